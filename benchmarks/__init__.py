@@ -1,1 +1,1 @@
-"""What is measured; each module prints and writes a table."""
+"""Benchmarks; each module prints and writes a table."""

@@ -1,7 +1,7 @@
-"""The Batch API's speed against moto's server, and what 100,000 waiting jobs cost: ``python -m benchmarks.api``.
+"""The Batch API's speed against moto's server, and the cost of 100,000 waiting jobs: ``python -m benchmarks.api``.
 
-Both servers run at the same time on this machine and are asked in turns, over HTTP, by clients in processes of their own; no job
-ever runs (Muster has no room for one, moto's simple backend calls every job finished at once). The tables go to ``api.md``.
+Both servers run at the same time on this machine. Clients in separate processes call them in turns over HTTP. No job ever runs: Muster
+has no capacity for one, and moto's simple backend calls every job finished at once. The tables go to ``api.md``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ EXISTING = (0, 1_000, 10_000)
 SECONDS = float(os.environ.get("MUSTER_BENCH_SECONDS", "2"))
 """Of each measurement."""
 PATIENCE = 180.0
-"""Seconds within which a server must have got its existing jobs, else the number that it has got counts."""
+"""Seconds for creating a server's existing jobs; after that the number created so far counts."""
 WAITING, CHILDREN = 100_000, 10_000
 _HEADERS = {
     "Content-Type": "application/json",
@@ -46,7 +46,7 @@ SUBMISSION = {"jobName": "bench", "jobQueue": "bench", "jobDefinition": "bench"}
 
 
 def raw(url: str) -> Callable[[str, dict[str, Any]], dict[str, Any]]:
-    """Calls operations over one kept-alive connection, with nothing but the standard library."""
+    """Calls operations over one kept-alive connection, with only the standard library."""
     connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=120)
     connection.connect()
     connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -75,7 +75,7 @@ CLIENTS = {"raw HTTP": raw, "boto3": boto}
 
 @dataclass(frozen=True)
 class Rate:
-    """What some clients got out of a server at once."""
+    """Throughput and latencies of concurrent clients."""
 
     per_second: float
     latencies: list[float]
@@ -93,7 +93,7 @@ class Rate:
 def measure(
     url: str, kind: str, clients: int, operation: str, jobs: list[str], seconds: float, most: int = 10**9
 ) -> Rate:
-    """Have ``clients`` processes call ``operation`` for some time, or until each of them has called it ``most`` times."""
+    """Call ``operation`` from ``clients`` processes for some time, or until each has called it ``most`` times."""
     context = multiprocessing.get_context("fork")
     ready, results = context.Barrier(clients), context.SimpleQueue()
     processes = [
@@ -142,7 +142,7 @@ class Server:
         self.jobs: list[str] = []
 
     def fill(self, count: int) -> int:
-        """Submit jobs until there are ``count``, or patience is at its end; returns how many there are."""
+        """Submit jobs until ``count`` exist or the time limit passes; returns their number."""
         deadline = time.monotonic() + PATIENCE
         while len(self.jobs) < count and time.monotonic() < deadline:
             missing = count - len(self.jobs)
@@ -156,7 +156,7 @@ class Server:
 
 
 class Muster(Server):
-    """``muster serve`` that has too little for any job."""
+    """``muster serve`` with too few resources for any job."""
 
     name = "Muster"
 
@@ -193,7 +193,7 @@ class Muster(Server):
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def settle(self, array: str) -> float:
-        """Wait until every child of the array waits for room; returns the seconds."""
+        """Wait until every child of the array waits for capacity; returns the seconds."""
         begin = time.perf_counter()
         call = raw(self.url)
         while True:
@@ -274,7 +274,7 @@ def rates(muster: Muster, moto: Moto) -> Iterator[list[str]]:
 
 
 def at_scale(muster: Muster) -> Iterator[tuple[str, str]]:
-    """What 100,000 waiting jobs cost: nine arrays of 10,000 and 10,000 plain jobs."""
+    """Cost of 100,000 waiting jobs: nine arrays of 10,000 and 10,000 plain jobs."""
     call = raw(muster.url)
     yield "memory (RSS) of the controller, no job", f"{muster.memory():.0f} MB"
     arrays: list[str] = []
@@ -334,7 +334,7 @@ def _latencies(muster: Muster, arrays: list[str]) -> Iterator[tuple[str, str]]:
 
 
 def fsync_milliseconds(directory: Path) -> float:
-    """What a power-safe append costs here, median."""
+    """Median time of a power-safe append here."""
     taken = []
     with open(directory / "probe", "wb", buffering=0) as file:
         for _ in range(200):

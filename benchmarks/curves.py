@@ -1,11 +1,11 @@
-"""Whole trainings: reward against time and steps, of each built-in task with its own settings, and of rsl-rl's own runner beside them.
+"""Whole trainings of each built-in task with its own settings, and of rsl-rl's own runner: reward against time and steps.
 
     python -m benchmarks.curves [--tasks Ant Humanoid Quadruped] [--stock Ant] [--out DIRECTORY]
 
 Writes ``curves.md``, ``curves.json``, and ``curves.png`` where matplotlib is installed (without a GPU ``curves_cpu.*``, with fewer
-worlds). The clock starts with the first iteration; what is before it (imports, worlds, kernels) stands apart. Each policy is
-evaluated at the end, its mean action from fresh starts; where a task's solver has limits, also in a simulation without them.
-A loaded machine is refused: :mod:`benchmarks.load`. Without a GPU use ``make bench``, as for :mod:`benchmarks.training`.
+worlds). The clock starts with the first iteration; earlier work (imports, worlds, kernels) is reported separately. At the end each
+policy's mean action is evaluated from new starts, and if a task's solver has limits, also in a simulation without them. A loaded machine
+is refused: :mod:`benchmarks.load`. Without a GPU use ``make bench``, as for :mod:`benchmarks.training`.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ PLAN = {
 """Worlds and iterations on a GPU."""
 PLAN_CPU = {"Cartpole": (64, 150), "CartpolePixels": (64, 60)}
 STOCK, STOCK_CPU = ["Ant"], ["Cartpole"]
-"""Tasks that rsl-rl's own runner trains, too."""
+"""Tasks that rsl-rl's own runner trains too."""
 NAME = "curves" if CUDA else "curves_cpu"
 REFERENCE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8}
 """MuJoCo's own defaults for its solver."""
 
 
 def train(task: str, worlds: int, iterations: int, store: Path, seed: int = 0) -> dict[str, Any]:
-    """Reward, episode length and seconds after each iteration, and what the policy is worth in the end."""
+    """Reward, episode length and seconds after each iteration, and the evaluation of the final policy."""
     started = time.perf_counter()
     runner = build(task, worlds, store, seed)
     built = time.perf_counter() - started
@@ -87,7 +87,7 @@ def train_stock(task: str, worlds: int, iterations: int, store: Path, seed: int 
     for done in range(0, iterations, every):
         started = time.perf_counter()
         with contextlib.redirect_stdout(io.StringIO()):
-            stock.learn(every)  # the worlds' clocks are apart already
+            stock.learn(every)  # the worlds' clocks are staggered already
         wait()
         seconds += time.perf_counter() - started
         episodes, returns, lengths = own.statistics[:3].tolist()
@@ -115,7 +115,7 @@ def main() -> None:
 
 
 def train_all(tasks: list[str], stock: list[str], watch: Watch, seed: int = 0) -> Iterator[list[dict[str, Any]]]:
-    """The rows so far, after each of ``tasks``, and then after each that rsl-rl trains."""
+    """The rows so far, after each of ``tasks``, then after each training by rsl-rl."""
     plan, rows = PLAN if CUDA else PLAN_CPU, list[dict[str, Any]]()
     with tempfile.TemporaryDirectory() as store:
         for task, trainer in [(task, train) for task in tasks] + [(task, train_stock) for task in stock]:
@@ -154,7 +154,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(rows: list[dict[str, Any]], directory: Path) -> None:
-    """Mean return of finished episodes against steps, one panel a task; nothing where matplotlib is not installed."""
+    """Plot mean return of finished episodes against steps, one panel per task; do nothing without matplotlib."""
     try:
         import matplotlib
     except ImportError:

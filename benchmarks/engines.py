@@ -1,8 +1,9 @@
-"""What engines cost: how soon a gang starts, how soon a death is noticed and mended, how soon a stop is done, speed and memory.
+"""Costs of the engines: time to start a gang, to detect and repair a death, to stop; training speed and memory.
 
-``make bench-engines`` writes ``benchmarks/engines.md``. The clusters are those of the tests (``tests/support/engines/``), all on this machine, so
-this is a module for pytest. Gangs have two nodes. A rank's death is noticed when the controller has recorded it, a node's likewise; a
-gang runs again when all its ranks have printed; nothing is left when no process of it is and the job is FAILED.
+``make bench-engines`` writes ``benchmarks/engines.md``. The clusters are those of the tests (``tests/support/engines/``), all on this
+machine, so this is a module for pytest. Gangs have two nodes. The death of a rank or node counts as noticed when the controller has
+recorded it. A gang runs again when all its ranks have printed. A stop is complete when no process of the gang exists and the job is
+FAILED.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ DAEMONS = {
     "ray": ("raylet", "gcs_server", "ray::", "ray/dashboard", "ray/_private", "engines.ray_"),
     "slurm": ("slurmctld", "slurmd", "slurmstepd"),
 }
-"""What the engine itself runs, by words in the commands of its processes."""
+"""The engine's own processes, identified by words in their commands."""
 ROWS: dict[str, dict[str, str]] = {}
 
 
@@ -73,7 +74,7 @@ def test_measure(site: Site) -> None:
 def _speed(site: Site) -> str:
     """Median steps/s of a cart-pole training on two nodes, from its metrics."""
     if site.engine == "aws-batch":
-        return "-"  # its nodes are the local engine's
+        return "-"  # its nodes run on the local engine
     job = submit(
         site.serving, "speed", site.engine, 40, "train.worlds=256", "checkpoint.every=1000", "resources.cpus=1"
     )
@@ -83,7 +84,7 @@ def _speed(site: Site) -> str:
 
 
 def _memory(site: Site) -> dict[str, str]:
-    """MiB (proportional set size) of the controller, and of all that the engine itself runs, its processes on all nodes together."""
+    """MiB (proportional set size) of the controller, and of the engine's own processes on all nodes together."""
     words = DAEMONS.get(site.engine, ())
     engine = 0.0
     for entry in Path("/proc").iterdir():

@@ -1,10 +1,10 @@
-"""How long it takes until an arm lifts a cube to its targets: wall time from the first iteration on.
+"""Wall time, from the first iteration on, until an arm lifts a cube to its targets.
 
     python -m benchmarks.lifting [--task LiftCube|LiftCubes] [--worlds 4096] [--seconds 170] [--out DIRECTORY]
 
-Trains as ``muster run`` does, with metrics and checkpoints, from the task's own settings. In the end the mean action plays an episode in each of
-``--judged`` held-out worlds. Building the worlds and judging stand apart. Writes ``lifting-<task>.json``, the curve as ``.png`` where matplotlib is
-installed, and a film of one world as ``.gif``.
+Trains as ``muster run`` does, with metrics and checkpoints, from the task's own settings. In the end the mean action plays an episode in
+each of ``--judged`` held-out worlds. The times of building the worlds and of judging are reported separately. Writes
+``lifting-<task>.json``, the curve as ``.png`` where matplotlib is installed, and a film of one world as ``.gif``.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from worker.learning.setup import build_task
 from worker.tasks.adapting import adaptive_steps, begin_evaluation
 
 CURVE = ("object_height", "position_error", "at_goal", "episode_success")
-"""Metrics of the task that are kept."""
+"""Metrics of the task to keep."""
 
 
 class LiftingLoop(Loop):
-    """A training that ends after so many seconds."""
+    """A training that ends after a given time."""
 
     def within(self, seconds: float) -> None:
-        """``seconds``: of training, after which it is left; the clock starts with :meth:`train`."""
+        """``seconds``: duration of the training; the clock starts with :meth:`train`."""
         self._limit = seconds
         self.curve: list[dict[str, Any]] = []
         """Of each iteration: ``seconds``, ``env_steps``, ``reward``, and the metrics of :data:`CURVE`."""
@@ -53,7 +53,7 @@ class LiftingLoop(Loop):
         metrics = {name: record.get(f"metric_{name}") for name in CURVE}
         row = {"seconds": seconds, "env_steps": record["env_steps"], "iteration": record["iteration"]}
         self.curve.append(row | {"reward": record["reward"]} | metrics)
-        self.stop.requested |= seconds >= self._limit  # it saves after the next iteration, and is left
+        self.stop.requested |= seconds >= self._limit  # it saves after the next iteration, then exits
         return record, signals
 
 
@@ -86,7 +86,7 @@ def measure(options: argparse.Namespace, store: Path, clip: Path) -> dict[str, A
 
 
 def draw(row: dict[str, Any], path: Path) -> None:
-    """Heights, distances and shares against the time of training; nothing where matplotlib is not installed."""
+    """Plot heights, distances and shares against the time of training; do nothing without matplotlib."""
     try:
         import matplotlib
     except ImportError:

@@ -1,7 +1,7 @@
-"""What else runs on this machine while it is measured: a table made on a loaded machine can't be compared with any other.
+"""The load by other processes during a measurement: a table made on a loaded machine can't be compared with others.
 
 The rule: other processes may use at most :data:`LIMIT` of the processors' time, before the first measurement and during each one.
-Above it a benchmark stops and writes nothing more, or, with ``--loaded-anyway``, its table says how loaded the machine was.
+Above it a benchmark stops and writes nothing more, or, with ``--loaded-anyway``, its table reports the load.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from typing import Any
 LIMIT = 0.05
 """Greatest share of all processors' time that other processes may use."""
 WATCHED = 3.0
-"""How long the machine is watched before the first measurement [s]."""
+"""Time of observing the machine before the first measurement [s]."""
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    """The option that measures in spite of what else runs."""
+    """The option that measures in spite of the load."""
     parser.add_argument(
         "--loaded-anyway",
         action="store_true",
-        help="measure on a loaded machine, too; the table says how loaded it was",
+        help="measure even on a loaded machine; the table reports the load",
     )
 
 
@@ -37,9 +37,9 @@ def busy_seconds() -> float:
 
 
 def own_seconds(pid: str = "self") -> float:
-    """Processor time used by this process and by all that it started [s]."""
+    """Processor time used by this process and all processes that it started [s]."""
     total = 0.0
-    with contextlib.suppress(OSError):  # a process that ends just now
+    with contextlib.suppress(OSError):  # the process just ended
         times = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15]
         total = sum(map(int, times)) / os.sysconf("SC_CLK_TCK")
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -48,10 +48,10 @@ def own_seconds(pid: str = "self") -> float:
 
 
 class Watch:
-    """Measures what processes that this one did not start use between two calls.
+    """Measures the processor time of other processes (not started by this one) between two calls.
 
     Args:
-        loaded_anyway: Go on above :data:`LIMIT`.
+        loaded_anyway: Continue above :data:`LIMIT`.
 
     Raises:
         SystemExit: The machine is loaded.
@@ -69,9 +69,9 @@ class Watch:
         self._began = time.monotonic(), busy_seconds() - own_seconds()
 
     def check(self, when: str) -> dict[str, Any]:
-        """What other processes used since the last call: ``others``, a share of all processors, and ``load_average``, at the start.
+        """Use by other processes since the last call: ``others``, a share of all processors, and ``load_average``, at the start.
 
-        Raises SystemExit above :data:`LIMIT`; ``when`` says in its message what was measured.
+        Raises SystemExit above :data:`LIMIT`; ``when`` names the measurement in its message.
         """
         then, others = self._began
         self._begin()
@@ -92,7 +92,7 @@ def machine() -> str:
 
 
 def told(rows: list[dict[str, Any]]) -> str:
-    """A sentence for the table of ``rows``, each with what :meth:`Watch.check` said of it."""
+    """A sentence for the table of ``rows``, each with its result of :meth:`Watch.check`."""
     known = [row for row in rows if "others" in row]
     if not known:
         return "What else ran on the machine was not recorded."

@@ -1,8 +1,8 @@
-"""How fast logs are read: ``python -m benchmarks.log_follow [lines]``.
+"""Speed of reading logs: ``python -m benchmarks.log_follow [lines]``.
 
-A gang of three nodes prints the time, ``lines`` times in all; a follower reads it with nothing but HTTP, as boto3 would. A line's
-latency is from just before ``print`` in the rank to the client that has parsed it. Then the logs of jobs that have printed many
-lines are read from beginning to end. Prints Markdown tables.
+A gang of three nodes prints the time, ``lines`` times in all; a follower reads it over plain HTTP, as boto3 would. A line's latency is
+the time from just before ``print`` in the rank until the client has parsed it. Then long logs are read from beginning to end. Prints
+Markdown tables.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ PAUSE = 0.02
 POLL = 0.2
 """Seconds between two polls of a FilterLogEvents follower."""
 MANY = 100_000
-"""Lines of a job whose log is read whole."""
+"""Number of lines of a job whose log is read whole."""
 _FLOOD = "for i in range({lines}): print('line', i, 'of the log of a program that prints much')"
 _LAST = "\nimport os, time\nif os.environ['NODE_RANK'] == '0': time.sleep(5)"
-"""The main node, whose end ends the others, waits for them."""
+"""The main node waits for the others, since its end ends them."""
 _SCRIPT = """
 import time
 time.sleep(3)
@@ -45,7 +45,7 @@ time.sleep(3)
 
 
 def polled(url: str, **selection: Any) -> Iterator[str]:
-    """Texts as a FilterLogEvents follower gets them: pages, then from the newest time on, each event once."""
+    """Texts that a FilterLogEvents follower receives: pages, then from the newest time on, each event once."""
     query: dict[str, Any] = {"logGroupName": GROUP, **selection}
     seen: set[str] = set()
     client = httpx.Client(base_url=url, headers={"X-Amz-Target": "Logs_20140328.FilterLogEvents"})
@@ -64,7 +64,7 @@ def polled(url: str, **selection: Any) -> Iterator[str]:
 
 
 def tailed(url: str, **selection: Any) -> Iterator[str]:
-    """Texts as a StartLiveTail session sends them."""
+    """Texts that a StartLiveTail session sends."""
     headers, buffer = {"X-Amz-Target": "Logs_20140328.StartLiveTail"}, EventStreamBuffer()
     request = {"logGroupIdentifiers": [GROUP], **selection}
     with httpx.stream("POST", url, json=request, headers=headers, timeout=30) as answer:
@@ -76,7 +76,7 @@ def tailed(url: str, **selection: Any) -> Iterator[str]:
 
 
 def latencies(texts: Iterator[str], sources: int) -> list[float]:
-    """Seconds from print to arrival, until the last line of every source has come."""
+    """Seconds from print to arrival, until the last line of every source has arrived."""
     found: list[float] = []
     for text in texts:
         arrived = time.time()
@@ -89,7 +89,7 @@ def latencies(texts: Iterator[str], sources: int) -> list[float]:
 
 
 def follow(url: str, lines: int, texts: Callable[[str], Iterator[str]], sources: int) -> list[float]:
-    """One gang and one follower of it, which is there before the first line: latencies [s], sorted."""
+    """Latencies [s], sorted, of one gang and one follower that starts before the first line."""
     script = _SCRIPT.format(lines=-(-lines // NODES), pause=PAUSE)
     with Client(url) as client:
         job = submit(client, "ticker", script, NODES)
@@ -118,7 +118,7 @@ def finish(client: Client, job: str) -> None:
 
 
 def rates(url: str, home: str, controller: int) -> list[tuple[str, int, float, float]]:
-    """What reads, how many lines, how many in a second, and CPU seconds of the controller a line, at the best of three times."""
+    """For each reader: number of lines, lines per second, and the controller's CPU seconds per line, best of three."""
     rows = []
     with Client(url) as client:
         for nodes in (1, NODES):
@@ -147,7 +147,7 @@ def cpu_seconds(pid: int) -> float:
 
 
 def received(url: str, job: str, **query: str) -> int:
-    """Lines that a client gets which does nothing with them."""
+    """Lines received by a client that discards them."""
     with httpx.stream("GET", f"{url}/api/jobs/{job}/logs", params=query, timeout=120) as answer:
         return sum(chunk.count(b"\n") for chunk in answer.iter_bytes())
 
@@ -160,7 +160,7 @@ def printed(url: str, home: str, job: str) -> int:
 
 
 def measure(url: str, lines: int) -> list[tuple[str, list[float]]]:
-    """Every kind of follower, one after the other."""
+    """All kinds of followers, one after the other."""
     return [
         (
             "StartLiveTail, all nodes",

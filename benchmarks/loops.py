@@ -1,9 +1,9 @@
-"""One PPO configuration through four loops, by the clock, each with its logging and a checkpoint every 25 iterations.
+"""Wall-clock speed of one PPO configuration in four loops, each with its logging and a checkpoint every 25 iterations.
 
     python -m benchmarks.loops [--tasks Ant Humanoid Cartpole] [--worlds 4096] [--out DIRECTORY]
 
-They are ``algorithm: ppo`` and ``algorithm: rsl_rl`` in Muster's loop, as ``muster run`` has it, and rsl-rl's own runner with
-TensorBoard: as it is, and tuned (``check_for_nan: false``). All train on the same simulation. Writes ``loops.md``.
+They are ``algorithm: ppo`` and ``algorithm: rsl_rl`` in the loop of ``muster run``, and rsl-rl's own runner with TensorBoard: unchanged,
+and tuned (``check_for_nan: false``). All train on the same simulation. Writes ``loops.md``.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from worker.learning.setup import build_task
 
 EVERY = 25
 WARM = 10
-"""Iterations that are not counted: graphs are recorded, kernels loaded."""
+"""Uncounted first iterations, which record graphs and load kernels."""
 
 
 def in_muster(task: str, worlds: int, iterations: int, algorithm: str) -> float:
-    """Steps a second, from the metrics of a whole run of the loop."""
+    """Steps per second, from the metrics of a whole run of the loop."""
     with tempfile.TemporaryDirectory() as directory:
         store, own = Path(directory), {}
         if algorithm == "rsl_rl":
@@ -46,7 +46,7 @@ def in_muster(task: str, worlds: int, iterations: int, algorithm: str) -> float:
 
 
 def in_rsl_rl(task: str, worlds: int, iterations: int, **changes: Any) -> float:
-    """Steps a second of rsl-rl's own runner, from one of its log entries to another."""
+    """Steps per second of rsl-rl's own runner, between two of its log entries."""
     with tempfile.TemporaryDirectory() as directory:
         loop = build(task, worlds, Path(directory) / "store")
         ppo, own = loop.config.ppo, build_task(type(loop.task), loop.config, loop.share, loop.gang, 1)
@@ -86,7 +86,7 @@ def main() -> None:
     watch, rows = Watch(options.loaded_anyway), list[dict[str, Any]]()
     found: dict[tuple[str, str], list[float]] = {}
     for task in options.tasks:
-        for _ in range(options.repeats):  # alternating, so that a machine that changes changes all of them
+        for _ in range(options.repeats):  # alternating, so that changes of the machine affect all of them
             for way, measure in WAYS.items():
                 found.setdefault((task, way), []).append(measure(task, options.worlds, options.iterations))
                 rows.append(watch.check(f"while {task} was measured"))
@@ -95,7 +95,7 @@ def main() -> None:
 
 
 def table(found: dict[tuple[str, str], list[float]], worlds: int, rows: list[dict[str, Any]]) -> str:
-    """Markdown, of the steps a second by task and way."""
+    """Markdown of the steps per second, by task and loop."""
     lines = [
         f"# One configuration, four loops, on {device_name()}",
         "",

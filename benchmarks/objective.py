@@ -1,8 +1,8 @@
-"""The loss of the fused PPO three ways, in one run: the hand-written kernel, plain torch, and plain torch that torch.compile has fused.
+"""The loss of the fused PPO in three forms, in one run: the hand-written kernel, plain torch, and plain torch with torch.compile.
 
     python -m benchmarks.objective [--tasks Ant Humanoid] [--worlds 4096] [--out DIRECTORY]
 
-Writes ``objective.md``: milliseconds of learning and of an iteration. Everything else is the same, recorded as the same graphs.
+Writes ``objective.md``: milliseconds of learning and of an iteration. Everything else is the same, including the captured graphs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""How fast and how steady the policy node is: ``python -m benchmarks.policy_node``; the tables go to ``policy_node.md``.
+"""Speed and jitter of the policy node: ``python -m benchmarks.policy_node``; the tables go to ``policy_node.md``.
 
 The policy is a network of 512, 256 and 128 units with the contract of Go1Flat: 48 observations from a joint state, an IMU, odometry and
-a commanded velocity, 12 joint targets. A driver in a process of its own puts the four messages and hears the command, over Zenoh.
+a commanded velocity, 12 joint targets. A driver in a separate process sends the four messages and receives the command, over Zenoh.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ REPEATS, SECONDS = 3, 4.0
 RATES = (50.0, 500.0)
 LAYERS = (512, 256, 128)
 BRIDGE = 16.7
-"""What a bridge to ROS 2 took in an earlier report on another machine, observation in to command out [ms]."""
+"""Latency of a bridge to ROS 2 in an earlier report on another machine, observation in to command out [ms]."""
 
 
 def network(inputs: int, outputs: int) -> bytes:
@@ -109,7 +109,7 @@ class NodeProcess:
 
 
 def drive(endpoint: str, robot: Any, rate: float, seconds: float) -> list[float]:
-    """Be a robot at a steady rate: times from before the first put of a step to its command's arrival [s]."""
+    """Act as a robot at a steady rate: times from just before a step's first message to its command's arrival [s]."""
     from muster_policy.graph import Node, open_session
     from muster_policy.messages import JOINT_STATE
     from muster_policy.timing import sleep_until

@@ -1,9 +1,9 @@
-"""The tables of training without a GPU, ``cpu.md`` and ``curves_cpu.md``, in one run, so that they are of one machine in one state.
+"""Both tables of training without a GPU, ``cpu.md`` and ``curves_cpu.md``, in one run, so that they describe one machine in one state.
 
     python -m benchmarks.processor [--out DIRECTORY]
 
-Nothing is written unless all of it was measured on a machine that was not loaded (:mod:`benchmarks.load`), and unless the two tables agree
-on what they both measure.
+Nothing is written unless the machine was not loaded during any measurement (:mod:`benchmarks.load`) and the two tables agree where they
+overlap.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from benchmarks import curves, training
 from benchmarks.load import Watch, add_option
 
 AGREEMENT = 1.5
-"""A whole training is not more than this much faster or slower than the rate of the same task and number of worlds says."""
+"""Tolerated relative difference between a whole training and the rate of the same task and number of worlds."""
 
 
 def contradictions(rates: list[dict[str, Any]], trainings: list[dict[str, Any]]) -> list[str]:
-    """What a table of rates and one of whole trainings disagree on, a line each."""
+    """Contradictions between a table of rates and one of whole trainings, one line each."""
     found = []
     for row in trainings:
         steps, by = row["curve"][-1][1], "stock" if row.get("stock") else "train"
@@ -49,7 +49,7 @@ def main() -> None:
     *_, rates = training.measure_all(plan, watch)
     *_, trainings = curves.train_all(list(curves.PLAN_CPU), curves.STOCK_CPU, watch)
     if found := contradictions(rates, trainings):
-        raise SystemExit("the tables contradict one another, so that nothing was written:\n" + "\n".join(found))
+        raise SystemExit("the tables contradict each other, so nothing was written:\n" + "\n".join(found))
     training.write(rates, options.out)
     curves.write(trainings, options.out)
     curves.draw(trainings, options.out)

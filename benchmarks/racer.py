@@ -1,13 +1,14 @@
-"""How long until a car drives laps: trained from its first iteration on, judged at intervals on held-out worlds; and cars · steps a second.
+"""Training time until a car drives laps, judged at intervals on held-out worlds; and cars · steps per second.
 
     python -m benchmarks.racer [--loaded-anyway]                                     # job_specs/racer.yaml, on a CPU
     python -m benchmarks.racer --task RacerPixels --worlds 1024 --seconds 1800       # job_specs/racer-pixels.yaml, on a GPU
     python -m benchmarks.racer --table                                               # the table alone, of all rows that are there
 
 Task, tracks, action space and all other settings are those of the job's YAML; ``--train`` changes them. A policy is judged by its mean
-action, one episode in each of ``--judged`` worlds, and drives when ``--share`` of them are complete laps; the training goes on, since laps become faster. The clock of training counts
-iterations as a job has them, with reports and checkpoints; building the worlds, judging and the clip stand apart. Processor time is that
-of this process: on a machine on which others work it says more. Nothing of it needs a network.
+action, one episode in each of ``--judged`` worlds, and drives when ``--share`` of them are complete laps; the training continues, since
+laps become faster. The clock of training counts iterations like a job's, with reports and checkpoints; building the worlds, judging and
+the clip are timed separately. Processor time is that of this process, which means more on a machine with other work. No network is
+needed.
 
 Writes ``racer-<task>-<device>.json``, the curve as ``.png`` where matplotlib is installed, a clip as ``.gif``, and ``racer.md`` of all rows.
 """
@@ -46,27 +47,27 @@ JOBS = {"Racer": "racer.yaml", "RacerPixels": "racer-pixels.yaml"}
 REAL_TIME = 15.0
 """Control steps a second of a simulator that runs one car in real time, as DeepRacer's does (reward 15 images a second)."""
 CLIP = (320, 240)
-"""Of a frame [px]."""
+"""Size of a frame [px]."""
 
 
 class RacingLoop(Loop):
     """A training that is judged at intervals."""
 
     def judged_by(self, worlds: Task, share: float, every: float, limit: float, iterations: int) -> RacingLoop:
-        """How it is judged; before :meth:`train`.
+        """Set up the judgement; call it before :meth:`train`.
 
         Args:
-            worlds: Where policies are judged.
-            share: Of complete laps from which on it drives.
+            worlds: Worlds in which policies are judged.
+            share: Share of complete laps from which the policy counts as driving.
             every: Seconds of training between two judgements.
-            limit: Seconds of training after which it is left in any case.
-            iterations: After which it is left.
+            limit: Seconds of training after which it ends in any case.
+            iterations: Iterations after which it ends.
         """
         self._worlds, self._share, self._every, self._limit, self._last = worlds, share, every, limit, iterations
         self.curve: list[dict[str, Any]] = []
-        """Of each iteration: ``seconds`` and ``cpu_seconds`` of training, ``env_steps``, ``episodes``, ``laps``, ``progress``."""
+        """For each iteration: ``seconds`` and ``cpu_seconds`` of training, ``env_steps``, ``episodes``, ``laps``, ``progress``."""
         self.judged: list[dict[str, Any]] = []
-        """Of each judgement: the same times, ``share`` of complete laps, ``lap_times`` by track [s], what ended episodes."""
+        """For each judgement: the same times, ``share`` of complete laps, ``lap_times`` by track [s], causes of episodes' ends."""
         self.done: dict[str, Any] | None = None
         """The first judgement with that share."""
         self._apart, self._next, self._began = (0.0, 0.0), every, (time.perf_counter(), time.process_time())
@@ -104,8 +105,8 @@ class RacingLoop(Loop):
             self._apart = tuple(
                 apart + now - then for apart, now, then in zip(self._apart, spent, (seconds, cpu), strict=True)
             )  # type: ignore[assignment]
-            self._stopwatch.begin()  # the run's own records don't count it either
-        self.stop.requested |= over  # it saves after the next iteration, and is left
+            self._stopwatch.begin()  # the run's own records exclude it too
+        self.stop.requested |= over  # it saves after the next iteration, then exits
         return record, signals
 
     def _judge(self, at: dict[str, Any]) -> None:
@@ -132,7 +133,7 @@ class RacingLoop(Loop):
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A section with changes, mapping by mapping."""
+    """A section with changes, merged mapping by mapping."""
     found = dict(base)
     for key, value in changes.items():
         both = isinstance(value, Mapping) and isinstance(found.get(key), Mapping)
@@ -141,7 +142,7 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 def measure(options: argparse.Namespace, store: Path, clip: Path) -> dict[str, Any]:
-    """Train once, and say when the policy drove laps. Writes the clip."""
+    """Train once, and report when the policy drove laps. Writes the clip."""
     built = time.perf_counter()
     section = yaml.safe_load((HERE.parent / "job_specs" / JOBS[options.task]).read_text())["train"]
     section = merged(section, options.train)
@@ -149,7 +150,7 @@ def measure(options: argparse.Namespace, store: Path, clip: Path) -> dict[str, A
     iterations = options.iterations or section["iterations"]
     for name in ("task", "worlds", "seed"):
         section.pop(name, None)
-    section["iterations"] = iterations + 100  # it is left before, and ends without an evaluation of its own
+    section["iterations"] = iterations + 100  # it exits earlier, without its own evaluation
     loop = build(options.task, worlds, store, options.seed, loop_type=RacingLoop, **section)
     assert isinstance(loop, RacingLoop)
     share = type(loop.share).of(0, 1, options.judged)
@@ -186,7 +187,7 @@ def measure(options: argparse.Namespace, store: Path, clip: Path) -> dict[str, A
 
 
 def simulation_rate(task: Task) -> float:
-    """Cars · steps a second without a policy, with whatever the task's camera sees."""
+    """Cars · steps per second without a policy, including the task's camera."""
     if task.discrete:
         actions = torch.randint(0, task.action_size, tuple(task.actions.shape), device=task.device)
     else:
@@ -214,7 +215,7 @@ def first(row: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def draw(row: Mapping[str, Any], path: Path) -> None:
-    """Progress and complete laps against the time of training; nothing where matplotlib is not installed."""
+    """Plot progress and complete laps against the time of training; do nothing without matplotlib."""
     try:
         import matplotlib
     except ImportError:
@@ -250,7 +251,7 @@ def draw(row: Mapping[str, Any], path: Path) -> None:
 
 
 def where(row: Mapping[str, Any]) -> str:
-    """On what a row was measured."""
+    """The device of a row's measurement."""
     return str(row["device"]) if row["cuda"] else f"{row['cores']} CPU cores"
 
 
@@ -300,7 +301,7 @@ def _when(at: Mapping[str, Any] | None) -> str:
 
 
 def stem(row: Mapping[str, Any]) -> str:
-    """What a row's files are called."""
+    """Name of a row's files."""
     return f"racer-{row['task'].lower()}-{'gpu' if row['cuda'] else 'cpu'}"
 
 
@@ -309,17 +310,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks.racer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--task", choices=list(JOBS), default="Racer")
-    parser.add_argument("--worlds", type=int, help="cars; by default those of the job")
+    parser.add_argument("--worlds", type=int, help="number of cars; by default the job's")
     parser.add_argument("--judged", type=int, default=64, help="worlds in which policies are judged")
-    parser.add_argument("--share", type=float, default=1.0, help="of complete laps from which on it drives")
-    parser.add_argument("--iterations", type=int, help="of training; by default those of the job")
+    parser.add_argument(
+        "--share", type=float, default=1.0, help="share of complete laps from which the policy counts as driving"
+    )
+    parser.add_argument("--iterations", type=int, help="iterations of training; by default the job's")
     parser.add_argument("--seconds", type=float, default=300.0, help="of training, at most")
     parser.add_argument("--every", type=float, default=5.0, help="seconds of training between two judgements")
     parser.add_argument("--clip-seconds", type=float, default=12.0, help="of the clip, simulated")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=HERE)
     parser.add_argument(
-        "--table", action="store_true", help="write the table of the rows that are there, and measure nothing"
+        "--table", action="store_true", help="write the table of the existing rows, and measure nothing"
     )
     parser.add_argument(
         "--train",

@@ -1,7 +1,7 @@
-"""What saving costs, and how long a restart takes: ``python -m benchmarks.resume`` (``make bench-resume``).
+"""Cost of saving, and time of a restart: ``python -m benchmarks.resume`` (``make bench-resume``).
 
-Trainings go through the real command and controller on a fresh home directory; the table goes to ``resume.md``. Kernels are taken
-from ``$WARP_CACHE_PATH`` where that is set, else compiled first, which is not measured.
+Trainings go through the real command and controller on a fresh home directory; the table goes to ``resume.md``. Kernels come from
+``$WARP_CACHE_PATH`` if it is set; otherwise they are compiled first, which is not measured.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from worker.learning.shards import read_file
 ANT = "job_specs/ant.yaml"
 KILLS = 3
 BIG = 256
-"""Size of a made-up state for the rates [MB]."""
+"""Size of a synthetic state for the rates [MB]."""
 
 
 @dataclass
 class Restart:
-    """How long each part of a restart took [s]."""
+    """Duration of each part of a restart [s]."""
 
     detection: float
     """SIGKILL → the controller has decided that the attempt failed."""
@@ -88,7 +88,7 @@ class Restarts(Bench):
             time.sleep(0.1)
 
     def kill_and_wait(self, job: str, run: str, attempt: int) -> tuple[float, float, float, Restart]:
-        """SIGKILL rank 1 of ``attempt`` after a checkpoint; the times of the restart, whose start is filled in later."""
+        """SIGKILL rank 1 of ``attempt`` after a checkpoint; returns the times of the restart, whose start is filled in later."""
         self.await_line(job, attempt, r"checkpoint \d+")
         victim = rank_of(run, 1)
         killed = time.time()
@@ -119,7 +119,7 @@ class Restarts(Bench):
         return found
 
     def saving(self) -> list[tuple[str, str]]:
-        """Rows: what saves cost a training of Ant that saves every 25 iterations."""
+        """Rows: cost of saves in a training of Ant that saves every 25 iterations."""
         detail = self.run(ANT, "nodes=1", "train.iterations=80", "checkpoint.every=25", "train.worlds=64")
         records = self.client.get(f"/api/runs/{detail['run']}/metrics")
         iteration = statistics.median(record["iteration_seconds"] for record in records[2:])

@@ -1,4 +1,4 @@
-"""Reward functions of the racer: calls a second, compiled to this device and in Python workers.
+"""Reward functions of the racer: calls per second, compiled to this device and in Python workers.
 
     python -m benchmarks.rewards [--cars 256 4096] [--out DIRECTORY]
 
@@ -56,7 +56,7 @@ def filled(reward: RewardFunction, cars: int) -> None:
 
 
 def rate(reward: RewardFunction, cars: int) -> float:
-    """Calls a second, the median of some rounds."""
+    """Calls per second, the median of several rounds."""
     reward.rewards()
     found = []
     for _ in range(ROUNDS):

@@ -1,9 +1,9 @@
-"""``sac`` beside ``ppo`` on this device: steps and seconds until the mean return of finished episodes is as good as stated.
+"""``sac`` and ``ppo`` on this device: steps and seconds until the mean return of finished episodes reaches a goal.
 
     python -m benchmarks.sac [--tasks Cartpole Ant Humanoid] [--seeds 0 1 2] [--out DIRECTORY]
 
-Each task is trained with its own settings of both. The clock starts with the first iteration, so that it holds the recording of
-graphs, not the building of worlds. Writes ``sac.md``, ``sac.json``, and ``sac.png`` where matplotlib is installed.
+Each task is trained with its own settings of both. The clock starts with the first iteration, so it includes the capture of graphs but
+not the construction of worlds. Writes ``sac.md``, ``sac.json``, and ``sac.png`` where matplotlib is installed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLAN: dict[str, tuple[dict[str, int], float, tuple[float, ...]]] = {
 
 
 def train(task: str, algorithm: str, seed: int, judged: bool) -> dict[str, Any]:
-    """The curve: seconds, steps and mean return after each iteration; if ``judged``, also what the policy is worth in the end."""
+    """The curve: seconds, steps and mean return after each iteration; if ``judged``, also the final policy's evaluation."""
     worlds, limit, _ = PLAN[task]
     with tempfile.TemporaryDirectory() as store:
         loop = build(task, worlds[algorithm], Path(store), seed, algorithm=algorithm)
@@ -51,7 +51,7 @@ def thinned(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def reached(curve: list[tuple[float, int, float]], goal: float) -> tuple[float, int] | None:
-    """Seconds and steps when ten iterations in a row had reached ``goal`` on average; None where they never did."""
+    """Seconds and steps when the mean of ten consecutive iterations reached ``goal``; None if it never did."""
     for end in range(10, len(curve) + 1):
         if statistics.fmean(point[2] for point in curve[end - 10 : end]) >= goal:
             return curve[end - 1][0], curve[end - 1][1]
@@ -99,7 +99,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Mean return against time, one panel a task; nothing where matplotlib is not installed."""
+    """Plot mean return against time, one panel per task; do nothing without matplotlib."""
     try:
         import matplotlib
     except ImportError:

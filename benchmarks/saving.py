@@ -1,9 +1,9 @@
-"""What a save costs the training, for each task on this device: how much longer iterations around a save take than those far from one.
+"""Cost of a save for each task on this device: the additional time of iterations around a save.
 
     python -m benchmarks.saving [--tasks Ant Humanoid Cartpole] [--iterations 180] [--out DIRECTORY]
 
-It saves every third iteration, far more often than a run does, so that there are many to compare: in the one before a save the device
-makes the copies, in the one after it threads write them, the third has nothing of it. Writes ``saving.md``.
+It saves every third iteration, far more often than a run does, for many comparisons: in the iteration before a save the device makes the
+copies, in the one after it threads write them, and the third is unaffected. Writes ``saving.md``.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from shared_store.metrics import read_metrics
 WORLDS = dict.fromkeys(("Ant", "Humanoid", "Cartpole", "Quadruped"), 4096) | {"CartpolePixels": 1024}
 WORLDS_CPU = {"Ant": 64, "Humanoid": 32, "Cartpole": 64, "Quadruped": 32, "CartpolePixels": 32}
 WARM = 10
-"""Iterations that are not counted: graphs are recorded, kernels loaded."""
+"""Uncounted first iterations, which record graphs and load kernels."""
 
 
 def measure(task: str, worlds: int, iterations: int) -> dict[str, Any]:
-    """Milliseconds by the clock of the iterations before, after and far from a save, of the host's part, and bytes of a checkpoint."""
+    """Wall-clock milliseconds of iterations before, after and far from a save, and of the host's part; bytes of a checkpoint."""
     with tempfile.TemporaryDirectory() as store:
         loop = build(task, worlds, Path(store), every=3, iterations=iterations)
         with contextlib.redirect_stdout(io.StringIO()):

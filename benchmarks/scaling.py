@@ -1,9 +1,9 @@
-"""Several GPUs: the same worlds a GPU on 1, 2, 4 … of them (weak scaling), collectives between the graphs.
+"""Weak scaling over several GPUs: the same number of worlds per GPU on 1, 2, 4 … GPUs, with collectives between the graphs.
 
     python -m benchmarks.scaling [--task Ant] [--worlds 4096] [--gpus 1 2 4] [--out DIRECTORY]
 
-Writes ``scaling.md`` and ``scaling.json``. The ranks are started by torchrun and meet as under Muster's supervisor. The last row has
-all GPUs on two "hosts", half of them each: network namespaces, between which NCCL has nothing but TCP over a virtual cable.
+Writes ``scaling.md`` and ``scaling.json``. The ranks are started by torchrun and meet as under Muster's supervisor. The last row has half
+of the GPUs on each of two "hosts": network namespaces, connected for NCCL only by TCP over a virtual cable.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ ITERATIONS = 60
 
 
 def rank(task: str, worlds: int, store: Path, result: Path) -> None:
-    """One rank: train, and (rank 0) write down how long an iteration took."""
+    """One rank: train, and on rank 0 record the time per iteration."""
     import torch
 
     from benchmarks.training import build
 
-    faulthandler.dump_traceback_later(140, exit=True)  # who waits for whom
+    faulthandler.dump_traceback_later(140, exit=True)  # the excess of the slowest rank
     runner = build(task, worlds, store)
     slowest = []
     for _ in range(6):
@@ -72,7 +72,7 @@ def launch(gpus: int, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def launch_hosts(gpus: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Train on ``gpus`` GPUs of two hosts. Raises OSError where there can be none."""
+    """Train on ``gpus`` GPUs of two hosts. Raises OSError if the hosts can't be made."""
     with tempfile.TemporaryDirectory() as directory, two_hosts():
         arguments = ["-m", "benchmarks.scaling", "--rank", directory, "--task", options.task]
         ranks = start_ranks([*arguments, "--worlds", str(options.worlds)], gpus, {})
@@ -87,7 +87,7 @@ def launch_hosts(gpus: int, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _counts() -> list[int]:
-    """1, 2, 4 … as far as there are GPUs."""
+    """1, 2, 4 … up to the number of GPUs."""
     import torch
 
     return [count for count in (1, 2, 4, 8) if count <= max(1, torch.cuda.device_count())]

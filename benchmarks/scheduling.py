@@ -1,4 +1,4 @@
-"""How long one scheduling pass takes on a full cluster: ``python -m benchmarks.scheduling`` prints a Markdown table."""
+"""Time of one scheduling pass on a full cluster: ``python -m benchmarks.scheduling`` prints a Markdown table."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def mixed_shapes() -> list[Shape]:
 
 
 def cluster() -> tuple[list[Host], list[Running]]:
-    """Sixteen hosts with eight GPUs, each of them held by a gang of its own that ends within a day."""
+    """Sixteen hosts with eight GPUs; each GPU is held by its own gang, which ends within a day."""
     hosts = [Host(f"h{i}", 96, tuple(str(k) for k in range(GPUS)), GPUS * 32768) for i in range(HOSTS)]
     running = [
         Running(
@@ -51,7 +51,7 @@ def cluster() -> tuple[list[Host], list[Running]]:
 
 
 def snapshot(count: int, shapes: list[Shape], policy: FairShare | None) -> Snapshot:
-    """``count`` jobs wait, every second one with a timeout; they come in no order."""
+    """``count`` waiting jobs, every second one with a timeout, in random order."""
     draw = random.Random(count)
     waiting = [
         Waiting(

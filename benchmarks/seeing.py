@@ -1,11 +1,11 @@
-"""What looking at a policy costs, and how fast it is judged and shipped: tap, recordings, evaluation, rendering, export, on this device.
+"""Cost of observing a policy, and speed of evaluating and exporting it: tap, recordings, evaluation, rendering, export, on this device.
 
     python -m benchmarks.seeing [--tasks Cartpole Ant] [--out DIRECTORY]
 
 Each training has three stretches of equal length: ``muster record`` writes four of its worlds; no reader is attached; ``muster view``
-shows the worlds (without a browser, and only where Rerun is installed). A second training with the same seed and no reader makes the
-same iterations for comparison, since the length of an iteration changes as robots learn. The checkpoint is then recorded, evaluated
-and exported. Writes ``seeing.md``.
+shows the worlds (without a browser, and only where Rerun is installed). A second training with the same seed and no reader repeats the
+iterations for comparison, since an iteration's duration changes as robots learn. The checkpoint is then recorded, evaluated and exported.
+Writes ``seeing.md``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ WORLDS_CPU = {"Cartpole": 1024, "Ant": 64}
 WARM, STRETCH, ROUNDS = 8, 40 if CUDA else 20, 3
 CHANGES = ("recorded", "left", "viewed")
 TAPPED, EPISODES = 4, 2
-"""Worlds that are recorded, and episodes of each of a checkpoint's recording."""
+"""Number of recorded worlds, and of episodes of each in a checkpoint's recording."""
 PICTURES = 60
 JUDGED = 256
 """Worlds of the evaluation: blocks of 32 act one after the other, so that its rate is the same with more of them."""
@@ -73,7 +73,7 @@ def watched(loop: Loop) -> list[int]:
     def attended(is_ready: Callable[[], bool], said: Path, *command: str) -> None:
         with said.open("w") as output:
             reader = subprocess.Popen([sys.executable, "-m", *command], stdout=output, stderr=subprocess.STDOUT)
-        while not is_ready():  # it imports and builds for seconds, and takes processor time for that
+        while not is_ready():  # its imports and construction take seconds of processor time
             if reader.poll() is not None:
                 raise RuntimeError(f"{command[0]} ended at once:\n{said.read_text()}")
             time.sleep(0.05)
@@ -114,7 +114,7 @@ def watched(loop: Loop) -> list[int]:
 
 
 def took(run: Run, marks: list[int]) -> list[float]:
-    """Milliseconds of an iteration between each two marks, medians."""
+    """Median milliseconds of an iteration between consecutive marks."""
     ends = [record["total_seconds"] for record in read_metrics(run)]
     each = [1000 * (after - before) for before, after in pairwise(ends)]
     return [statistics.median(each[first:last]) for first, last in zip(marks[::2], marks[1::2], strict=True)]
@@ -143,13 +143,13 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
     policies = [load_policy(rollout.checkpoint, str(rollout.task.device)) for _ in range(count // SIZE)]
     gang = connect(Placement())
     best: dict[str, float] = {}
-    for _ in range(2):  # the first records the step
+    for _ in range(2):  # the first step captures the graph
         started = time.perf_counter()
         played = play([rollout.task], Blocks(policies), gang)
         if CUDA:
             torch.cuda.synchronize()
         seconds = time.perf_counter() - started
-        # worlds step on to the longest episode's end
+        # all worlds step until the longest episode ends
         steps = float(played.lengths.max()) * count
         best = {
             "judged": count,
@@ -162,7 +162,7 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
 
 
 def rendered(run: Run) -> dict[str, float]:
-    """Pictures a second of the camera of ``muster render``, 640 x 360 px, after the first, for which kernels are loaded."""
+    """Pictures per second of the camera of ``muster render``, 640 x 360 px, without the first, which loads kernels."""
     rollout = Rollout.of(run, None, TAPPED)
     camera, spent = Camera(rollout.stage(rollout.task.device), 640, 360), list[float]()
     for rows in rollout.steps(PICTURES + 1):
@@ -182,7 +182,7 @@ def exported(run: Run) -> dict[str, float]:
 
 
 def measure(task: str, worlds: int) -> dict[str, Any]:
-    """All of one task."""
+    """All measurements of one task."""
     rounds, row = list[tuple[list[float], list[float]]](), dict[str, Any]()
     for number in range(ROUNDS):
         with tempfile.TemporaryDirectory() as store, tempfile.TemporaryDirectory() as other:

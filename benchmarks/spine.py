@@ -1,6 +1,6 @@
-"""From YAML to the first iteration, steps a second on this machine, log latency, lines of code: ``python -m benchmarks.spine``.
+"""From YAML to the first iteration, steps per second on this machine, log latency, lines of code: ``python -m benchmarks.spine``.
 
-Everything is measured through the real command and controller, on a fresh home directory; the table goes to ``spine.md``.
+Everything is measured through the real command and controller, with a new home directory; the table goes to ``spine.md``.
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ class Bench:
         return first_process - detail["createdAt"] / 1000, seconds(lines[0]["time"]) - first_process
 
     def rate(self, detail: dict[str, Any]) -> float:
-        """Median steps a second of the gang, the first two iterations left out."""
+        """Median steps per second of the gang, without the first two iterations."""
         records = self.client.get(f"/api/runs/{detail['run']}/metrics")[2:]
         return statistics.median(record["steps_per_second"] for record in records)
 
     def log_latency(self, lines: int = 50) -> list[float]:
-        """Line written by a rank → seen by ``muster logs -f``, one value a line [s]."""
+        """Line written by a rank → seen by ``muster logs -f``, one value per line [s]."""
         spec = self.home / "ticker.yaml"
         code = f"import time\\nfor _ in range({lines}): print(time.time(), flush=True); time.sleep(0.1)"
         spec.write_text(f'name: ticker\nresources: {{cpus: 0.1, memory: 16MiB}}\ncommand: [python, -c, "{code}"]\n')

@@ -1,6 +1,6 @@
-"""How long a person waits for the command: ``python -m benchmarks.startup``; the table goes to ``startup.md``.
+"""Waiting time of a user for the command: ``python -m benchmarks.startup``; the table goes to ``startup.md``.
 
-CPU time is what the kernel charges to the process and its children (user and system); ready is the time to the line ``Muster serves``.
+CPU time is the user and system time of the process and its children; ready is the time to the line ``Muster serves``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def cpu_of(command: list[str], env: dict[str, str]) -> tuple[float, float]:
 
 
 def serving(env: dict[str, str]) -> tuple[subprocess.Popen[str], float]:
-    """A controller, and how long it took to be ready [s]."""
+    """A controller, and the time until it was ready [s]."""
     began = time.monotonic()
     server = subprocess.Popen([MUSTER, "serve", "--port", "0"], env=env, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None and server.stdout.readline().startswith("Muster serves ")

@@ -1,4 +1,4 @@
-"""rsl-rl's own runner on a task of ours: what a user would have without Muster's learner, on the same simulation."""
+"""rsl-rl's own runner on one of our tasks: the alternative to Muster's learner, on the same simulation."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _wait() -> None:
 
 
 def stock_seconds(runner: OnPolicyRunner, iterations: int, warm: int = 5) -> float:
-    """Seconds an iteration, after ``warm`` ones."""
+    """Seconds per iteration, after ``warm`` iterations."""
     with contextlib.redirect_stdout(io.StringIO()):
         runner.learn(warm)
         _wait()

@@ -1,11 +1,11 @@
-"""What a declared task is made of and what each part costs on this device: kernels, sensors, terms, and compiling it.
+"""Cost of the parts of a declared task on this device: kernels, sensors, terms, and compilation.
 
     python -m benchmarks.tasks [--tasks Ant Quadruped] [--worlds 4096] [--no-compile] [--out DIRECTORY]
 
-A part is recorded many times over in one graph, and its share is that of one control step of the same task; all graphs take turns, so that
-what else happens on the machine happens to all of them. A sensor that the task does not have is added to it, and nothing reads it. A term
-is measured with and without: in a task with sixteen more of them. Compiling is done in processes of its own, with a kernel cache that is
-empty (cold) and then full (warm). Writes ``tasks.md`` on a GPU and ``tasks_cpu.md`` without one.
+A part is captured many times in one graph, and its share is relative to one control step of the same task. All graphs take turns, so that
+other load on the machine affects all of them. A sensor that the task lacks is added, and nothing reads it. A term's cost is the
+difference to a task with sixteen more of them. Compilation runs in separate processes, with a kernel cache that is empty (cold) and then
+full (warm). Writes ``tasks.md`` on a GPU and ``tasks_cpu.md`` without one.
 """
 
 from __future__ import annotations
@@ -33,11 +33,13 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, device_name, wait
 from worker.simulation.capture import CapturedStep
 from worker.simulation.episodes import STEP
+from worker.simulation.sensors.camera import CameraSensor
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan
 from worker.simulation.sensors.imu import Imu
 from worker.simulation.sensors.momentum import AngularMomentum
+from worker.simulation.sensors.rays import LidarPattern, RayCaster
 from worker.tasks import find_task, terms
 from worker.tasks.compiler import Kernels, further
 from worker.tasks.declaration import Declaration, Metric, Observation
@@ -46,17 +48,17 @@ from worker.tasks.declared import DeclaredTask
 WORLDS, WORLDS_CPU = 4096, 32
 TASKS = ("Ant", "Quadruped")
 FEET = {"Ant": "*_foot", "Quadruped": "*_shank", "LiftCube": "?f_down"}
-"""Bodies that sensors are put on."""
+"""Bodies that carry the sensors."""
 TRUNKS = {"Ant": "torso", "Quadruped": "trunk", "LiftCube": "link_6"}
 ROUNDS, SECONDS, COPIES = 9, 0.15, 20
 MORE = 16
-"""So many more terms."""
+"""Number of additional terms."""
 DEVICE = "cuda:0" if CUDA else "cpu"
 LOADED = re.compile(r"^Module (\S+) \S+ load on device '.*' took ([\d.]+) ms", re.M)
 
 
 def sensors(task: str) -> dict[str, Any]:
-    """One of each kind, by what the table calls it."""
+    """One of each kind, by its name in the table."""
     feet, trunk = FEET[task], TRUNKS[task]
     return {
         "contacts": ContactSensor(bodies=feet),
@@ -67,6 +69,16 @@ def sensors(task: str) -> dict[str, Any]:
     }
 
 
+def eyes(task: str) -> dict[str, Any]:
+    """What follows rays, which costs so much more that it is measured by itself alone."""
+    trunk, pixels = TRUNKS[task], {"width": 64, "height": 64}
+    return {
+        "rays_64": RayCaster(body=trunk, pattern=LidarPattern(count=64), start=0.5),
+        "depth_64x64": CameraSensor(body=trunk, kind="depth", **pixels),
+        "colour_64x64": CameraSensor(body=trunk, **pixels),
+    }
+
+
 def varied(task: str, change: Callable[[Declaration], Declaration]) -> type[DeclaredTask]:
     """The task with another declaration."""
     kind: Any = find_task(task)
@@ -74,7 +86,7 @@ def varied(task: str, change: Callable[[Declaration], Declaration]) -> type[Decl
 
 
 def made(kind: Any, worlds: int) -> DeclaredTask:
-    """A task that acts at random; what Warp says of its modules is not shown."""
+    """A task with random actions; Warp's messages about its modules are not shown."""
     with contextlib.redirect_stdout(io.StringIO()):
         task: DeclaredTask = kind(kind.config_type(), worlds, seed=1, device=DEVICE)
     task.actions.uniform_(-1.0, 1.0)
@@ -82,7 +94,7 @@ def made(kind: Any, worlds: int) -> DeclaredTask:
 
 
 def parts(task: DeclaredTask) -> dict[str, Callable[[], None]]:
-    """What a control step is made of besides the physics, as launches."""
+    """The launches of a control step besides the physics."""
     rows = [array for group in further(task.plan) for array in task._rows[group]]
     common = [int(STEP), task.max_episode_length, *rows, *task._common]
 
@@ -109,7 +121,7 @@ def measured(sensor: Any) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def unmeasured(sensed: DeclaredTask, plain: DeclaredTask) -> Iterator[None]:
-    """Within it, a task measures only what the plain one does."""
+    """In this context, a task runs only the sensors of the plain one."""
     sensors, needs = sensed.sensors, sensed._needs
     sensed.sensors, sensed._needs = {key: sensors[key] for key in plain.sensors}, plain._needs
     try:
@@ -119,7 +131,7 @@ def unmeasured(sensed: DeclaredTask, plain: DeclaredTask) -> Iterator[None]:
 
 
 def seconds(graphs: Mapping[str, Callable[[], None]]) -> dict[str, list[float]]:
-    """Time of one replay of each graph, of each round: they take turns."""
+    """Time of one replay of each graph in each round; the graphs take turns."""
     counts, found = {}, dict[str, list[float]]()
     for name, launch in graphs.items():
         launch()
@@ -165,15 +177,21 @@ TERMS = ("reward of the root", "reward of each joint", "observation of each join
 def measure(name: str, worlds: int) -> dict[str, Any]:
     """Seconds of a control step and of its parts, of each sensor, of a term."""
     plain = made(find_task(name), worlds)
-    added = {key: each for key, each in sensors(name).items()}
-    sensed = made(varied(name, lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})), worlds)
+
+    def with_sensors(added: dict[str, Any]) -> DeclaredTask:
+        change = lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})  # noqa: E731
+        return made(varied(name, change), worlds)
+
+    added, looking = sensors(name), eyes(name)
+    sensed, seeing = with_sensors(added), with_sensors(looking)
     graphs: dict[str, Callable[[], None]] = {"step": CapturedStep(plain._whole, DEVICE).launch}
-    # both of the same worlds, since what the solver has to do depends on what they are in
+    # both on the same worlds, since the solver's work depends on their state
     graphs["step, sensed"] = CapturedStep(sensed._whole, DEVICE).launch
     with unmeasured(sensed, plain):
         graphs["step, unmeasured"] = CapturedStep(sensed._whole, DEVICE).launch
     graphs |= {part: copies(launch) for part, launch in parts(plain).items()}
     graphs |= {f"sensor {key}": copies(measured(sensed.sensors[key])) for key in added}
+    graphs |= {f"sensor {key}": copies(measured(seeing.sensors[key])) for key in looking}
     for term in TERMS:
         crowd = parts(made(varied(name, lambda given, term=term: more(term, given)), worlds))  # type: ignore[misc]
         graphs[f"term {term}"] = copies(lambda crowd=crowd: (crowd["judge"](), crowd["observe"]()))  # type: ignore[misc]
@@ -191,11 +209,11 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
     started = time.perf_counter()
     Kernels(name, plain.plan, plain._needs.apart)
     columns = {key: len(sensed.sensors[key].names) for key in added}
-    return {"times": times, "text": time.perf_counter() - started, "columns": columns}
+    return {"times": times, "text": time.perf_counter() - started, "columns": columns, "eyes": [*looking]}
 
 
 def compiled(name: str, worlds: int) -> dict[str, Any]:
-    """Seconds until a task is there in a new process, and of them those for its own kernels and for all, cold and warm."""
+    """Seconds until a task is built in a new process, and those for its own kernels and for all kernels, cold and warm."""
     found = {}
     with tempfile.TemporaryDirectory() as cache:
         for state in ("cold", "warm"):
@@ -212,7 +230,7 @@ def compiled(name: str, worlds: int) -> dict[str, Any]:
 
 
 def build(name: str, worlds: int) -> None:
-    """Build a task, and print in the last line how long it took."""
+    """Build a task, and print the time it took in the last line."""
     kind: Any = find_task(name)
     started = time.perf_counter()
     kind(kind.config_type(), worlds, seed=1, device=DEVICE)
@@ -247,7 +265,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         "## Sensors",
         "",
         "Each by itself, measured once a control step; a contact sensor that is `fine` takes its cost in every physics step. Those that "
-        "look at bodies need their poses as well. All of them: the step with them, poses included, less the step without.",
+        "look at bodies need their poses as well. All of them: the step with them, poses included, less the step without. Those that "
+        "follow rays come after them, and are not among them.",
         "",
         "| task | sensor | columns | [µs] | of a step |",
         "|---|---|--:|--:|--:|",
@@ -261,6 +280,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         lines.append(
             f"| {row['task']} | all of them | {sum(row['columns'].values())} | {1e6 * took:.1f} | {took / step:+.2%} |"
         )
+        for key in row["eyes"]:
+            took = times[f"sensor {key}"]
+            lines.append(f"| {row['task']} | {key} | | {1e6 * took:.1f} | {took / step:.2%} |")
     lines += [
         "",
         "## A term",
@@ -279,7 +301,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def compilation(rows: list[dict[str, Any]]) -> list[str]:
-    """The part of the table that is about compiling."""
+    """The part of the table about compilation."""
     if not rows:
         return []
     lines = [

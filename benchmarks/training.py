@@ -3,9 +3,9 @@
     python -m benchmarks.training [--tasks Ant Humanoid] [--worlds 4096 16384] [--sweep Ant] [--out DIRECTORY]
 
 On a CUDA device it writes ``gpu.md`` and ``gpu.json``, else, with fewer worlds, ``cpu.md`` and ``cpu.json``. Every rate is in policy
-steps of all worlds together per second, the median of three stretches after everything was captured; the cold start stands apart.
-A loaded machine is refused: :mod:`benchmarks.load`. Without a GPU use ``make bench``: it makes this table and that of whole trainings
-in one run, and refuses tables that contradict one another.
+steps per second over all worlds, the median of three stretches after all captures; the cold start is reported separately. A loaded
+machine is refused: :mod:`benchmarks.load`. Without a GPU use ``make bench``: it makes this table and that of whole trainings in one run,
+and refuses tables that contradict each other.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def build(
     loop_type: type[Loop] = Loop,
     **train: Any,
 ) -> Loop:
-    """The real training loop, on a store of its own; it saves every so many iterations, by default never."""
+    """The real training loop, on its own store; it saves at the given interval of iterations, by default never."""
     placement = Placement.from_env(os.environ)
-    name = task.rpartition(":")[2]  # of a task by its path
+    name = task.rpartition(":")[2]  # a task given by its path
     run = Store(store).open().run(f"bench-{name}-{worlds}-{seed}".lower())
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}
     spec = {"train": section, "checkpoint": {"every": every}}
@@ -69,18 +69,18 @@ def build(
 
 
 def device_name() -> str:
-    """What the tables call the device."""
+    """Name of the device in the tables."""
     return torch.cuda.get_device_name() if CUDA else "the CPU"
 
 
 def wait() -> None:
-    """Until the device is done."""
+    """Wait for the device."""
     if CUDA:
         torch.cuda.synchronize()
 
 
 def rate(step: Callable[[], Any], steps: int) -> float:
-    """Policy steps a second of a function that makes ``steps`` of them."""
+    """Policy steps per second of a function that makes ``steps`` of them."""
     for _ in range(4 if CUDA else 1):
         step()
     wait()
@@ -99,7 +99,7 @@ def rate(step: Callable[[], Any], steps: int) -> float:
 
 
 def kernels(step: Callable[[], Any]) -> dict[str, float]:
-    """Where one iteration's time on the device goes [ms]: by kind, and the rest of the wall time, in which no kernel ran."""
+    """Time of one iteration on the device by kind of kernel [ms], and the remaining wall time without a kernel."""
     step()
     wait()
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:

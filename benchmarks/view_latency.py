@@ -1,9 +1,9 @@
-"""How old what ``muster view`` shows of a running training is: from the end of a control step to Rerun's page in Chromium, on the CPU.
+"""Latency of ``muster view`` on a running training: from the end of a control step to Rerun's page in Chromium, on the CPU.
 
     python -m benchmarks.view_latency [--task Ant] [--worlds 64] [--seconds 30] [--out DIRECTORY]
 
-A process trains; this one is ``muster view``, whose page is open in Chromium without a display. After each frame that is shown a word
-of twelve random letters follows in the stream; a script in the page sees it arrive. All times are of one machine's clock. Writes
+A process trains; this one is ``muster view``, whose page is open in Chromium without a display. After each displayed frame a word of
+twelve random letters follows in the stream, whose arrival a script in the page detects. All times are of one machine's clock. Writes
 ``view.md``.
 """
 
@@ -36,9 +36,9 @@ from worker.telemetry.tap import Tap
 from worker.telemetry.view import Training
 
 WARM = 20.0
-"""Seconds in which the page starts and draws its first frames."""
+"""Seconds for the page to start and draw its first frames."""
 LATE = 8.0
-"""Seconds in which the last frames may still arrive."""
+"""Seconds for the last frames to arrive."""
 SHOWN = 4
 """Worlds in the view."""
 PARTS = (
@@ -77,7 +77,7 @@ window.fetch = async (...given) => {
 
 
 def train(task: str, worlds: int, folder: Path) -> None:
-    """Train until SIGTERM; the end of each control step [ns] goes into a file, at the number that the tap gives it."""
+    """Train until SIGTERM; write the end of each control step [ns] to a file, by the step's number in the tap."""
     loop, taps = build(task, worlds, folder / "store"), list[Tap]()
     ends = np.memmap(folder / "ends", np.int64, "w+", shape=(1 << 22,))
     step, opened = loop.task.step, Tap.open
@@ -97,7 +97,7 @@ def train(task: str, worlds: int, folder: Path) -> None:
 
 
 class Timed(Training):
-    """The view of a training, which says when it has read a row."""
+    """The view of a training, which records when it has read a row."""
 
     read = 0
 
@@ -108,7 +108,7 @@ class Timed(Training):
 
 
 class Marked(screen.Screen):
-    """Its stream has a word behind each frame."""
+    """Its stream has a word after each frame."""
 
     frames_sent: dict[str, tuple[int, int, int]] = {}
     """By word: number of the step, when its row was read, when the frame was handed to Rerun [ns]."""
@@ -123,7 +123,7 @@ class Marked(screen.Screen):
 
 
 def look_on(url: str, seconds: float, home: Path, stop: list[int], found: dict[str, Any]) -> None:
-    """Open the page, and bring what its script saw; then the view ends."""
+    """Open the page and return its script's observations; then the view ends."""
     try:
         browser = Browser("about:blank", home)
         browser.call("Page.addScriptToEvaluateOnNewDocument", source=SCRIPT)

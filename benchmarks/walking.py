@@ -1,13 +1,14 @@
-"""How long it takes until a robot walks: wall time from the start of training until a policy follows commands and does not fall.
+"""Wall time from the start of training until a robot walks: its policy follows commands and does not fall.
 
     python -m benchmarks.walking --task G1Flat --algorithm sac|ppo [--worlds 4096] [--seconds 600] [--out DIRECTORY]
 
 A policy walks when, in a whole episode of each of ``--judged`` other worlds (drawn from another seed, with the task's own noise,
 pushes and randomisation), the mean length of the episodes is at least ``--length`` of the longest and the mean tracking errors of its
 mean actions are at most ``--linear`` and ``--angular``. Those worlds have the task's own physics steps and mjlab's limits of the solver,
-whatever the training has (``--limits ours``, ``--train '{"config": {"substeps": 2}}'``). It is judged every ``--every`` seconds of training, and the clock of training stands
-still meanwhile: how long that took stands apart. The clock starts with the first iteration, before any graph is recorded; what
-comes before (imports, worlds, kernels) stands apart, too. Training is as ``muster run`` does it, with metrics and checkpoints.
+whatever the training has (``--limits ours``, ``--train '{"config": {"substeps": 2}}'``). It is judged every ``--every`` seconds of
+training, while the clock of training is paused; the time of judging is reported separately. The clock starts with the first iteration,
+before any graph is captured; earlier work (imports, worlds, kernels) is reported separately, too. Training is that of ``muster run``,
+with metrics and checkpoints.
 
 Writes ``walking-<task>-<algorithm>-<seed>.json`` and the curve as ``.png`` where matplotlib is installed.
 """
@@ -40,18 +41,18 @@ from worker.tasks.task import Task
 
 ALGORITHMS = ("sac", "ppo")
 LENGTH = 0.987
-"""Share of the longest episode: 987 of 1,000 steps, as the public records of G1 have it."""
+"""Share of the longest episode: 987 of 1,000 steps, as in the public records of G1."""
 LINEAR, ANGULAR = 0.3, 0.4
 """Tracking errors of a robot that follows its commands [m/s, rad/s]: commands reach 1 m/s and 0.5 rad/s, and pushes of up to 0.5 m/s
 come every 1 to 3 s."""
 
 PHYSICS = ("substeps", "solver_iterations", "solver_line_search")
-"""Settings by which a training may have rougher physics than its judgement."""
+"""Settings in which a training's physics may be coarser than its judgement's."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a policy has to reach to walk.
+    """Criteria of walking.
 
     Attributes:
         length: Least mean length of an episode, as a share of the longest.
@@ -73,24 +74,24 @@ class Bounds:
 
 
 class WalkingLoop(Loop):
-    """A training that is judged at intervals, and left once its policy walks."""
+    """A training that is judged at intervals, and ends once its policy walks."""
 
     def judged_by(self, worlds: Task, bounds: Bounds, every: float, limit: float) -> WalkingLoop:
-        """How it is judged; before :meth:`train`.
+        """Set up the judgement; call it before :meth:`train`.
 
         Args:
-            worlds: Where policies are judged.
-            bounds: What they have to reach.
+            worlds: Worlds in which policies are judged.
+            bounds: Criteria of walking.
             every: Seconds of training between two judgements.
-            limit: Seconds of training after which it is left in any case.
+            limit: Seconds of training after which it ends in any case.
         """
         self._worlds, self._bounds, self._every, self._limit = worlds, bounds, every, limit
         self.curve: list[dict[str, Any]] = []
-        """A row a judgement: ``seconds`` of training, ``env_steps``, ``iteration``, and what :class:`Judgement` has."""
+        """One row per judgement: ``seconds`` of training, ``env_steps``, ``iteration``, and the fields of :class:`Judgement`."""
         self.walked: dict[str, Any] | None = None
         """The first row of a policy that walks."""
         self.judging = 0.0
-        """Seconds that all judgements took together, which the clock of training does not count."""
+        """Total seconds of all judgements, which the clock of training excludes."""
         self._next, self._began = every, 0.0
         return self
 
@@ -111,7 +112,7 @@ class WalkingLoop(Loop):
         if not left and self.walked is None and (self.trained >= self._next or self.trained >= self._limit):
             self._judge()
         if self.walked is not None or self.trained >= self._limit:
-            self.stop.requested = True  # it saves after the next iteration, and is left
+            self.stop.requested = True  # it saves after the next iteration, then exits
         return left
 
     def _judge(self) -> None:
@@ -127,7 +128,7 @@ class WalkingLoop(Loop):
         self._next = seconds + self._every
         wait()
         self.judging += time.perf_counter() - started
-        self._stopwatch.begin()  # the run's own records don't count it either
+        self._stopwatch.begin()  # the run's own records exclude it too
         print(
             f"{seconds:.1f} s: length {100 * judged.length_share:.1f} %, linear {judged.linear_error:.3f} m/s, angular "
             f"{judged.angular_error:.3f} rad/s (judged in {judged.judging_s:.1f} s)",
@@ -136,13 +137,13 @@ class WalkingLoop(Loop):
 
 
 def judged_with(config: Any) -> Any:
-    """The training's configuration with the physics that the task has by default: its steps, and its limits of the solver."""
+    """The training's configuration with the task's default physics: its physics steps and its limits of the solver."""
     usual = type(config)()
     return dataclasses.replace(config, **{name: getattr(usual, name) for name in PHYSICS})
 
 
 def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
-    """Train once, and say when the policy walked. Raises ValueError where the task can't be judged."""
+    """Train once, and report when the policy walked. Raises ValueError if the task can't be judged."""
     built = time.perf_counter()
     asked = {
         "task": options.task,
@@ -199,7 +200,7 @@ def verdict(row: dict[str, Any]) -> str:
 
 
 def draw(row: dict[str, Any], path: Path) -> None:
-    """Lengths and errors against the time of training, with their bounds; nothing where matplotlib is not installed."""
+    """Plot lengths and errors against the time of training, with their bounds; do nothing without matplotlib."""
     try:
         import matplotlib
     except ImportError:
@@ -228,7 +229,7 @@ def draw(row: dict[str, Any], path: Path) -> None:
 
 
 def check(options: argparse.Namespace) -> None:
-    """Raises ValueError for options that make no sense."""
+    """Raises ValueError for invalid options."""
     tasks = [case.task for case in CASES.values() if "mjlab" in case.peers]
     if options.task not in tasks:
         raise ValueError(f"--task {options.task}: it follows no velocity commands; {nearest(options.task, tasks)}")

@@ -28,7 +28,7 @@ from orchestrator.control.compute_environments import ensure_compute_environment
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
@@ -121,13 +121,13 @@ class Server:
             self.peers = Peers(self.store, home)
             stack.callback(self.peers.close)
             try:
-                self.controller = Controller(
+                self.reconciler = Reconciler(
                     found, nodes, self.store, self.bus, self.peers, retention=retention, min_free=min_free
                 )
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
-            stack.callback(self.controller.close)
-            self.evaluations = AutomaticEvaluations(self.controller)
+            stack.callback(self.reconciler.close)
+            self.evaluations = AutomaticEvaluations(self.reconciler)
             stack.callback(self.evaluations.close)
             if "local" in nodes.names:
                 _name_lost_gangs(home, found)
@@ -135,10 +135,10 @@ class Server:
             self.url = (
                 f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
             )
-            self.deliveries = Deliveries(self.controller, told, self.url)
+            self.deliveries = Deliveries(self.reconciler, told, self.url)
             stack.callback(self.deliveries.close)
             self._opened = stack.pop_all()
-        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
+        self.app = create_app(self.reconciler, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
         add_console(self.app)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
@@ -164,7 +164,7 @@ class Server:
         """Start the controller and the server, and tell commands on this machine where it is."""
         self.bus.open()
         self.peers.start()
-        self.controller.start()
+        self.reconciler.start()
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()

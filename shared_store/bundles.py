@@ -104,6 +104,11 @@ def verify(bundle: Path) -> dict[str, Any]:
     return manifest
 
 
+def reason(error: Exception, bundle: Path) -> str:
+    """The words of an error without the bundle's directory, for a message that names what the bundle is."""
+    return str(error).removeprefix(f"bundle {bundle}: ")
+
+
 def read_contract(bundle: Path) -> Contract:
     """The policy contract of a bundle. Raises DamagedBundle."""
     try:

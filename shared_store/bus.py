@@ -27,9 +27,9 @@ class Credential:
     """Authenticates an attempt's nodes; its text is ``MUSTER_BUS_TOKEN``."""
 
     password: str
-    """Of the router: the same for all nodes; it only lets them connect."""
+    """Secret of the router, the same for all nodes; it only lets them connect."""
     secret: str
-    """Of the attempt: only its nodes and the controller know it."""
+    """Secret of the attempt, known only to its nodes and the controller."""
 
     @classmethod
     def derive(cls, master: str, job: str, attempt: int) -> Credential:

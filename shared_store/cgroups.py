@@ -1,7 +1,7 @@
 """Control groups (version 2) around nodes: no process of a node can leave its group, whatever sessions and forks it uses.
 
-They are used where this process may create one below its own: as root, or where it is delegated (``systemd-run --user --scope -p
-Delegate=yes``). A trial shows whether it may. No controller is enabled in them. Linux only.
+They are used if this process may create groups below its own: as root, or with delegation (``systemd-run --user --scope -p
+Delegate=yes``). A trial decides. No controller is enabled in them. Linux only.
 """
 
 from __future__ import annotations
@@ -76,6 +76,6 @@ def remove_group(group: str) -> None:
 def remove_abandoned_groups(directory: str) -> None:
     """Remove empty, old groups of nodes below ``directory``: leftovers of shims that were killed while no controller stopped the gang."""
     for entry in os.scandir(directory) if directory else ():
-        with contextlib.suppress(OSError):  # the kernel refuses where a process is in it
+        with contextlib.suppress(OSError):  # the kernel refuses if a process is in it
             if entry.name.startswith("muster-") and time.time() - entry.stat().st_mtime > _NEW:
                 os.rmdir(entry.path)

@@ -92,6 +92,13 @@ class Checkpoint:
         """Bytes of all the files that the manifest lists."""
         return sum(entry["size"] for entry in self.manifest["files"].values())
 
+    @property
+    def is_scheduled(self) -> bool:
+        """Whether the job asked for it; False if it was saved only because its iterations are long (:mod:`worker.learning.leaving`)."""
+        with contextlib.suppress(DamagedCheckpoint):
+            return self.manifest.get("scheduled") is not False
+        return True
+
     def verify(self) -> None:
         """Raises DamagedCheckpoint, naming the first file that is missing, truncated or altered."""
         for name, entry in sorted(self.manifest["files"].items()):
@@ -296,12 +303,13 @@ class CheckpointWriter:
 
 
 def retain(run: Run, keep: int) -> list[str]:
-    """Delete all but the newest ``keep`` checkpoints, the one with the greatest ``score``, the best evaluated one, and those of finished
-    or pending exports and of evaluations that keep their checkpoint; returns the deleted names.
+    """Delete all but the newest ``keep`` scheduled checkpoints, the newest one of all, the one with the greatest ``score``, the best
+    evaluated one, and those of finished or pending exports and of evaluations that keep their checkpoint; returns the deleted names.
     """
     checkpoints = list_checkpoints(run)
     scored = [(score, c.name) for c in checkpoints if (score := _score(c)) is not None]
-    kept = {c.name for c in checkpoints[-max(1, keep) :]} | ({max(scored)[1]} if scored else set())
+    scheduled = [c for c in checkpoints if c.is_scheduled]
+    kept = {c.name for c in (*scheduled[-max(1, keep) :], *checkpoints[-1:])} | ({max(scored)[1]} if scored else set())
     kept |= kept_checkpoints(run)
     best = best_evaluated(checkpoints, by_checkpoint(run))
     kept |= {best.name} if best else set()

@@ -1,4 +1,4 @@
-"""Runs side by side: those that differ in their seed alone are one group, with means and standard deviations."""
+"""Comparison of runs. Runs that differ only in their seed form a group, with means and standard deviations."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from shared_store.wording import counted
 COLUMNS = ("RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS")
 """Of the table; see :meth:`Group.cells`."""
 POINTS = 200
-"""Points of the curve of a group."""
+"""Number of points in the curve of a group."""
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What is compared of one run.
+    """The data of one run to compare.
 
     Attributes:
-        name: Of the run.
-        spec: Its job YAML; empty where it has none.
-        records: Its metrics, one an iteration.
-        evaluation: The summary of an evaluation; None where it has none.
+        name: Name of the run.
+        spec: Its job YAML; empty without one.
+        records: Its metrics, one per iteration.
+        evaluation: The summary of an evaluation; None without one.
         evaluations: The summaries of all evaluations of the same checkpoint.
         path: Its directory in the store.
     """
@@ -62,13 +62,13 @@ class RunFacts:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs whose specs differ in name and seed alone."""
+    """Runs whose specs differ only in name and seed."""
 
     runs: Sequence[RunFacts]
 
     @property
     def label(self) -> str:
-        """Its run; of several what their names have in common."""
+        """The name of its run, or the common part of several names."""
         first, last = min(run.name for run in self.runs), max(run.name for run in self.runs)
         if len(self.runs) == 1:
             return first
@@ -76,12 +76,12 @@ class Group:
         return f"{first[:shared]}* ({len(self.runs)})"
 
     def numbers(self, key: str) -> list[float]:
-        """A number of the newest record of each run that has it."""
+        """A number of the newest record, for each run that has it."""
         return [value for run in self.runs if (value := run.last(key)) is not None]
 
     @property
     def evaluations(self) -> list[Mapping[str, Any]]:
-        """Those of its runs that have one."""
+        """Evaluations of its runs."""
         return [run.evaluation for run in self.runs if run.evaluation]
 
     def describe(self) -> dict[str, Any]:
@@ -181,14 +181,14 @@ def grouped(runs: Iterable[RunFacts]) -> list[Group]:
     for run in runs:
         spec = {key: value for key, value in run.spec.items() if key not in ("name", "train")}
         train = {key: value for key, value in run.train.items() if key != "seed"}
-        # without a spec nothing says what two runs have in common
+        # without a spec, runs can't be compared
         key = json.dumps([spec, train], sort_keys=True) if run.train else run.name
         groups.setdefault(key, []).append(run)
     return [Group(each) for each in groups.values()]
 
 
 def same_episodes(new: RunFacts, old: RunFacts) -> tuple[Mapping[str, Any], Mapping[str, Any]] | None:
-    """An evaluation of each of two runs that played the same episodes: those that have the most in common; None where none did."""
+    """An evaluation of each of two runs on the same episodes: the pair with the most common episodes; None without any."""
     both = [(a, b) for a in new.evaluations for b in old.evaluations if are_paired(a, b)]
     return max(both, key=lambda pair: min(pair[0]["episodes"], pair[1]["episodes"]), default=None)
 
@@ -226,7 +226,7 @@ def sentence(told: Mapping[str, Any]) -> str:
 
 
 def _at(curve: Sequence[tuple[float, float]], steps: float) -> float | None:
-    """The value of a curve, in proportion between two points; None outside."""
+    """The value of a curve, linearly interpolated; None outside."""
     if not curve[0][0] <= steps <= curve[-1][0]:
         return None
     index = bisect_right(curve, steps, key=lambda point: point[0])

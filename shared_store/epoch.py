@@ -1,8 +1,8 @@
 """Fencing: every attempt that may write to a run has an epoch, and only the attempt that the run's ``EPOCH`` names may commit.
 
 Before it launches a gang, the controller creates ``EPOCH.<n>``, exclusively: of several controllers on one store, only one gets
-the number, also on NFS and EFS. Then it writes n to ``EPOCH``. A gang that was believed dead and comes back reads another gang's
-number there, and stops. Readers open only ``EPOCH``; ``EPOCH.<n>`` tells controllers which attempt writes.
+the number, also on NFS and EFS. Then it writes n to ``EPOCH``. A gang that was presumed dead and comes back reads another gang's number
+there, and stops. Readers open only ``EPOCH``; ``EPOCH.<n>`` tells controllers which attempt writes.
 """
 
 from __future__ import annotations
@@ -137,8 +137,8 @@ def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
 def check_epoch(run: Run, epoch: int) -> None:
     """Raises StaleEpoch if another attempt owns the run.
 
-    A smaller number counts, too: of two controllers that publish at the same instant, the last one owns the run, and exactly one
-    gang goes on. A missing file proves nothing.
+    A smaller number counts, too: of two controllers that publish at the same instant, the last one owns the run, and exactly one gang
+    continues. A missing file proves nothing.
     """
     current = read_epoch(run)
     if current not in (0, epoch):

@@ -19,6 +19,9 @@ from shared_store.wording import counted
 TERMS_SHOWN = 6
 """Number of reward terms in a printed table: the largest ones."""
 
+BY_CLOCK = "the clock ended the episode"
+"""What a success is of a task that does not declare it: its length tells as much."""
+
 _NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9-]{1,40})?")
 _NUMBERS = ("mean_return", "mean_length", "max_length", "episodes", "time")
 
@@ -99,6 +102,22 @@ def kept_checkpoints(run: Run) -> set[str]:
     return kept
 
 
+def in_one_line(summary: Mapping[str, Any]) -> str:
+    """An evaluation in one line: the share of successes where the task declares what a success is, else how long its episodes lasted."""
+    episodes, length, longest = (summary[key] for key in ("episodes", "mean_length", "max_length"))
+    success, meant = _mapping(summary, "success"), summary.get("success_is")
+    mean = f"mean return {summary['mean_return']:.2f}"
+    if not success or not isinstance(meant, str) or meant == BY_CLOCK:
+        share = f"{100 * length / longest:.0f} %"
+        return f"mean episode length {length:.1f} of {longest} ({share}), {mean} over {counted(episodes, 'episode')}"
+    shown = "".join(f"{name} {text}, " for name, text in _mapping(summary, "shown").items())
+    count = success.get("count")
+    return (
+        f"{count} of {counted(episodes, 'episode')} succeeded ({_percent(success.get('share'))}: {meant}), {shown}"
+        f"mean length {length:.1f} steps, {mean}"
+    )
+
+
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """An evaluation as lines of text."""
     if _mapping(summary, "race"):
@@ -108,20 +127,20 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
     for place, value in flattened(_mapping(summary, "config")):
         yield f"  with config.{place}: {value}"
-    yield f"{'':20} {'mean':>10} {'95 % interval':>24} {'std':>10}"
+    rewards, metrics = _mapping(summary, "rewards"), _mapping(summary, "metrics")
+    largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
+    terms = {f"reward {name}": _mapping(rewards, name) for name in largest[:TERMS_SHOWN]}
+    terms |= {f"metric {name}": _mapping(metrics, name) for name in metrics}
+    width = max(map(len, [*terms, 20 * " "]))
+    yield f"{'':{width}} {'mean':>10} {'95 % interval':>24} {'std':>10}"
     success = _mapping(summary, "success")
     if success:
         ends = f"{_percent(success.get('low'))} to {_percent(success.get('high'))}"
-        yield f"{'success':20} {_percent(success.get('share')):>10} {ends:>24} {'':10}  {summary.get('success_is', '')}"
-    yield _row("return", _mapping(summary, "return"))
-    yield f"{_row('length', _mapping(summary, 'length'))}  of at most {summary['max_length']}"
-    rewards = _mapping(summary, "rewards")
-    largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
-    for name in largest[:TERMS_SHOWN]:
-        yield _row(f"reward {name}", _mapping(rewards, name))
-    metrics = _mapping(summary, "metrics")
-    for name in metrics:
-        yield _row(f"metric {name}", _mapping(metrics, name))
+        yield f"{'success':{width}} {_percent(success.get('share')):>10} {ends:>24} {'':10}  {summary.get('success_is', '')}"
+    yield _row("return", _mapping(summary, "return"), width)
+    yield f"{_row('length', _mapping(summary, 'length'), width)}  of at most {summary['max_length']}"
+    for name, figures in terms.items():
+        yield _row(name, figures, width)
     causes = _mapping(summary, "causes")
     ends = ", ".join(f"{name} {_mapping(causes, name).get('count')}" for name in causes)
     yield f"ended by: {ends}"
@@ -151,9 +170,9 @@ def _comparison(compared: Mapping[str, Any]) -> str:
     )
 
 
-def _row(name: str, figures: Mapping[str, Any]) -> str:
+def _row(name: str, figures: Mapping[str, Any], width: int) -> str:
     ends = f"{_number(figures.get('low'))} to {_number(figures.get('high'))}" if figures.get("low") is not None else "-"
-    return f"{name:20} {_number(figures.get('mean')):>10} {ends:>24} {_number(figures.get('std')):>10}"
+    return f"{name:{width}} {_number(figures.get('mean')):>10} {ends:>24} {_number(figures.get('std')):>10}"
 
 
 def _mapping(found: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Leagues of the racer: ``leagues/<name>/``, races of registered models by one set of rules; a league is immutable.
+"""Leagues of the racer: ``leagues/<name>/``, races of registered models under one set of rules; a league is immutable.
 
 ``definition/`` has the rules (``league.json``), ``entries/<number>/`` a model, its evaluation and its race (``entry.json``),
 ``disqualified/<number>/`` the reason why an entry does not count (``ruling.json``); each has a manifest of digests
@@ -37,6 +37,7 @@ CAR: Mapping[str, Any] = {
     "speed_factor": [1.0, 1.0],
     "steering_factor": [1.0, 1.0],
     "steering_offset": [0.0, 0.0],
+    "friction": [0.0, 0.0],
     "stuck_steps": 15,
     "put_back": 1.0,
 }
@@ -58,7 +59,7 @@ class Rules:
 
     Attributes:
         laps: Number of laps; each is a trial from the start line.
-        continuous: Whether a car that leaves the road is put back and goes on, with a penalty.
+        continuous: Whether a car that leaves the road is put back and continues, with a penalty.
         off_track_penalty: Time added to a lap for leaving the road [s].
         crash_penalty: Time added for touching an obstacle [s].
         max_resets: Number of times that a car is put back in one lap.
@@ -83,13 +84,13 @@ class League:
         name: Its name.
         track: Names of the tracks; with several, lap n is driven on number (n - 1) modulo their count.
         rules: The rules of its races.
-        seed: Of every race.
+        seed: Seed of every race.
         owner: The key or the user that created it.
         created: Time of creation [Unix s].
         opens: Time from which races may start [Unix s]; None: at once.
         closes: Time from which no race may start [Unix s]; None: never.
-        most_entries: Of each key or user.
-        track_digests: Of the tracks in the store.
+        most_entries: Greatest number of entries of each key or user.
+        track_digests: Digests of the tracks in the store.
         car: Settings of the task for every car.
     """
 
@@ -142,7 +143,7 @@ class League:
         """Raise LeagueError if a track of the store is missing, damaged or was replaced."""
         for name, digest in self.track_digests.items():
             if digest_of_track(store, name) != digest:
-                raise LeagueError(f"league {self.name}: track {name} is another one than when the league was created")
+                raise LeagueError(f"league {self.name}: track {name} has changed since the league was created")
 
 
 @dataclass(frozen=True)
@@ -205,6 +206,10 @@ class StoredLeague:
             raise LeagueError(f"{what}: {error}") from None
         return {**found, "digest": digest}
 
+    def problem(self, number: int, error: LeagueError) -> str:
+        """The words of an error of an entry, without the names of league and entry."""
+        return str(error).removeprefix(f"league {self.name}: entry {number}").removeprefix(":").removeprefix(" ")
+
     def ruling(self, number: int) -> dict[str, Any] | None:
         """The ruling that disqualifies an entry; None without one. An altered ruling still disqualifies, and says that it is altered."""
         path = self.path / "disqualified" / str(number)
@@ -224,7 +229,7 @@ class StoredLeague:
             try:
                 entry = self.entry(number)
             except LeagueError as error:
-                found.append(Contender(number, "-", "-", None, reason, str(error)))
+                found.append(Contender(number, "-", "-", None, reason, self.problem(number, error)))
                 continue
             reference = f"{entry['model']['name']}@{entry['model']['version']}"
             found.append(Contender(number, entry["racer"], reference, read_race(entry["race"]), reason))
@@ -249,7 +254,7 @@ class StoredLeague:
             number = len(self.numbers()) + 1
             self.admit(entry["owner"], entry["racer"], entry["evaluation"])
             whole = {**entry, "league": {"name": self.name, "digest": digest}, "entry": number, "entered": time.time()}
-            with contextlib.suppress(FileExistsError):  # another was faster: this one is the next
+            with contextlib.suppress(FileExistsError):  # another process was faster: try the next number
                 _seal(self.path / "entries" / str(number), "entry.json", whole)
                 return self.entry(number)
 
@@ -293,12 +298,12 @@ class StoredLeague:
             refuse_links(folder, 3)
             manifest = bundles.verify(folder)
             if list(manifest["files"]) != [name]:
-                raise LeagueError(f"{what} is altered: it has other files than {name}")
+                raise LeagueError(f"{what}: it has other files than {name}")
             document = read_json(folder / name)
         except (DamagedBundle, DamagedFile, OSError) as error:
-            raise LeagueError(f"{what} is altered: {error}") from None
+            raise LeagueError(f"{what}: {bundles.reason(error, folder)}") from None
         if document is None:
-            raise LeagueError(f"{what} is altered: {name} is missing")
+            raise LeagueError(f"{what}: {name} is missing")
         return document, str(manifest["digest"])
 
 
@@ -337,7 +342,7 @@ def create(store: Store, league: League) -> StoredLeague:
             (hidden / folder).mkdir(parents=True)
         _fill(hidden / "definition", "league.json", asdict(league))
         bundles.publish(hidden, path)
-    except FileExistsError:  # another was faster
+    except FileExistsError:  # another process was faster
         raise taken from None
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
@@ -348,6 +353,10 @@ def digest_of_track(store: Store, name: str) -> str | None:
     """Digest of a track of the store; None for a preset and for one drawn from a seed. Raises LeagueError if it does not exist."""
     if tracks.is_made(name):
         return None
+    if name.startswith("random:"):
+        raise LeagueError(
+            f"track {shown(name)}: after random: stands a whole number from 0 to {2**63 - 1}, such as random:7"
+        )
     try:
         track = tracks.find(store, name, tracks.PRESETS)
         track.read()

@@ -160,7 +160,7 @@ def _merged_before(sources: Sequence[_Back], rank: int | None, most: int, first:
             if newest >= bound:
                 kept.append((newest, number, index, line))
     kept = sorted(kept, key=itemgetter(0, 1, 2))[-most:] if most > 0 else []
-    begins = {}
+    begins: dict[int, int] = {}
     for _, number, index, _ in kept:
         begins[number] = min(index, begins.get(number, index))
     for number, source in enumerate(sources):

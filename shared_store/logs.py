@@ -34,7 +34,7 @@ _MOST = 8 << 20
 """Bytes that a poll reads of all logs of an attempt."""
 
 LIMIT_REACHED = "the log reached its limit"
-REPLACED = "the log was truncated or replaced; following goes on from its new beginning"
+REPLACED = "the log was truncated or replaced; following continues from its new beginning"
 
 END_LINE = "node {node} ended: {reason}"
 """The supervisor's last line: no output of the job, so CloudWatch Logs does not show it."""

@@ -71,7 +71,7 @@ class Model:
         return found
 
     def contract(self) -> Contract:
-        """Of its policy. Raises DamagedBundle."""
+        """The contract of its policy. Raises DamagedBundle."""
         return bundles.read_contract(self.bundle)
 
     def verify(self) -> None:
@@ -144,10 +144,10 @@ def register(
     First, it deletes the leftovers of killed registrations by the same registrar.
 
     Args:
-        store: Of the models.
-        name: Of the model.
-        run: Of the checkpoint.
-        checkpoint: An exported one.
+        store: Store of the models.
+        name: Name of the model.
+        run: Run of the checkpoint.
+        checkpoint: An exported checkpoint.
         facts: Further entries of ``model.json``: who registered it, for whom.
         registrar: Id of the controller; no other process registers under it at the same time.
         again: Whether to register a checkpoint that is already a version of the model once more.

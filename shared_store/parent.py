@@ -39,7 +39,7 @@ class WeightsCopy:
 
     Args:
         store: Store of the runs.
-        owner: Of the hidden directory; the next copy of the same owner deletes the leftovers of crashed ones.
+        owner: Owner of the hidden directory; the owner's next copy deletes leftovers of crashed ones.
         source: Checkpoint with the weights.
     """
 
@@ -68,9 +68,7 @@ class WeightsCopy:
         """
         manifest = self.source.manifest
         if WEIGHTS not in manifest["files"]:
-            raise DamagedCheckpoint(
-                f"checkpoint {self.source.name}: it has no {WEIGHTS}, so there are no weights in it"
-            )
+            raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
         self._in_progress.add(self.hidden)
         self._clear_leftovers()
         target = self.hidden / place / self.source.name
@@ -166,7 +164,7 @@ class TeacherCopy(WeightsCopy):
         """Delete the copy and the directories that were created for it."""
         super().discard()
         if self._published is not None:
-            with suppress(OSError):  # one that is not empty: a run's
+            with suppress(OSError):  # not empty: it belongs to a run
                 for each in self._published.parents[:4]:
                     each.rmdir()
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 from shared_store.documents import DocumentError, parse
 
-FORMAT = 2
+FORMAT = 3
 """Version of the document; a newer one is refused."""
 CLOSE = 1e-6
 """Relative difference up to which two numbers count as equal: recompiling a model rounds."""
@@ -35,13 +35,13 @@ class Frame(_Part):
     """A frame on a body of the robot in which a vector is measured."""
 
     name: str
-    """Of the site or body."""
+    """Name of the site or body."""
     body: str
     """Its body."""
     position: tuple[float, float, float]
-    """Of its origin in the body's frame [m]."""
+    """Position of its origin in the body's frame [m]."""
     rotation: tuple[float, float, float, float]
-    """From it to the body's frame, a quaternion xyzw."""
+    """Rotation from it to the body's frame, a quaternion xyzw."""
     root: bool
     """Whether the body is the robot's root."""
 
@@ -51,15 +51,15 @@ class Term(_Part):
     """Consecutive numbers of an observation, each ``scale * clip(quantity - offset)``, in this order."""
 
     name: str
-    """Of the term in its task."""
+    """Name of the term in its task."""
     kind: Literal["measured", "command", "previous_action"]
     """Its source: sensors, the operator, or the policy itself (its last actions, clipped)."""
     first: int
     """Index of its first number in the group."""
     names: tuple[str, ...]
-    """Of the numbers of one step."""
+    """Names of the numbers of one step."""
     units: tuple[str, ...]
-    """Of each quantity, before the scale; ``1`` for a ratio. Empty: the task declares only the number's name."""
+    """Unit of each quantity, before the scale; ``1`` for a ratio. Empty: the task declares only the number's name."""
     scale: tuple[float, ...]
     """Factor of each [1/unit]."""
     offset: tuple[float, ...]
@@ -103,7 +103,7 @@ class Image(_Part):
     """Images as bytes, channels first; the present frame comes first."""
 
     channels: tuple[str, ...]
-    """Of one frame, in order."""
+    """Channels of one frame, in order."""
     frames: int
     """Number of frames: the present one and those of the control steps before."""
     camera: Mapping[str, Any]
@@ -117,17 +117,31 @@ class Group(_Part):
     """One input of the policy: numbers by terms, or images."""
 
     name: str
-    """Of the observation group."""
+    """Name of the observation group."""
     input: str
     """Name of the input in the exported file."""
     shape: tuple[int, ...]
-    """Of one observation: one dimension, or channels, height, width."""
+    """Shape of one observation: one dimension, or channels, height, width."""
     dtype: Literal["float32", "uint8"]
     """Of its elements."""
     terms: tuple[Term, ...] = ()
     """Its numbers, in order; empty for images, and if the task does not declare them."""
     image: Image | None = None
     """Its images."""
+
+
+@dataclass(frozen=True)
+class Target(_Part):
+    """What a choice asks of one joint."""
+
+    joint: str
+    """Name of the joint."""
+    kind: Literal["effort", "position", "velocity"]
+    """Kind of the actuator's input, as of an action."""
+    unit: str
+    """Unit of the input: N, N m, m, rad, m/s or rad/s."""
+    value: float
+    """The input [unit]."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +173,8 @@ class Action(_Part):
     """Least and greatest position of the joint [m, rad]; null: not limited, or unknown."""
     rule: str = ""
     """How the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
+    targets: tuple[Target, ...] = ()
+    """What a choice asks of the joints, the same joints for each choice; empty: it is no choice, or the task does not declare it."""
 
 
 @dataclass(frozen=True)
@@ -166,9 +182,9 @@ class Command(_Part):
     """A command of the operator."""
 
     name: str
-    """Of the command in its task."""
+    """Name of the command in its task."""
     names: tuple[str, ...]
-    """Of its numbers, in order."""
+    """Names of its numbers, in order."""
     units: tuple[str, ...]
     """Of each."""
     ranges: tuple[Pair | None, ...]
@@ -188,9 +204,9 @@ class State(_Part):
     name: str
     """Of the input."""
     output: str
-    """Of the output that is the next step's input."""
+    """Name of the output that is the next step's input."""
     shape: tuple[int, ...]
-    """Without the batch, which is the first dimension."""
+    """Shape without the batch, which is the first dimension."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +224,7 @@ class Contract(_Part):
     actions: tuple[Action, ...]
     """Its output ``actions``, in order; with choices, the output is one number, the index of the choice. Empty: not declared."""
     action_names: tuple[str, ...]
-    """Of the actions, or of the choices."""
+    """Names of the actions, or of the choices."""
     commands: tuple[Command, ...] = ()
     """The commands that it follows."""
     states: tuple[State, ...] = ()
@@ -380,8 +396,8 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]
         old, new = before.get(name), now.get(name)
         if (name in before) != (name in now):
             yield f"{name} {_value(new if name in now else old)} is {'new' if name in now else 'gone'}"
-        elif name == "frame" and None in (old, new):
-            continue  # a contract of format 1 lacks it
+        elif (name == "frame" and None in (old, new)) or (name == "targets" and () in (old, new)):
+            continue  # a contract of format 1, or 2, lacks it
         elif not _same(old, new):
             yield f"{name} {_value(old)} became {_value(new)}"
 

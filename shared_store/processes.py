@@ -88,7 +88,7 @@ def marked(marks: Collection[str]) -> list[Process]:
     """
     wanted = {mark.encode() for mark in marks}
     if not wanted or any(not mark.partition(b"=")[2] for mark in wanted):
-        raise ValueError(f"no process can be told by the marks {sorted(marks)}")
+        raise ValueError(f"no process can be identified by the marks {sorted(marks)}")
     found = []
     for pid in _pids():
         if pid == os.getpid():
@@ -102,6 +102,20 @@ def marked(marks: Collection[str]) -> list[Process]:
         if process := find_process(pid):
             found.append(process)
     return found
+
+
+def await_marks(pid: int, patience: float = 1.0) -> None:
+    """Wait until :func:`marked` can find a child that was just started: the kernel shows its environment a moment after ``exec``.
+
+    Returns after ``patience`` seconds in any case, and at once for a process that has ended.
+    """
+    deadline = time.monotonic() + patience
+    with contextlib.suppress(OSError):
+        while find_process(pid) and time.monotonic() < deadline:
+            with open(f"/proc/{pid}/environ", "rb") as file:
+                if file.read(1):
+                    return
+            time.sleep(0.001)
 
 
 def end_all(

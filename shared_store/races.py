@@ -19,7 +19,7 @@ DEFAULTS: Mapping[str, Any] = {
     "seconds": 1200.0,
 }
 """Rules that a ``race`` section may change."""
-NO_RACER = "which drives no laps; a race is for runs of a racer's task, such as Racer"
+NO_RACER = "which drives no laps; race only runs of a racer's task, such as Racer"
 """The reason why a run can't race; follows the name of its task."""
 _FROM_THE_LINE = {"start": "line", "start_sideways": [0.0, 0.0], "start_turned": [0.0, 0.0]}
 

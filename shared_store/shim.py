@@ -61,7 +61,7 @@ def main(parent: str, group: str, files: str, *command: str) -> None:
             os._exit(1)
     sys.path.append(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     me = os.getpid()
-    supervisor = os.fork()  # there is one thread only: Python may run in the child
+    supervisor = os.fork()  # the process has only one thread, so Python may run in the child
     if not supervisor:
         _become(me, group, int(files), command)
     code = _wait(supervisor, watched)
@@ -87,7 +87,7 @@ def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
             with open(os.path.join(group, "cgroup.procs"), "w") as file:
                 file.write("0")
         except OSError:
-            pass  # without a group the shim itself finds what is left
+            pass  # without a group the shim itself finds the remaining processes
     tied.main(str(shim), "", *command)
 
 
@@ -111,7 +111,7 @@ def _wait(supervisor: int, watched: set[signal.Signals]) -> int:
 
 
 def _end_the_rest(group: str, call_stuck: Callable[[], object]) -> None:
-    """Kill and reap all remaining processes of the node; returns when none is left."""
+    """Kill and reap all remaining processes of the node; returns when all are gone."""
     from shared_store.cgroups import remove_group
     from shared_store.nodes import end_descendants
     from shared_store.processes import unkillable

@@ -58,7 +58,7 @@ class Race:
             return None
         if ranking == "best":
             return self.best
-        total = math.fsum(self.times)  # of the exact times: rounded ones would give another sum
+        total = math.fsum(self.times)  # from the exact times: rounded ones would give another sum
         return _milliseconds(total if ranking == "total" else total / len(self.times))
 
 

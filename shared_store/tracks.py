@@ -132,4 +132,4 @@ def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> Store
 
 
 def _taken(track: StoredTrack) -> TrackError:
-    return TrackError(f"track {track.name} exists already, and a track is never changed; choose another name")
+    return TrackError(f"track {track.name} exists already, and tracks are immutable; choose another name")

@@ -10,7 +10,7 @@ from worker.learning.job import Job, StopRequest, run_command, user_errors
 from worker.telemetry.tracking import Tracking
 
 SWITCH_SECONDS = 0.0005
-"""For how long a thread that reports or saves may keep the interpreter from the training thread, whose device may be idle meanwhile [s]."""
+"""Longest time for which a reporting or saving thread may hold the interpreter, while the training thread's device may be idle [s]."""
 
 
 def main() -> int:
@@ -36,6 +36,7 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
 
     with user_errors("train.task"):
         task_type = find_task(job.section["task"])
+    from worker.learning.leaving import train
     from worker.learning.loop import Loop
     from worker.learning.memory import within_memory
     from worker.learning.setup import total_worlds
@@ -49,7 +50,7 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
     # All memory is allocated in the first iterations; a later out-of-memory error has another cause.
     with within_memory(task_type, training.config, learner, worlds, gang, lambda: loop is None or loop.iterated < 3):
         loop = Loop(training, gang, stop)
-        code = loop.train()
+        code = train(loop, stop)
     loop.close()
     return code
 

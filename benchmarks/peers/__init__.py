@@ -1,1 +1,2 @@
-"""Muster beside mjlab, Isaac Lab and rsl_rl: the same training by the clock, on the same machine. ``README.md`` says how to repeat it."""
+"""Muster compared with mjlab, Isaac Lab and rsl_rl: wall time of the same training on the same machine. ``README.md`` explains how to
+repeat it."""

@@ -1,4 +1,4 @@
-"""Muster's own training of a case: the task with the case's solver limits, network and steps, as a job has it."""
+"""Muster's own training of a case, like a job's: the task with the case's solver limits, network and steps."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from worker.tasks.task import Task
 
 
 def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[str, Any]]:
-    """A task whose solver has these limits, and what its configuration (``train.config`` of a job) has to say for them.
+    """A task whose solver has these limits, and its configuration (``train.config`` of a job) for them.
 
     Args:
         task: Name of a task.
         limits: ``iterations``, ``ls_iterations`` and ``tolerance`` of the solver.
 
     Raises:
-        ValueError: No such task.
+        ValueError: The task does not exist.
     """
     task_type = find_task(task)
     known = {item.name for item in dataclasses.fields(task_type.config_type)}
@@ -37,7 +37,7 @@ def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[st
             "solver_line_search": int(limits["ls_iterations"]),
         }
     options = {**task_type.solver_options, **limits}
-    if settings:  # then they are the configuration's
+    if settings:  # then the configuration has them
         options = {**task_type.solver_options, "tolerance": limits["tolerance"]}
     if options == dict(task_type.solver_options):
         return task_type, settings
@@ -45,17 +45,17 @@ def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[st
 
 
 def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Loop, **train: Any) -> Loop:
-    """The training loop as ``muster run`` has it, on a store of its own.
+    """The training loop of ``muster run``, on its own store.
 
     Args:
-        asked: ``task``, ``worlds``, ``iterations``, ``limits``, ``save_every`` and ``seed``; ``steps`` and ``hidden_sizes`` of
-            ``ppo`` where they are there.
-        store: Folder of the store.
-        loop_type: What is built.
+        asked: ``task``, ``worlds``, ``iterations``, ``limits``, ``save_every`` and ``seed``; ``steps`` and ``hidden_sizes`` of ``ppo``,
+            if given.
+        store: Directory of the store.
+        loop_type: Class of the loop.
         **train: More of the job's ``train`` section.
 
     Raises:
-        ValueError: No such task.
+        ValueError: The task does not exist.
         UserError: A setting that the task or the algorithm refuses.
     """
     task_type, settings = limited(asked["task"], asked["limits"])
@@ -64,11 +64,11 @@ def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Lo
     run.create({"run": run.name})
     raise_epoch(run, 1)
     network = {name: asked[name] for name in ("steps", "hidden_sizes") if name in asked}
-    if train.get("algorithm", "ppo") != "ppo":  # another algorithm has networks and steps of its own
+    if train.get("algorithm", "ppo") != "ppo":  # other algorithms have their own networks and steps
         network = {}
     section = {name: asked[name] for name in ("task", "worlds", "iterations", "seed")}
     section |= ({"ppo": network} if network else {}) | train | {"config": settings | train.get("config", {})}
-    # every checkpoint stays: they are judged afterwards
+    # keep every checkpoint, to judge them afterwards
     spec = {"train": section, "checkpoint": {"every": asked["save_every"], "keep": 10**6}}
     job = Job(spec, Store(store), run, 1, 1, "peers", section=section)
     return loop_type(Training.of(job, task_type), connect(placement), StopRequest())

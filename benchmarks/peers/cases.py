@@ -1,4 +1,4 @@
-"""What is trained: the robot's task by the name that each system calls it, with the physics, network and steps that all of them take."""
+"""The trained cases: a robot's task, with its name in each system, and the common physics, network and steps."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 from shared_store.wording import nearest
 
 LIMITS = ("theirs", "ours")
-"""Whose limits the solver has."""
+"""Sources of the solver's limits."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Where MuJoCo's solver stops.
+    """Limits of MuJoCo's solver.
 
     Attributes:
-        iterations: Of the solver, at most.
-        ls_iterations: Of its line search, at most.
+        iterations: Most iterations of the solver.
+        ls_iterations: Most iterations of its line search.
         tolerance: Improvement of the cost below which it stops earlier.
     """
 
@@ -29,16 +29,16 @@ class Limits:
 
 @dataclass(frozen=True)
 class Case:
-    """One robot that is to be trained.
+    """One robot to train.
 
     Attributes:
-        name: What the commands call it.
+        name: Its name in the commands.
         task: Muster's task.
         peers: Names of the task in other systems, by the name of the system.
         steps: Control steps of every world in one iteration.
         hidden_sizes: Widths of the hidden layers of actor and critic.
-        theirs: The solver's limits as the peer has them.
-        ours: Looser ones, with which Muster trains as well.
+        theirs: The peer's limits of the solver.
+        ours: Looser limits, with which Muster trains equally well.
     """
 
     name: str
@@ -50,13 +50,13 @@ class Case:
     ours: Limits
 
     def limits(self, whose: str) -> Limits:
-        """The solver's limits. Raises ValueError where ``whose`` is none of :data:`LIMITS`."""
+        """The solver's limits. Raises ValueError if ``whose`` is not one of :data:`LIMITS`."""
         if whose not in LIMITS:
             raise ValueError(f"limits {whose!r}: there are {' and '.join(LIMITS)}")
         return self.theirs if whose == "theirs" else self.ours
 
     def named_in(self, peer: str) -> str:
-        """What ``peer`` calls the task. Raises ValueError where it has no such task."""
+        """The task's name in ``peer``. Raises ValueError if the peer lacks it."""
         if peer in ("muster", "rsl_rl"):
             return self.task
         if peer not in self.peers:
@@ -65,7 +65,7 @@ class Case:
         return self.peers[peer]
 
     def shared(self, peer: str, whose: str) -> dict[str, Any]:
-        """What a training of it takes over, as plain values: ``task``, ``steps``, ``hidden_sizes``, ``limits``."""
+        """Its settings for a training, as plain values: ``task``, ``steps``, ``hidden_sizes``, ``limits``."""
         task, limits = self.named_in(peer), asdict(self.limits(whose))
         return {"task": task, "steps": self.steps, "hidden_sizes": list(self.hidden_sizes), "limits": limits}
 
@@ -96,7 +96,7 @@ CASES: Mapping[str, Case] = {
 
 
 def find_case(name: str) -> Case:
-    """The case of this name. Raises ValueError with the nearest name where there is none."""
+    """The case of this name. Raises ValueError with the nearest name if it does not exist."""
     if name not in CASES:
         raise ValueError(f"there is no case {name!r}; {nearest(name, CASES)}")
     return CASES[name]

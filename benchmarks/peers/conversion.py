@@ -1,4 +1,5 @@
-"""Policies of others on Muster's tasks: a checkpoint of rsl_rl, as mjlab writes it, as a plain network; and whether it fits the task."""
+"""Other systems' policies on Muster's tasks: an rsl_rl checkpoint, as written by mjlab, as a plain network, with checks that it fits the
+task."""
 
 from __future__ import annotations
 
@@ -24,13 +25,13 @@ ACTIVATIONS: Mapping[str, type[nn.Module]] = {
 }
 """Activations of a network by rsl_rl's names."""
 EPSILON = 1e-2
-"""What rsl_rl's normaliser adds to each standard deviation."""
+"""Constant that rsl_rl's normaliser adds to each standard deviation."""
 TOLERANCE = 1e-3
-"""How far scales and default positions of the same policy may be apart, in their own unit: mjlab's own export has three decimals."""
+"""Tolerance for scales and default positions of the same policy, in their own unit: mjlab's own export has three decimals."""
 
 
 CLOSE = 2e-3
-"""How far actions of the same policy may be apart in two environments, relative to the greatest: products on a GPU may be in TF32."""
+"""Tolerance for actions of the same policy in two environments, relative to the greatest: products on a GPU may use TF32."""
 
 
 class PlainPolicy:
@@ -38,13 +39,13 @@ class PlainPolicy:
 
     Args:
         layers: Weights, shape (outputs, inputs), and biases, shape (outputs,), in order; float32.
-        mean: Of each observation, shape (observations,), or None where they are not normalised.
+        mean: Mean of each observation, shape (observations,); None without normalisation.
         deviation: Standard deviation of each, shape (observations,).
         activation: Between the layers, one of :data:`ACTIVATIONS`.
-        device: Where it runs.
+        device: Its device.
 
     Raises:
-        ValueError: No such activation, or layers that don't follow one another.
+        ValueError: The activation is unknown, or the sizes of consecutive layers don't match.
     """
 
     def __init__(
@@ -69,12 +70,12 @@ class PlainPolicy:
 
     @property
     def observations(self) -> int:
-        """How many numbers it sees."""
+        """Number of its inputs."""
         return int(self._layers[0][0].shape[1])
 
     @property
     def actions(self) -> int:
-        """How many numbers it gives."""
+        """Number of its outputs."""
         return int(self._layers[-1][0].shape[0])
 
     @torch.no_grad()
@@ -95,12 +96,12 @@ def read_rsl_rl(path: Path | str, activation: str = "elu", device: str = "cpu") 
     """The policy of a checkpoint that rsl_rl 5 or mjlab wrote (``model_<iteration>.pt``).
 
     Args:
-        path: The file. It is read without running what is in it.
-        activation: Of its network; the file does not say.
+        path: The file. It is read without running code from it.
+        activation: Activation of its network, which the file lacks.
         device: Where the policy runs.
 
     Raises:
-        ValueError: There is no such file, it is no such checkpoint, or its network is not made of linear layers alone.
+        ValueError: The file does not exist or is not such a checkpoint, or its network has other than linear layers.
     """
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
@@ -126,21 +127,21 @@ def read_rsl_rl(path: Path | str, activation: str = "elu", device: str = "cpu") 
 
 
 def check_fit(policy: PlainPolicy, observations: int, actions: int, task: str) -> None:
-    """Raises ValueError where the policy sees or gives another number of values than the task has."""
+    """Raises ValueError if the policy's number of inputs or outputs differs from the task's."""
     for what, has, wants in (("sees", policy.observations, observations), ("gives", policy.actions, actions)):
         if has != wants:
             raise ValueError(f"the policy {what} {has} values, task {task} has {wants}")
 
 
 def check_probe(policy: PlainPolicy, probe: Mapping[str, Any]) -> None:
-    """Whether the policy acts as the system that trained it says that it does.
+    """Check that the policy acts as in the system that trained it.
 
     Args:
-        policy: That of the training's last checkpoint.
+        policy: The policy of the training's last checkpoint.
         probe: What the record says under ``probe``: ``observations``, shape (n, observations), and ``actions``, shape (n, actions).
 
     Raises:
-        ValueError: It gives other actions.
+        ValueError: Its actions differ.
     """
     seen, given = torch.tensor(probe["observations"]), torch.tensor(probe["actions"])
     device = policy.device
@@ -152,7 +153,7 @@ def check_probe(policy: PlainPolicy, probe: Mapping[str, Any]) -> None:
 
 
 def check_contract(contract: Mapping[str, Any], interface: Interface, task: str) -> None:
-    """Whether the numbers of mjlab's policy mean in ``task`` what they meant in mjlab.
+    """Check that the numbers of mjlab's policy have the same meaning in ``task``.
 
     Args:
         contract: What the record of a training by mjlab says under ``contract``.
@@ -187,7 +188,7 @@ def check_contract(contract: Mapping[str, Any], interface: Interface, task: str)
 
 
 def _check_order(widths: Mapping[str, int], names: Sequence[str], joints: Sequence[str], task: str) -> None:
-    """mjlab's observations of joints and commands are where the task has them, and the joints in the same order."""
+    """Check that mjlab's observations of joints and commands are in the task's columns, with the joints in the same order."""
     first = 0
     for term, width in widths.items():
         ours = names[first : first + width]

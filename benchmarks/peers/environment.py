@@ -1,10 +1,10 @@
-"""Makes the environment of a peer, apart from this one and with the peer's own pins.
+"""Makes a separate environment for a peer, with the peer's own pins.
 
     python -m benchmarks.peers.environment mjlab [--folder .peers/mjlab] [--python python3.11] [--torch-index URL]
     python -m benchmarks.peers.environment isaaclab --python python3.12
 
-``--torch-index`` names pip's index of torch where the usual one has not the build for this machine. Isaac Lab's robots come from a
-server on the network; in its place stand Newton's own files of the same robots.
+``--torch-index`` names pip's index of torch if the usual one lacks the build for this machine. Isaac Lab's robots come from a server on
+the network; Newton's own files of the same robots replace them.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from shared_store.wording import nearest
 
 HERE = Path(__file__).parent
 FOLDER = HERE.parent.parent / ".peers"
-"""Where environments are made by default, a folder for each."""
+"""Default directory of the environments, one folder each."""
 ASSETS = "assets"
 """Folder of robots, inside Isaac Lab's environment."""
 
 
 @dataclass(frozen=True)
 class Environment:
-    """How an environment is made.
+    """Recipe of an environment.
 
     Attributes:
-        torch: What is installed first, from the index of torch: what comes afterwards takes it as it is.
+        torch: Packages installed first, from torch's index; later installations keep them.
         pins: File of requirements, beside this module.
-        alone: Packages that are installed last, without what they ask for.
-        python: Versions of Python that will do, ``(3, 12)`` for 3.12.
+        alone: Packages installed last, without their dependencies.
+        python: Suitable versions of Python, ``(3, 12)`` for 3.12.
         finish: Called with the environment's folder in the end.
     """
 
@@ -46,17 +46,17 @@ class Environment:
 
 
 def make(name: str, folder: Path, python: str = sys.executable, torch_index: str | None = None) -> None:
-    """Make the environment; packages that are there already stay.
+    """Make the environment; installed packages are kept.
 
     Args:
         name: One of :data:`ENVIRONMENTS`.
-        folder: Where it is made.
-        python: The interpreter that it is made of.
+        folder: Its directory.
+        python: Its base interpreter.
         torch_index: Address of a package index for torch; None: the usual one.
 
     Raises:
-        ValueError: No such environment, or the interpreter can't be used for it.
-        CalledProcessError: pip could not install something; it has said what.
+        ValueError: The environment is unknown, or the interpreter can't be used for it.
+        CalledProcessError: pip could not install something, and printed what.
     """
     if name not in ENVIRONMENTS:
         raise ValueError(f"there is no environment {name!r}; {nearest(name, ENVIRONMENTS)}")
@@ -88,7 +88,7 @@ def make(name: str, folder: Path, python: str = sys.executable, torch_index: str
 
 
 def version_of(python: str) -> tuple[int, int]:
-    """Major and minor version of an interpreter. Raises ValueError where it can't be started."""
+    """Major and minor version of an interpreter. Raises ValueError if it can't be started."""
     asked = "import sys; print(*sys.version_info[:2])"
     try:
         said = subprocess.run([python, "-c", asked], check=True, capture_output=True, text=True).stdout
@@ -111,11 +111,11 @@ ROBOTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
         },
     ),
 }
-"""What stands for each of Isaac Lab's robots: a file of Newton's, and its joints that Isaac Lab calls otherwise."""
+"""Replacement of each of Isaac Lab's robots: a file of Newton's, and its joints with other names in Isaac Lab."""
 
 
 GROUND = "Isaac/IsaacLab/Environments/Grid/default_ground_plane_checker_v1/default_ground_plane.usda"
-"""Where Isaac Lab looks for the plane that robots stand on."""
+"""Path at which Isaac Lab looks for the ground plane."""
 PLANE = """#usda 1.0
 (
     defaultPrim = "ground"
@@ -131,14 +131,14 @@ def Xform "ground"
     }
 }
 """
-"""A plane that touches, and nothing to look at."""
+"""A plane for collisions only, without visuals."""
 
 
 def put_robots(folder: Path) -> None:
-    """Put a plane, and Newton's files of the ant and the humanoid, where Isaac Lab looks for its own.
+    """Put a plane and Newton's files of the ant and the humanoid at the paths of Isaac Lab's own.
 
     Raises:
-        ValueError: A file has not the joints of :data:`ROBOTS`.
+        ValueError: A file lacks the joints of :data:`ROBOTS`.
     """
     (source,) = folder.glob("lib/python*/site-packages/newton/examples/assets")
     ground = folder / ASSETS / GROUND

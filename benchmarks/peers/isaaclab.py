@@ -1,4 +1,4 @@
-"""Isaac Lab on its Newton backend by the clock, in its own environment, by its own entry point, with TensorBoard and checkpoints.
+"""Wall time of Isaac Lab on its Newton backend, in its own environment, with its own entry point, TensorBoard and checkpoints.
 
     python -m benchmarks.peers.environment isaaclab
     python -m benchmarks.peers.isaaclab [--case ant] [--limits theirs] [--frontend torch] [--worlds 4096] [--out DIRECTORY]

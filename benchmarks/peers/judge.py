@@ -1,11 +1,11 @@
-"""What the checkpoints of recorded trainings are worth: tracking errors and episode lengths, all in the same task of Muster.
+"""Evaluation of the checkpoints of recorded trainings: tracking errors and episode lengths, all in the same task of Muster.
 
     python -m benchmarks.peers.judge [RECORD ...] [--worlds 256] [--limits theirs] [--last] [--out DIRECTORY]
 
-The records are those of trainings by mjlab, rsl_rl and Muster that kept their checkpoints (``--keep``); without any named, all of
-``--out``. Every policy takes its mean actions in the same worlds, drawn from the same seed, under the same limits of the solver
-(``theirs`` unless told otherwise, whatever it was trained with: the proof that looser limits did not harm it). Writes
-``judged/<record>.json``; ``python -m benchmarks.peers.table`` shows them.
+The records are those of trainings by mjlab, rsl_rl and Muster that kept their checkpoints (``--keep``); by default all in ``--out``.
+Every policy takes its mean actions in the same worlds, drawn from the same seed, under the same limits of the solver: by default
+``theirs``, whatever it was trained with, which shows that looser limits did not harm it. Writes ``judged/<record>.json``; ``python -m
+benchmarks.peers.table`` shows them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from worker.learning.trained import find_checkpoint, load_policy
 from worker.tasks.task import Task
 
 SEED = 12345
-"""Of the worlds in which policies are judged: no training has them."""
+"""Seed of the worlds in which policies are judged; no training uses it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """A record of a training. Raises ValueError where it is none."""
+    """A record of a training. Raises ValueError for any other file."""
     try:
         record = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -83,9 +83,9 @@ def judge_record(record: dict[str, Any], options: argparse.Namespace, worlds: di
     """The judgement of each checkpoint of a training.
 
     Args:
-        record: Of the training.
-        options: Of the command line.
-        worlds: Tasks that are built already, by case; one is added where it is missing.
+        record: Record of the training.
+        options: The command line's options.
+        worlds: Built tasks by case; a missing one is added.
     """
     case = find_case(record["case"])
     if case.name not in worlds:
@@ -107,7 +107,7 @@ def build(case: Case, options: argparse.Namespace) -> Task:
     """The worlds in which the policies of a case are judged.
 
     Raises:
-        ValueError: Options that make no sense.
+        ValueError: An option is invalid.
     """
     if options.worlds < 1:
         raise ValueError(f"--worlds {options.worlds}: it is at least 1")
@@ -122,7 +122,7 @@ def policy_of(record: dict[str, Any], point: dict[str, Any], task: Task) -> Acti
     """The policy of one checkpoint of a record.
 
     Raises:
-        ValueError: It is not there, or does not fit the task.
+        ValueError: It does not exist, or does not fit the task.
     """
     name = type(task).__name__
     if record["peer"] == "muster":

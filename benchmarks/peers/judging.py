@@ -1,4 +1,4 @@
-"""One judgement of velocity-following policies of any system: tracking errors and how long episodes are, on the same worlds."""
+"""Evaluation of velocity-following policies of any system: tracking errors and episode lengths in the same worlds."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from worker.simulation.robot_view import body_arrays
 from worker.tasks.task import Task
 
 COMMAND = ("command_forward", "command_left", "command_turn")
-"""What the observations of the command are called: velocities forward and left [m/s], turning velocity to the left [rad/s]."""
+"""Names of the command's observations: velocities forward and left [m/s], turning velocity to the left [rad/s]."""
 
 
 class Acting(Protocol):
-    """A policy, as far as it is judged."""
+    """The part of a policy that the evaluation needs."""
 
     def act(self, observations: Any) -> torch.Tensor:
         """Mean actions, shape (worlds, actions), for the task's observation groups."""
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """Forget what is remembered of episodes."""
+        """Clear the recurrent state."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a policy's mean actions are worth, over the first episode of each world.
+    """Results of a policy's mean actions over the first episode of each world.
 
     Attributes:
-        episodes: How many there were.
+        episodes: Number of episodes.
         linear_error: Mean distance between the commanded velocity forward and left and that of the root's origin, in its own frame
             [m/s].
         angular_error: Mean difference between the commanded turning velocity and that about the root's own vertical axis [rad/s].
         length_share: Mean length of an episode, as a share of the longest that it can be.
         full_length: Share of the episodes that only the clock ended.
         mean_return: Mean sum of rewards.
-        judging_s: How long it took, by the clock [s].
+        judging_s: Wall time [s].
     """
 
     episodes: int
@@ -52,7 +52,7 @@ class Judgement:
 
 
 class VelocityErrors:
-    """How far a robot's velocities are from those that it is commanded, read from the simulation, not from the task's own terms.
+    """Errors of a robot's velocities relative to its commands, read from the simulation, not from the task's own terms.
 
     Args:
         task: A task whose policy sees a velocity command, and whose robot is called ``robot``.
@@ -79,11 +79,11 @@ class VelocityErrors:
         self._center = wp.to_torch(body_arrays(task.worlds).coms)[:, robot.root_body]
 
     def commands(self) -> torch.Tensor:
-        """What is commanded now, shape (worlds, 3): forward [m/s], left [m/s], turn [rad/s]; a copy."""
+        """The present command, shape (worlds, 3): forward [m/s], left [m/s], turn [rad/s]; a copy."""
         return self._observations[:, self._columns].clone()
 
     def errors(self, commands: torch.Tensor) -> torch.Tensor:
-        """Distance from ``commands`` of the velocities now, shape (worlds, 2): linear [m/s], angular [rad/s]."""
+        """Distance of the present velocities from ``commands``, shape (worlds, 2): linear [m/s], angular [rad/s]."""
         rotation = self._coordinates[:, self._first : self._first + 4]
         linear, angular = (
             self._velocities[:, self._dof : self._dof + 3],
@@ -109,7 +109,7 @@ def judge(task: Task, policy: Acting) -> Judgement:
     The last step of an episode is not in the errors: the world has begun a new one by then.
 
     Args:
-        task: The worlds; they are left after that episode.
+        task: The worlds, used for that episode only.
         policy: Takes the mean actions.
 
     Raises:
@@ -134,7 +134,7 @@ def judge(task: Task, policy: Acting) -> Judgement:
         totals[:, 3] += running & (task.time_outs > 0)
         totals[:, 4] += torch.where(running, task.rewards, 0.0)
         running &= ~ended
-        # looking waits for the device, so look seldom
+        # reading waits for the device, so read seldom
         if step % 32 == 31 and not bool(running.any()):
             break
     linear, angular, steps, full, returns = totals.sum(0).tolist()

@@ -1,4 +1,4 @@
-"""mjlab by the clock, in its own environment, by its own training script, with TensorBoard and checkpoints.
+"""Wall time of mjlab in its own environment, with its own training script, TensorBoard and checkpoints.
 
     python -m benchmarks.peers.environment mjlab
     python -m benchmarks.peers.mjlab [--case go1] [--limits theirs] [--worlds 4096] [--out DIRECTORY]
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _command(options: argparse.Namespace, case: Case, asked: str) -> tuple[list[str], dict[str, str]]:
     words, variables = other_process(options.environment / "bin" / "python", "train_mjlab.py")
-    # it draws videos with OpenGL where it is asked to, and nothing here asks
+    # it draws videos with OpenGL on request, which this never makes
     return [*words, asked], {**variables, "WANDB_MODE": "disabled", "MUJOCO_GL": "disable"}
 
 

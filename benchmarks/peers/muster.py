@@ -1,4 +1,4 @@
-"""Muster by the clock, as ``muster run`` trains: with metrics, TensorBoard events and checkpoints.
+"""Wall time of Muster, training like ``muster run``, with metrics, TensorBoard events and checkpoints.
 
     python -m benchmarks.peers.muster [--case go1] [--limits theirs] [--worlds 4096] [--algorithm ppo] [--out DIRECTORY]
 

@@ -1,4 +1,4 @@
-"""rsl_rl's own runner on Muster's simulation, by the clock, with TensorBoard and checkpoints.
+"""Wall time of rsl_rl's own runner on Muster's simulation, with TensorBoard and checkpoints.
 
     python -m benchmarks.peers.rsl_rl [--case go1] [--limits theirs] [--worlds 4096] [--out DIRECTORY]
 

@@ -1,4 +1,4 @@
-"""What the commands of all peers share: their options, one process a training, and the record that is written of it."""
+"""Common part of all peers' commands: options, one process per training, and its record."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ HERE = Path(__file__).parent
 REPOSITORY = HERE.parent.parent
 RECORDS = HERE / "records"
 POINTS = 400
-"""A record keeps at most so many points of its curve."""
+"""Most points of the curve in a record."""
 SAID = 25
-"""Lines of a training that failed which are shown."""
+"""Number of last lines to show of a failed training."""
 
 Command = Callable[[argparse.Namespace, Case, str], tuple[list[str], dict[str, str]]]
 
 
 def options_of(peer: str, doc: str | None, cases: Sequence[str]) -> argparse.ArgumentParser:
-    """The options that the command of every peer has."""
+    """The options of every peer's command."""
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.peers.{peer}",
         description=doc,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--case", default=cases[0], help=f"what is trained: {', '.join(cases)}")
-    parser.add_argument("--limits", default=LIMITS[0], help="whose limits the solver has: theirs or ours")
+    parser.add_argument("--case", default=cases[0], help=f"case to train: {', '.join(cases)}")
+    parser.add_argument("--limits", default=LIMITS[0], help="limits of the solver: theirs or ours")
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--iterations", type=int, default=110, help="of one training")
-    parser.add_argument("--warm", type=int, default=10, help="first iterations that no rate counts")
-    parser.add_argument("--repeats", type=int, default=3, help="trainings, each a process of its own")
+    parser.add_argument("--warm", type=int, default=10, help="number of first iterations not counted in rates")
+    parser.add_argument("--repeats", type=int, default=3, help="number of trainings, one process each")
     parser.add_argument("--save-every", type=int, default=50, help="iterations between two checkpoints")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RECORDS, help="folder of the records")
-    parser.add_argument("--keep", type=Path, help="folder in which logs and checkpoints stay; by default they go")
+    parser.add_argument("--keep", type=Path, help="folder for logs and checkpoints, which are otherwise deleted")
     add_option(parser)
     return parser
 
@@ -54,7 +54,7 @@ def cases_of(peer: str) -> list[str]:
 
 
 def checked(options: argparse.Namespace, peer: str) -> Case:
-    """The case of the options. Raises ValueError where they make no sense."""
+    """The case of the options. Raises ValueError for invalid options."""
     case = find_case(options.case)
     case.named_in(peer)
     case.limits(options.limits)
@@ -71,18 +71,18 @@ def checked(options: argparse.Namespace, peer: str) -> Case:
 
 
 def measure(peer: str, parser: argparse.ArgumentParser, command: Command, arguments: Sequence[str] | None) -> None:
-    """Train as the options say, and write a record of each training.
+    """Train by the options, and write a record of each training.
 
     Args:
         peer: Name of the system.
-        parser: From :func:`options_of`, with what the peer adds.
-        command: Makes, of the options, the case and the JSON that the training reads, the process and the variables it gets besides.
-        arguments: Of the command line; None: those of this process.
+        parser: From :func:`options_of`, with the peer's own options.
+        command: Returns the command and additional variables of the training's process, from the options, the case and its JSON.
+        arguments: Command-line arguments; None: those of this process.
     """
     options = parser.parse_args(arguments)
     try:
         case = checked(options, peer)
-        command(options, case, "{}")  # what it refuses it refuses before anything runs
+        command(options, case, "{}")  # refuse mistakes before anything runs
     except ValueError as error:
         parser.error(str(error))
     options.out.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def measure(peer: str, parser: argparse.ArgumentParser, command: Command, argume
 def train(
     peer: str, options: argparse.Namespace, case: Case, command: Command, number: int, logs: Path
 ) -> dict[str, Any]:
-    """One training, in a process of its own: its record. Raises SystemExit, with its last lines, where it fails."""
+    """The record of one training in a separate process. Raises SystemExit with its last lines if it fails."""
     logs.mkdir(parents=True, exist_ok=True)
     out, said = logs / "found.json", logs / "output.txt"
     asked = case.shared(peer, options.limits) | {
@@ -128,10 +128,10 @@ def train(
 def record_of(
     peer: str, case: Case, options: argparse.Namespace, asked: dict[str, Any], found: dict[str, Any]
 ) -> dict[str, Any]:
-    """What is written of a training.
+    """The record of a training.
 
     Raises:
-        ValueError: It did fewer iterations than were asked for.
+        ValueError: It made fewer iterations than requested.
     """
     curve = found.pop("curve")
     if len(curve) != options.iterations:
@@ -149,7 +149,7 @@ def record_of(
 
 
 def rate(curve: Sequence[dict[str, Any]], warm: int) -> float:
-    """Steps a second by the clock, from the end of iteration ``warm`` to the end of the last one."""
+    """Steps per second of wall time, from the end of iteration ``warm`` to the end of the last one."""
     first, last = curve[warm - 1], curve[-1]
     return float((last["env_steps"] - first["env_steps"]) / (last["seconds"] - first["seconds"]))
 
@@ -167,10 +167,10 @@ def own_process(module: str) -> tuple[list[str], dict[str, str]]:
 
 
 def other_process(python: Path, script: str) -> tuple[list[str], dict[str, str]]:
-    """A training in an environment of its own, into which nothing of this one leaks.
+    """A training in a separate environment, isolated from this one.
 
     Raises:
-        ValueError: There is no such environment.
+        ValueError: The environment does not exist.
     """
     if not python.exists():
         raise ValueError(

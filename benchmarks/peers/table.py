@@ -2,8 +2,8 @@
 
     python -m benchmarks.peers.table [--records DIRECTORY] [--out FILE]
 
-Reads what the commands of the peers wrote, and ``judged/`` of :mod:`benchmarks.peers.judge` where it is there; prints markdown, or
-writes it to ``--out``.
+Reads the records of the peers' commands, and ``judged/`` of :mod:`benchmarks.peers.judge` if it exists; prints Markdown, or writes it to
+``--out``.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def read_all(directory: Path) -> tuple[list[Record], list[Record]]:
-    """The records of trainings and the judgements in a folder. Raises ValueError where there are none, or one can't be read."""
+    """The records of trainings and the judgements in a folder. Raises ValueError without any, or if one can't be read."""
     records = [read_record(path) for path in sorted(directory.glob("*.json"))]
     if not records:
         raise ValueError(
@@ -57,7 +57,7 @@ def read_all(directory: Path) -> tuple[list[Record], list[Record]]:
 
 
 def table(records: Sequence[Record], judged: Sequence[Record] = ()) -> str:
-    """Markdown of the records, and of the judgements where there are any."""
+    """Markdown of the records, and of any judgements."""
     lines = [
         "# Muster and its peers",
         "",
@@ -130,7 +130,7 @@ def _judgements(judged: Sequence[Record]) -> list[str]:
 
 
 def _as_good(peer: Record, judged: Iterable[Record]) -> str:
-    """When a training by Muster was as good as the peer's last policy, the median of those that were."""
+    """Median training time after which Muster was as good as the peer's last policy, over the trainings that reached it."""
     if _is_ours(peer):
         return "–"
     goal = peer["rows"][-1]
@@ -147,7 +147,7 @@ def _as_good(peer: Record, judged: Iterable[Record]) -> str:
 
 
 def reached(rows: Iterable[Record], goal: Record) -> float | None:
-    """Training time of the first row that is as good as ``goal`` in every respect [s]; None where none is."""
+    """Training time of the first row that is as good as ``goal`` in every respect [s]; None without any."""
     for row in rows:
         errors = all(row[name] <= goal[name] for name in ("linear_error", "angular_error"))
         if errors and row["length_share"] >= goal["length_share"]:
@@ -156,7 +156,7 @@ def reached(rows: Iterable[Record], goal: Record) -> float | None:
 
 
 def label(record: Record) -> str:
-    """What a row calls the system of a record, with its version, front end and algorithm where they are known."""
+    """Label of a record's system, with its version, front end and algorithm if known."""
     name = NAMES.get(record["peer"], record["peer"])
     version = record.get("versions", {}).get(PACKAGES.get(record["peer"], ""))
     more = [record[key] for key in ("frontend", "algorithm") if record.get(key)]

@@ -13,7 +13,7 @@ from orchestrator.api.arns import plain_name
 from orchestrator.api.damaged import DamagedRow
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
@@ -34,7 +34,7 @@ class Context:
     """One call."""
 
     session: Session
-    controller: Controller
+    reconciler: Reconciler
     idempotency_key: str | None = None
     making: NewRun | None = None
     """The run that a submission makes, of a clone."""
@@ -73,19 +73,19 @@ class Context:
     def run(self, name: str) -> Run:
         """The run of that name, whether it exists or not. Raises ClientError where no run can have it."""
         try:
-            return self.controller.store.run(name)
+            return self.reconciler.store.run(name)
         except StoreError as error:
             raise ClientError(str(error)) from None
 
     def reason(self, job: Job) -> str | None:
         """Why a job waits now, or a note for its user while it runs; None if its stored reason suffices."""
-        return self.controller.reason(job)
+        return self.reconciler.reason(job)
 
 
-def controller_of(request: Request) -> Controller:
+def reconciler_of(request: Request) -> Reconciler:
     """The controller that the application serves."""
-    controller: Controller = request.app.state.controller
-    return controller
+    reconciler: Reconciler = request.app.state.reconciler
+    return reconciler
 
 
 def queue_names(session: Session) -> list[str]:
@@ -94,14 +94,14 @@ def queue_names(session: Session) -> list[str]:
     return [name for name in names if is_visible(JobsOf(name))]
 
 
-def find_run(controller: Controller, name: str) -> Run:
+def find_run(reconciler: Reconciler, name: str) -> Run:
     """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run."""
     try:
-        run = controller.store.run(name)
+        run = reconciler.store.run(name)
     except StoreError as error:
         raise ClientError(str(error)) from None
     if run.description() is None:
-        with controller.database.session() as session:
+        with reconciler.database.session() as session:
             query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
             job = session.scalars(query.limit(1)).first()
             if job is not None and is_visible(job):
@@ -111,20 +111,20 @@ def find_run(controller: Controller, name: str) -> Run:
             named = find_job(session, name, visible_queues())
             if named is not None and is_visible(named):
                 raise ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
-            runs = [each.name for each in visible_runs(session, controller.store, most=_COMPARED)]
+            runs = [each.name for each in visible_runs(session, reconciler.store, most=_COMPARED)]
         others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
         hint = nearest(name, runs, others, cutoff=0.3)
-        raise ClientError(f"run {name} does not exist in {controller.store.path}; {hint}", 404)
+        raise ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
     return run
 
 
-def permitted_run(controller: Controller, name: str, operation: Operation) -> Run:
+def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:
     """The run called ``name``, where the caller may do this to it; nothing of another's is read. Raises ClientError."""
-    with controller.database.session() as session:
-        owner = owner_of(session, Context(session, controller).run(name))
+    with reconciler.database.session() as session:
+        owner = owner_of(session, Context(session, reconciler).run(name))
     if owner is not None:
         check(operation, owner)
-    return find_run(controller, name)
+    return find_run(reconciler, name)
 
 
 def visible_runs(

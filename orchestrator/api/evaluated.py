@@ -7,17 +7,19 @@ from typing import Any
 
 from orchestrator.api.checkpoints import choose, refusal
 from orchestrator.api.errors import ClientError
+from orchestrator.api.racing_tracks import check_names
 from orchestrator.spec.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
-from shared_store.layout import Run
+from shared_store.layout import Run, Store
 from shared_store.races import NO_RACER, key_of, race_changes
 from shared_store.settings import merged
 
 
-def check_evaluation(run: Run, spec: Mapping[str, Any], key: str = "evaluate") -> Checkpoint | None:
+def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str = "evaluate") -> Checkpoint | None:
     """The checkpoint that the section ``evaluate`` or ``race`` of a spec means; None where the section is none, which the rank refuses.
 
-    Raises ClientError: there is no such checkpoint, it can't be read, its task drives no laps of a race, or refuses the changes.
+    Raises ClientError: there is no such checkpoint, it can't be read, its task drives no laps of a race, refuses the changes, or
+    has no such track.
     """
     section = spec.get(key)
     if not isinstance(section, dict):
@@ -45,4 +47,6 @@ def check_evaluation(run: Run, spec: Mapping[str, Any], key: str = "evaluate") -
             path, words = problem
             named = key_of(section, path) if key == "race" else ".".join(map(str, ("evaluate", "config", *path)))
             raise ClientError(f"{named}: {words}")
+        if kind.races:
+            check_names(store, changes.get("track"), "race.track" if section.get("track") else f"{key}.config.track")
     return chosen

@@ -136,6 +136,7 @@ class Operation(StrEnum):
     READ_KEYS = "GET /api/keys"
     CREATE_KEY = "POST /api/keys"
     DELETE_KEY = "DELETE /api/keys/{name}"
+    LIST_TRACKS = "GET /api/tracks"
     READ_WEBHOOKS = "GET /api/webhooks"
     TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 

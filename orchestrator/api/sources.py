@@ -13,7 +13,8 @@ from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
-from orchestrator.control.reconciler import Controller
+from orchestrator.api.racing_tracks import check_tracks
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.excerpts import shown
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
@@ -60,6 +61,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     Returns:
         The teacher's weights, where the job's run has to hold a copy of them.
     """
+    check_tracks(context.reconciler.store, gang.spec)
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
     for source in sources_of(gang):
@@ -68,21 +70,21 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
             continue
         if not is_waiting:
             try:
-                find_run(context.controller, source.run)
+                find_run(context.reconciler, source.run)
             except ClientError as error:
                 raise ClientError(f"{source.key}: {error}" if is_teacher else str(error), error.status) from None
         if permissions.visible_queues() is not None:
             nobodys = RunRecord(name=source.run, queue="")
             permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
         if source.key in ("evaluate", "race") and not is_waiting:
-            check_evaluation(context.run(source.run), gang.spec or {}, source.key)
+            check_evaluation(context.reconciler.store, context.run(source.run), gang.spec or {}, source.key)
         if is_teacher and not is_waiting:
             needed = TeacherNeeded(source.run, _checkpoint(context, source))
             teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take
     return teacher
 
 
-def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], dict[str, Any]]) -> dict[str, Any]:
+def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], dict[str, Any]]) -> dict[str, Any]:
     """Submit a job; the weights that its policy will imitate are copied first, without holding the database.
 
     Raises ClientError.
@@ -95,9 +97,9 @@ def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], 
         return submit(None)
     except TeacherNeeded as error:
         needed = error
-    if shortage := controller.disk.shortage("store"):
+    if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; the run has a copy of its teacher's weights", 503)
-    copy = TeacherCopy(controller.store, controller.peers.id, needed.run, needed.checkpoint)
+    copy = TeacherCopy(reconciler.store, reconciler.peers.id, needed.run, needed.checkpoint)
     try:
         with copy:
             copy.copy("teacher")

@@ -1,4 +1,4 @@
-"""The ``muster`` command: one module a group of commands; errors end as one line and an exit code.
+"""The ``muster`` command: one module per group of commands. Errors end as one line and an exit code.
 
 Exit codes: 0 done, 1 failure, 2 wrong use.
 """

@@ -1,4 +1,4 @@
-"""``muster aws``: the stack in which jobs run on AWS."""
+"""``muster aws``: the CloudFormation stack for jobs on AWS."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from orchestrator.engines.aws_batch.stack import Event, Stack
 
 NameOption = Annotated[str, typer.Option("--stack-name", help="Name of the CloudFormation stack.")]
-RegionOption = Annotated[str | None, typer.Option(help="AWS region; that of your AWS configuration by default.")]
+RegionOption = Annotated[str | None, typer.Option(help="AWS region; by default that of your AWS configuration.")]
 ProfileOption = Annotated[str | None, typer.Option(help="Profile of your AWS configuration.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch).",
+        "Manage the CloudFormation stack for jobs on AWS (network, volume, images, AWS Batch).",
         "Examples:  muster aws up --region eu-west-1   then   muster serve --engine aws-batch",
     )
     group.command(epilog="Example:  muster aws up --region eu-west-1 --parameter InstanceTypes=g6.4xlarge")(up)
@@ -46,16 +46,16 @@ def up(
     profile: ProfileOption = None,
     parameter: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=VALUE of the template; repeatable. What is not given stays as it was."),
+        typer.Option(help="NAME=VALUE of a template parameter; repeatable. Other parameters keep their values."),
     ] = None,
-    template: Annotated[Path | None, typer.Option(help="Another template than Muster's own.")] = None,
+    template: Annotated[Path | None, typer.Option(help="A template to use instead of Muster's own.")] = None,
     yes: YesOption = False,
 ) -> None:
-    """Create the stack, or bring it up to date, and write $MUSTER_HOME/aws.json for the aws-batch engine."""
+    """Create or update the stack, and write $MUSTER_HOME/aws.json for the aws-batch engine."""
     given = dict(_pair(each) for each in parameter or [])
     from_template, stack = _stack_module(), _stack(stack_name, region, profile)
     text = from_template.template_text(template)
-    stack.parameters(text, given, existing=False)  # refused before anything is asked
+    stack.parameters(text, given, existing=False)  # refuse mistakes before the first question
     if not yes:
         verb = "update" if stack.describe() else "create"
         typer.confirm(
@@ -93,7 +93,7 @@ def down(
     profile: ProfileOption = None,
     yes: YesOption = False,
 ) -> None:
-    """Delete the stack: network, queue, images, logs, workstation. The volume with all runs stays."""
+    """Delete the stack: network, queue, images, logs, workstation. The volume with all runs is kept."""
     from_template, stack = _stack_module(), _stack(stack_name, region, profile)
     outputs = stack.outputs()
     volume = outputs.get("FileSystemId")
@@ -127,7 +127,7 @@ def status(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the stack: whether it is whole, what its queue and compute environment say, its jobs, its image."""
+    """Show the stack: its status, queue, compute environment, jobs and image."""
     stack = _stack(stack_name, region, profile)
     told = stack.status()
     if write:
@@ -153,7 +153,7 @@ def status(
 
 
 def _follow(stack: Stack, made: str, began: float) -> list[Event]:
-    """Print what happens until the stack rests."""
+    """Print the stack's events until it is stable."""
     events = []
     for event in stack.follow(made, began):
         events.append(event)
@@ -170,7 +170,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _stack_module() -> ModuleType:
-    """What needs boto3. Raises ServerError where it is not installed."""
+    """Import the module that needs boto3. Raises ServerError if it is not installed."""
     try:
         from orchestrator.engines.aws_batch import stack as aws_stack
     except ModuleNotFoundError as error:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue
+from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
@@ -15,7 +16,7 @@ from orchestrator.domain.errors import UsageError
 from orchestrator.spec.kept_files import changes_with_files
 
 _EXAMPLES = """Examples:  muster clone ant-1f2e3d4c@best --name ant-fast --set train.config.rewards.forward=2.0 -f
-muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2"""
+muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2 --dry-run"""
 
 
 def register(app: typer.Typer) -> None:
@@ -27,21 +28,27 @@ def clone(
         str,
         typer.Argument(
             metavar="RUN[@ITERATION|@best|@latest]",
-            help="Whose weights: of its newest checkpoint, of that of an iteration, or of the best one.",
+            help="The source of the weights: a run's newest checkpoint, or that of an iteration, or the best one.",
         ),
     ],
-    name: Annotated[str, typer.Option(help="Of the new run, and of its job.")],
+    name: Annotated[str, typer.Option(help="Name of the new run and of its job.")],
     set_: SetOption = None,
-    nodes: Annotated[int | None, typer.Option(min=1, help="Another number of nodes.")] = None,
+    nodes: Annotated[int | None, typer.Option(min=1, help="Number of nodes, if it should change.")] = None,
     queue: Annotated[str | None, typer.Option(help="Another queue.")] = None,
-    engine: Annotated[str | None, typer.Option(help="What runs it, of the engines that the controller has.")] = None,
+    engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Check it and show what would start where; --json: with all variables. Nothing starts."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Start a new run with the weights of a checkpoint, and with nothing else of it.
+    """Start a new run from only the weights of a checkpoint.
 
-    Networks and normalisers are taken over; the optimizer, the learning rate, the worlds and the curriculum begin anew, at
-    iteration 0, with the settings of RUN and the changes of --set: other rewards, another configuration of the task, another seed.
+    Networks and normalisers are copied. The optimizer, the learning rate, the worlds and the curriculum start over at iteration 0, with
+    the settings of RUN and the changes of --set: other rewards, another configuration of the task, another seed.
     """
     run, checkpoint = split_reference(source)
     if queue is not None and engine is not None:
@@ -57,8 +64,12 @@ def clone(
                 *on_queue(set_, elsewhere),
             ],
             "directory": os.getcwd(),
+            "dry_run": dry_run,
         }
         cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)
+        if dry_run:
+            show_plan(client, cloned["definition"], cloned["queue"], as_json)
+            return
         if as_json:
             echo_json(cloned)
         else:
@@ -80,5 +91,5 @@ def split_reference(text: str) -> tuple[str, int | str | None]:
     if at.isascii() and at.isdecimal() and len(at) < 10:
         return run, int(at)
     raise UsageError(
-        f"{text}: after @ stands an iteration, best or latest; `muster checkpoints {run}` lists the iterations"
+        f"{text}: expected an iteration, best or latest after @; `muster checkpoints {run}` lists the iterations"
     )

@@ -28,7 +28,7 @@ def register(app: typer.Typer) -> None:
 def compare(
     runs: Annotated[
         list[str],
-        typer.Argument(metavar="RUN…", help="Runs, or patterns of them in quotes: 'ant-*'. Two or more in all."),
+        typer.Argument(metavar="RUN…", help="Runs, or patterns in quotes such as 'ant-*'; at least two runs in all."),
     ],
     output: Annotated[
         Path | None,
@@ -39,11 +39,11 @@ def compare(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare runs, or groups of runs that differ in their seed alone; draw their curves.
+    """Compare runs, or groups of runs that differ only in their seed; draw their curves.
 
-    A group has the mean over its runs ± their standard deviation. EVALUATED is the return of each run's best checkpoint in its
-    evaluations (its last checkpoint has one); an interval of 95 % where the group is a single run. Single runs that `muster evaluate`
-    had play the same episodes (the same --seed) are compared with the first one episode by episode.
+    For a group, the table shows the mean over its runs ± their standard deviation. EVALUATED is the return of each run's best checkpoint
+    in its evaluations (its last checkpoint has one), for a single run with a 95 % interval. Single runs that `muster evaluate` evaluated
+    on the same episodes (the same --seed) are compared with the first one episode by episode.
     """
     _check_output(output)
     if output is not None:
@@ -72,7 +72,7 @@ def compare(
 
 
 def _chosen(client: Client, patterns: Sequence[str]) -> list[str]:
-    """The names of the runs that are meant, in the order of the patterns. Raises UsageError, ApiError."""
+    """The names of the matching runs, in the order of the patterns. Raises UsageError, ApiError."""
     known: list[str] | None = None
     chosen: list[str] = []
     for pattern in patterns:
@@ -82,9 +82,7 @@ def _chosen(client: Client, patterns: Sequence[str]) -> list[str]:
         known = _all_runs(client) if known is None else known
         fitting = [name for name in known if fnmatchcase(name, pattern)]
         if not fitting:
-            raise UsageError(
-                f"no run is called like {pattern}; `muster list` shows the jobs, `muster show JOB` a job's run"
-            )
+            raise UsageError(f"no run matches {pattern}; `muster list` shows the jobs, `muster show JOB` a job's run")
         chosen += fitting
     different = list(dict.fromkeys(chosen))
     if len(different) < 2:
@@ -100,7 +98,7 @@ def _all_runs(client: Client) -> list[str]:
 
 
 def _facts(client: Client, name: str) -> RunFacts:
-    """What is compared of a run. Raises ApiError where it does not exist."""
+    """The data of a run to compare. Raises ApiError if it does not exist."""
     described = client.get(f"/api/runs/{named(name)}")
     records: list[dict[str, Any]] = []
     while page := client.get(f"/api/runs/{named(name)}/metrics", after=records[-1]["iteration"] if records else 0):
@@ -110,13 +108,13 @@ def _facts(client: Client, name: str) -> RunFacts:
 
 
 def _check_output(output: Path | None) -> None:
-    """Refuse what can't be written before anything is asked. Raises UsageError."""
+    """Refuse an output that can't be written before the first request. Raises UsageError."""
     if output is None:
         return
     if output.suffix not in ENDINGS:
-        raise UsageError(f"-o {output}: the ending says what is written; there are {', '.join(ENDINGS)}")
+        raise UsageError(f"-o {output}: unknown ending; use {', '.join(ENDINGS)}")
     if not output.parent.is_dir():
-        raise UsageError(f"-o {output}: {output.parent} is no directory")
+        raise UsageError(f"-o {output}: {output.parent} is not a directory")
 
 
 def _draw(groups: Sequence[Group], output: Path) -> None:

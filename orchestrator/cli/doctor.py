@@ -1,4 +1,4 @@
-"""``muster doctor``: whether this machine has what Muster needs, and what to do where it has not."""
+"""``muster doctor``: check Muster's requirements on this machine, with advice for those that are not met."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo_json
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, Unreachable
+from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.engines.api import EngineError, Setting
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.toolkit.gpus import visible_gpus
@@ -32,7 +33,7 @@ from shared_store.wording import counted
 
 _WORKER = ("torch", "warp-lang", "newton", "rsl-rl-lib", "gymnasium")
 _LEAST_SHARED_MEMORY = 256
-"""MiB of /dev/shm below which NCCL between ranks of one node has been seen to fail (Docker's default is 64)."""
+"""Size of /dev/shm [MiB] below which NCCL between ranks of one node was observed to fail (Docker's default is 64)."""
 _MARKS = {"ok": "[green]ok [/]", "absent": "[yellow]-  [/]", "bad": "[red]BAD[/]"}
 _LEAST_SPACE = 5
 """GiB."""
@@ -40,11 +41,11 @@ _LEAST_SPACE = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     what: str
     state: str
-    """``ok``; ``absent``: only those who want it need it; ``bad``: it is needed and not as it must be."""
+    """``ok``; ``absent``: optional and missing; ``bad``: required and broken."""
     said: str
 
 
@@ -53,14 +54,14 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(
-    engine: Annotated[list[str] | None, typer.Option(help="Engines that must work here. Repeatable.")] = None,
+    engine: Annotated[list[str] | None, typer.Option(help="An engine that must work here. Repeatable.")] = None,
     store: Annotated[
         str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")
     ] = None,
-    worker: Annotated[bool, typer.Option("--worker", help="This machine must be able to run nodes.")] = False,
+    worker: Annotated[bool, typer.Option("--worker", help="Require that this machine can run nodes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look whether this machine has what Muster needs; exit 1 where what was asked for is missing."""
+    """Check whether this machine meets Muster's requirements; exit 1 if a requested part is missing."""
     findings = list(_examine(engine or [], Path(store).expanduser() if store else muster_home() / "store", worker))
     if as_json:
         echo_json([asdict(finding) for finding in findings], indent=1)
@@ -116,7 +117,7 @@ def _directory(path: Path) -> str:
 
 
 def _store(path: Path) -> str:
-    """A commit as Muster makes them: written, made durable, renamed, read again."""
+    """A commit like Muster's: written, made durable, renamed, read back."""
     said = _directory(path)
     with tempfile.TemporaryDirectory(prefix=".doctor-", dir=path) as scratch:
         started = time.perf_counter()
@@ -150,6 +151,9 @@ def _controller() -> Finding:
 
 def _engine(name: str) -> str:
     # an engine that launches nothing writes nothing there
-    hosts = [host for host in make_engine(name, Setting(muster_home())).capacity() if not host.away]
+    capacity = make_engine(name, Setting(muster_home())).capacity()
+    if isinstance(capacity, Queued) and isinstance(capacity.limits, Limit):
+        return f"queue {capacity.limits.queue}, at most {capacity.limits.resources.cpus:g} CPUs for a gang"
+    hosts = [host for host in capacity.machines if not host.away]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
     return f"{counted(len(hosts), 'host')}, {cpus:g} CPU{'s' if cpus != 1 else ''}, {counted(gpus, 'GPU')}"

@@ -1,4 +1,4 @@
-"""``muster evaluate``, races included."""
+"""``muster evaluate``, including races."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ def evaluate(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="RUN[@ITERATION|@best|@latest]", help="Whose policy: of its newest checkpoint, unless one is named."
+            metavar="RUN[@ITERATION|@best|@latest]",
+            help="The policy: of a run's newest checkpoint, unless you name one.",
         ),
     ],
     episodes: Annotated[int | None, typer.Option(help="Episodes in all; 100 by default.", show_default=False)] = None,
@@ -47,7 +48,7 @@ def evaluate(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(help="Of the worlds; by default one that follows from the training's, and is none of it."),
+        typer.Option(help="Seed of the worlds; by default derived from the training's seed, and different from it."),
     ] = None,
     set_: Annotated[
         list[str] | None,
@@ -56,55 +57,57 @@ def evaluate(
             help="Change the worlds (config.randomize.friction=[0.4, 0.6]) or a key of the job (resources.cpus=4). Repeatable.",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Of the job; evaluate-RUN by default.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the job; evaluate-RUN by default.")] = None,
     race: Annotated[
-        bool, typer.Option("--race", help="Drive laps of a race from the start line.", rich_help_panel=_RACE)
+        bool, typer.Option("--race", help="Drive race laps from the start line.", rich_help_panel=_RACE)
     ] = False,
     trials: Annotated[
-        int | None, typer.Option(help="Laps; 3 by default.", rich_help_panel=_RACE, show_default=False)
+        int | None, typer.Option(help="Number of laps; 3 by default.", rich_help_panel=_RACE, show_default=False)
     ] = None,
     continuous: Annotated[
         bool | None,
         typer.Option(
             "--continuous/--no-continuous",
-            help="Put a car back that left the road or crashed, or end its lap, as by default.",
+            help="Put back a car that left the road or crashed; by default its lap ends.",
             rich_help_panel=_RACE,
         ),
     ] = None,
     penalty: Annotated[
         float | None,
         typer.Option(
-            help="Seconds for each time off the track and each crash; 1 by default.",
+            help="Penalty in seconds for leaving the track and for each crash; 1 by default.",
             rich_help_panel=_RACE,
             show_default=False,
         ),
     ] = None,
     track: Annotated[
         list[str] | None,
-        typer.Option(help="Instead of the training's; laps take several in turn. Repeatable.", rich_help_panel=_RACE),
+        typer.Option(
+            help="Track to use instead of the training's; laps use several in turn. Repeatable.", rich_help_panel=_RACE
+        ),
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
             "--output",
             "-o",
-            help="Copy the SimTrace files into this directory, as log tools expect them.",
+            help="Copy the SimTrace files into this directory, in the layout that log tools expect.",
             rich_help_panel=_RACE,
             show_default=False,
         ),
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="What runs it, of the engines that the controller has.")] = None,
+    engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Evaluate a checkpoint: whole episodes on worlds that its training has not seen.
+    """Evaluate a checkpoint: whole episodes in worlds that its training has not seen.
 
-    A job like any other, followed to its end, with a controller of its own where none is running. The policy takes its mean action.
-    Every episode becomes a row of a Parquet file beside a summary in the run's evaluations/. The job has one node, with the resources
-    that the run's nodes have, and at most one GPU.
+    This submits a job and follows it to its end, with a temporary controller if none is running. The policy takes its mean action. The
+    run's evaluations/ gets a Parquet file with one row per episode, and a summary. The job has one node, with the resources of the run's
+    nodes, but at most one GPU.
 
-    With --race the episodes are laps of a racer from the start line, one world each, timed, with a file of all steps.
+    With --race the episodes are timed laps of a racer from the start line, one world each, with a file of all steps.
     """
     run, checkpoint = split_reference(source)
     rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None}
@@ -147,7 +150,7 @@ def _spec(
     elsewhere: Sequence[str],
     kind: str,
 ) -> Spec:
-    """The job, on nodes like those of the training. Raises SpecError, ApiError for a run that does not exist."""
+    """The job, on nodes like the training's. Raises SpecError, and ApiError for an unknown run."""
     trained = client.get(f"/api/runs/{run}")["spec"] or {}
     document = evaluation_document(run, trained, section, name, kind)
     worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
@@ -157,18 +160,20 @@ def _spec(
 
 
 def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:
-    """Options of races go with --race alone, and the other ones without it. Raises UsageError."""
+    """Refuse options of races without --race, and other options with it. Raises UsageError."""
     wrong = [name for name, value in (episodes if race else rules).items() if value is not None]
     if wrong:
-        instead = "a race has --trials, each in a world of its own" if race else "it is for races; add --race"
+        instead = "a race takes --trials instead, one world each" if race else "only races take it; add --race"
         raise UsageError(f"--{wrong[0]}: {instead}")
 
 
 def _copy(run: Path, evaluation: str, output: Path, quiet: bool) -> None:
-    """Bring the SimTrace files of a race to ``output``. Raises ServerError."""
+    """Copy the SimTrace files of a race to ``output``. Raises ServerError."""
     made = run / "evaluations" / evaluation / SIM_TRACE
     if not made.is_dir():
-        raise ServerError(f"-o {output}: the run's directory {run} can't be seen from this machine; they lie in {made}")
+        raise ServerError(
+            f"-o {output}: the run's directory {run} is not visible from this machine; the files are in {made}"
+        )
     hidden = output / f".{SIM_TRACE}.{evaluation}.tmp"
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -177,14 +182,14 @@ def _copy(run: Path, evaluation: str, output: Path, quiet: bool) -> None:
     except OSError as error:
         shutil.rmtree(hidden, ignore_errors=True)
         raise ServerError(
-            f"-o {output}: it can't be written ({error.strerror or error}); the files lie in {made}"
+            f"-o {output}: it can't be written ({error.strerror or error}); the files are in {made}"
         ) from None
     if not quiet:
         echo(f"copied: {output / SIM_TRACE}")
 
 
 def _told(client: Client, job: str) -> int:
-    """Print what the main rank says; how the job ended where it did not succeed. Returns the exit code."""
+    """Print the main rank's output, and how the job ended if it did not succeed. Returns the exit code."""
     for line in client.logs(job, follow=True):
         if line["rank"] == 0:
             echo(line["text"])

@@ -27,7 +27,7 @@ CheckpointArgument = Annotated[
     str,
     typer.Argument(
         metavar="RUN[@ITERATION|@best|@latest]",
-        help="Whose policy: of its newest checkpoint, of that of an iteration, or of the one with the best score.",
+        help="The policy: of a run's newest checkpoint, of an iteration's, or of the one with the best score.",
     ),
 ]
 
@@ -42,21 +42,21 @@ def export(
         Path | None, typer.Option("--output", "-o", help="Copy the bundle to this directory, which must not exist.")
     ] = None,
     episodes: Annotated[
-        int, typer.Option(min=0, help="Judge the bundle on at least so many episodes; 0: compare its actions alone.")
+        int, typer.Option(min=0, help="Judge the bundle on at least this many episodes; 0: compare only its actions.")
     ] = 16,
-    worlds: Annotated[int, typer.Option(min=1, help="Simulated worlds of the comparison.")] = 16,
+    worlds: Annotated[int, typer.Option(min=1, help="Number of simulated worlds in the comparison.")] = 16,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the job: resources.gpus=1. Repeatable.")
     ] = None,
     store: StoreOption = None,
 ) -> None:
-    """Export a policy as a bundle for a robot: ONNX, contract and self-test, compared with the policy.
+    """Export a policy as a bundle for a robot (ONNX, contract, self-test), checked against the policy.
 
-    A job writes it to exports/ of the run, with a controller of its own where none is running. The bundle appears only where its
-    policy acts as the trained one on recorded observations (1e-5), and does as well on the same simulated worlds.
+    A job writes it to the run's exports/, with a temporary controller if none is running. The bundle appears only if its policy acts like
+    the trained one on recorded observations (within 1e-5) and performs as well in the same simulated worlds.
     """
     if output is not None and output.exists():
-        raise UsageError(f"-o {output}: exists already; name a directory that does not")
+        raise UsageError(f"-o {output}: exists already; name a new directory")
     run, wanted = split_reference(source)
     with controller(store, None) as connect:
         client = connect()
@@ -72,7 +72,7 @@ def export(
 
 
 def chosen(client: Client, run: str, wanted: int | str | None) -> dict[str, Any]:
-    """The checkpoint that a reference means, as the API describes it. Raises UsageError naming the nearest one."""
+    """The API's description of the referenced checkpoint. Raises UsageError with the nearest one."""
     found: list[dict[str, Any]] = client.get(f"/api/runs/{named(run)}/checkpoints")
     if not found:
         raise UsageError(f"run {run} has no checkpoint yet; train it first")
@@ -94,7 +94,7 @@ def chosen(client: Client, run: str, wanted: int | str | None) -> dict[str, Any]
 
 
 def _tell(place: Path, output: Path | None) -> None:
-    """Say what the bundle is worth, and copy it. Raises ServerError where the store is on another machine."""
+    """Print the results of the bundle's checks, and copy it. Raises ServerError if the store is on another machine."""
     if not place.is_dir():
         where = f"the bundle is in the controller's store, {place}, which is not on this machine"
         if output is not None:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from orchestrator.cli.progress import best_told, evaluated, follow, shown_metrics
-from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line
+from orchestrator.cli.plans import show_plan
+from orchestrator.cli.progress import best_told, follow, shown_metrics
+from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.hosts import engine_of
@@ -23,6 +21,7 @@ from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
+from shared_store.evaluations import in_one_line
 from shared_store.wording import counted
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -33,12 +32,14 @@ SpecArgument = Annotated[str, typer.Argument(help="A job YAML, such as job_specs
 JobArgument = Annotated[
     str,
     typer.Argument(
-        help="Job id, the first letters of one (4 or more), or a job name (the newest); of an array's child with :INDEX."
+        help="Job id or its first letters (4 or more), or a job name (its newest job); with :INDEX, an array's child."
     ),
 ]
 
+_EXAMPLES = """Examples:  muster submit job_specs/ant.yaml --set train.iterations=600 -f
+muster submit job_specs/ant.yaml --name ant-2 --set train.seed=2 --dry-run"""
 _PATIENCE = 3.0
-"""Seconds after which a stop that takes its time says why."""
+"""Seconds after which a slow stop explains itself."""
 _OF_RUN = {
     "evaluate": "evaluates",
     "race": "races",
@@ -46,12 +47,12 @@ _OF_RUN = {
     "record": "records",
     "render": "renders",
 }
-"""What a job of each kind does with another run."""
+"""Verb for what a job of each kind does with another run."""
 COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 
 
 def register(app: typer.Typer) -> None:
-    app.command(epilog="Example:  muster submit job_specs/ant.yaml --set train.iterations=600 -f")(submit)
+    app.command(epilog=_EXAMPLES)(submit)
     app.command(epilog="Example:  muster show ant")(show)
     app.command(epilog="Example:  muster stop ant   then   muster resume RUN")(stop)
     app.command(epilog="Example:  muster checkpoint ant")(checkpoint)
@@ -85,22 +86,24 @@ def submit(
     set_: SetOption = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would start where; --json: with all variables. Nothing starts.")
+        bool,
+        typer.Option("--dry-run", help="Show what would start where, without starting it; --json: with all variables."),
     ] = False,
     engine: Annotated[
         str | None,
-        typer.Option(help=f"What runs it, of the engines that the controller has: {', '.join(ENGINES)}."),
+        typer.Option(help=f"Engine that runs the job, one of the controller's: {', '.join(ENGINES)}."),
     ] = None,
+    name: Annotated[str | None, typer.Option(help="Of the job, and of its run, instead of the spec's.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Submit a job to a running controller."""
-    loaded = specfile.load(spec, set_)
+    loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)])
     tell(loaded)
     with Client.connect() as client:
         if engine is not None:
             loaded = on_engine(client, loaded, engine, spec)
         if dry_run:
-            _show_plan(client, loaded, as_json)
+            show_plan(client, compile_definition(loaded, os.getcwd()), loaded.queue, as_json)
             return
         submitted = submit_spec(client, loaded, spec)
         if as_json:
@@ -114,13 +117,13 @@ def submit(
 
 
 def tell(spec: Spec) -> None:
-    """Say on standard error what a spec has to say."""
+    """Print a spec's warnings on standard error."""
     for note in spec.notes:
         echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
-    """The same spec for the queue of that engine. Raises SpecError where the controller does not have it."""
+    """The same spec for the queue of that engine. Raises SpecError if the controller lacks it."""
     queue = engine_queue(client, engine)
     if spec.queue not in ("default", queue):
         raise SpecError(f"{source}: queue: {spec.queue}, but --engine {engine} means {queue}; leave one of them out")
@@ -128,7 +131,7 @@ def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
 
 
 def engine_queue(client: Client, engine: str) -> str:
-    """The queue of an engine. Raises SpecError where the controller does not have it."""
+    """The queue of an engine. Raises SpecError if the controller lacks it."""
     check_engine(engine)
     queues: dict[str, str] = client.get("/api/capacity")["engines"]
     if engine not in queues:
@@ -140,7 +143,7 @@ def engine_queue(client: Client, engine: str) -> str:
 
 
 def on_queue(changes: Sequence[str] | None, queue: str | None) -> list[str]:
-    """The change that sends a job to ``queue``. Raises SpecError where ``changes`` name one, too."""
+    """The change that sends a job to ``queue``. Raises SpecError if ``changes`` name a queue too."""
     if queue is None:
         return []
     for change in changes or ():
@@ -149,36 +152,19 @@ def on_queue(changes: Sequence[str] | None, queue: str | None) -> list[str]:
     return [f"queue={json.dumps(queue)}"]
 
 
+def called(changes: Sequence[str] | None, name: str | None) -> list[str]:
+    """The change that names a job. Raises SpecError where ``changes`` do, too."""
+    if name is None:
+        return []
+    if twice := next((each for each in changes or () if each.partition("=")[0] == "name"), None):
+        raise SpecError(f"--set {twice}: --name {name} names the job; give one of them")
+    return [f"name={json.dumps(name)}"]
+
+
 def check_engine(name: str) -> None:
     """Raises SpecError for a name that no engine has."""
     if name not in ENGINES:
         raise SpecError(f"--engine {name}: there is no such engine; there are {', '.join(ENGINES)}")
-
-
-def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
-    """What the controller's engine would start for ``spec``, if all hosts were free."""
-    definition = compile_definition(spec, os.getcwd())
-    plan = client.post("/api/plan", {"definition": definition, "queue": spec.queue})
-    if as_json:
-        echo_json({**plan, "registerJobDefinition": definition}, indent=1)
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("NODE", "RANK", "HOST", "CPUS", "GPUS", "MEMORY", "ADDRESS", "IMAGE"):
-        table.add_column(column, no_wrap=True)
-    table.add_column("COMMAND", overflow="fold")
-    for node in plan["nodes"]:
-        image = node["image"] if plan["images"] else "-"
-        table.add_row(
-            *(str(node["index"]), str(node["rank"]), node["host"], f"{node['cpus']:g}", ",".join(node["gpus"]) or "-"),
-            *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
-        )
-    echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
-    whole = Console(width=WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
-    with whole.capture() as printed:
-        whole.print(table)
-    echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
-    if plan["document"]:
-        echo(f"\n{plan['document']}")
 
 
 def _counted(summary: dict[str, int]) -> str:
@@ -187,7 +173,7 @@ def _counted(summary: dict[str, int]) -> str:
 
 
 def _used(attempt: dict[str, Any], saves: bool) -> str:
-    """GPU time that an attempt held (CPU time where it has no GPUs), and how much of it was lost where that is known: of what ``saves``."""
+    """GPU time of an attempt (CPU time without GPUs), and the lost part if known: only for what ``saves``."""
     kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
     used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
     if not used:
@@ -196,7 +182,7 @@ def _used(attempt: dict[str, Any], saves: bool) -> str:
 
 
 def _gpus(node: dict[str, Any]) -> str:
-    """Which GPUs a node has; how many, where only its engine knows which."""
+    """The GPUs of a node, or their number if only its engine knows them."""
     if not node["gpus"]:
         return ""
     known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
@@ -206,7 +192,7 @@ def _gpus(node: dict[str, Any]) -> str:
 
 
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
-    """Show a job: its state and why, its attempts and nodes, its run and results."""
+    """Show a job: its state and the reason, its attempts and nodes, its run and results."""
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         detail["job"] = client.batch("DescribeJobs", jobs=[detail["id"]])["jobs"][0]
@@ -228,7 +214,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     }
     results = detail["results"] or {}
     array = detail["job"].get("arrayProperties", {})
-    if "statusSummary" in array:  # its children have runs and nodes, the array has none
+    if "statusSummary" in array:  # the children have runs and nodes, not the array
         facts["run"] = None
         facts["children"] = f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:0"
     if progress := detail["progress"]:
@@ -238,7 +224,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
         )
     if evaluation := results.get("evaluation"):
-        facts["evaluation"] = evaluated(evaluation)
+        facts["evaluation"] = in_one_line(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))
     facts["evaluating"] = _automatic(detail["run"], results.get("automatic"))
     facts |= {name: results.get(name) for name in ("checkpoint", "plot", "picture")} | {
@@ -254,7 +240,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         counted = "" if attempt["spent"] else ", not counted"
         spent += bool(attempt["spent"])
         number = f"{attempt['number']} of {detail['attemptsAllowed']}"
-        if spent < attempt["number"]:  # of those that are allowed, attempts that left on request are none
+        if spent < attempt["number"]:  # attempts that exited on request don't count against the allowed number
             number = f"{attempt['number']} ({spent} of {detail['attemptsAllowed']} spent)"
         reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] and ended != "succeeded" else ""
         lasted = took(attempt["startedAt"], attempt["stoppedAt"])
@@ -272,7 +258,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
 
 
 def _source(detail: Mapping[str, Any]) -> str:
-    """What a job reads of another run, as ``RUN@ITERATION``."""
+    """The checkpoint of another run that a job reads, as ``RUN@ITERATION``."""
     section = (detail["spec"] or {}).get(detail["kind"])
     if not isinstance(section, dict) or "run" not in section:
         return ""
@@ -297,7 +283,7 @@ def _automatic(run: str, told: Mapping[str, Any] | None) -> str:
 
 
 def started_from(parent: Mapping[str, Any] | None) -> str:
-    """Where a clone has its weights from, in one line; nothing of a run that is no clone."""
+    """The source of a clone's weights, in one line; empty for other runs."""
     if not parent:
         return ""
     score = scored(parent.get("score"), parent.get("score_error"))
@@ -306,7 +292,7 @@ def started_from(parent: Mapping[str, Any] | None) -> str:
 
 
 def scored(score: float | None, error: float | None) -> str:
-    """A score with its standard error, where that is known: ``812.30 ± 4.10``."""
+    """A score with its standard error, if known: ``812.30 ± 4.10``."""
     if score is None:
         return "-"
     return f"{score:.2f}" + (f" ± {error:.2f}" if error is not None else "")
@@ -314,10 +300,13 @@ def scored(score: float | None, error: float | None) -> str:
 
 def stop(
     job: JobArgument,
-    reason: Annotated[str, typer.Option(help="Kept with the job.")] = "stopped by the user",
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return when the job has ended.")] = True,
+    reason: Annotated[str, typer.Option(help="Reason, kept with the job.")] = "stopped by the user",
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return only when the job has ended.")] = True,
 ) -> None:
-    """Stop a job: it checkpoints and leaves; `muster resume` goes on from there."""
+    """Stop a job: it checkpoints and exits; `muster resume` continues from there.
+
+    A training ends its iteration first. One that does not end within the 30 s that a job has is left, and `muster resume` repeats it.
+    """
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         if detail["status"] in ("SUCCEEDED", "FAILED"):
@@ -325,22 +314,48 @@ def stop(
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
+        slow = wait and slow_iteration(detail)
         while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:
                 said = detail["statusReason"]
                 echo(f"{detail['name']} ({detail['id'][:8]}): {one_line(said)}", err=True)
+            if slow and time.monotonic() > patience:
+                echo(slow, err=True)
+                slow = ""
     if not wait:
         echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
+    if lost := lost_iterations(detail):
+        echo(lost)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
         echo(f"go on with: muster resume {detail['run']}")
 
 
+def slow_iteration(detail: Mapping[str, Any]) -> str:
+    """What may become of the present iteration of a training whose iterations last long; empty for others."""
+    seconds = (detail["progress"] or {}).get("iteration_seconds") or 0.0
+    if detail["kind"] != "train" or detail["status"] != "RUNNING" or seconds < _PATIENCE:
+        return ""
+    return (
+        f"an iteration takes about {seconds:.0f} s; one that does not end in the time that the job has to leave (30 s, unless the "
+        f"engine gives less) is left, and resume repeats it; to lose none: muster checkpoint {detail['name']}, then stop"
+    )
+
+
+def lost_iterations(detail: Mapping[str, Any]) -> str:
+    """The iterations of a stopped training that no checkpoint has; empty without any, and for other jobs."""
+    done = (detail["progress"] or {}).get("iteration", 0)
+    saved = (detail["results"] or {}).get("iteration", 0)
+    if detail["kind"] != "train" or done <= saved:
+        return ""
+    return f"lost: {counted(done - saved, 'iteration')}, those after {saved} until {done}"
+
+
 def checkpoint(job: JobArgument) -> None:
-    """Have a training job save now; returns when the checkpoint is durable."""
+    """Make a training job save now; return when the checkpoint is durable."""
     with Client.connect() as client:
         answer = client.post(f"/api/jobs/{named(job)}/checkpoint", {}, seconds=180)["answer"]
     echo(answer)
@@ -351,7 +366,7 @@ def checkpoint(job: JobArgument) -> None:
 def stacks(job: JobArgument) -> None:
     """Print the Python and native stacks of every rank of a running job.
 
-    They go to the job's log too.
+    The stacks go to the job's log too.
     """
     with Client.connect() as client:
         for node in client.get(f"/api/jobs/{named(job)}/stacks", seconds=180):
@@ -360,10 +375,11 @@ def stacks(job: JobArgument) -> None:
 
 def print_schema(
     contract: Annotated[
-        bool, typer.Option("--contract", help="Of a policy contract (contract.json) instead of a job.")
+        bool,
+        typer.Option("--contract", help="Print the schema of a policy contract (contract.json) instead of a job's."),
     ] = False,
 ) -> None:
-    """Print the JSON Schema of the job YAML, for editors; or that of the policy contract."""
+    """Print the JSON Schema of the job YAML, for editors, or of the policy contract."""
     echo_json(contract_schema() if contract else schema(), indent=2)
 
 
@@ -376,7 +392,7 @@ def took(start: int | None, end: int | None) -> str:
         return "-"
     seconds = (
         max(0, int((end or time.time() * 1000) - start)) // 1000
-    )  # this machine's clock may be behind the controller's
+    )  # this machine's clock may lag behind the controller's
     return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}"
 
 

@@ -1,4 +1,4 @@
-"""``muster keys``: who may call the server."""
+"""``muster keys``: access keys of the server."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from orchestrator.client import EXAMPLE_URL
 from orchestrator.home import local_url, muster_home
 from orchestrator.keys import KeyStore
 
-NameArgument = Annotated[str, typer.Argument(help="The key's name: who or what uses it.")]
+NameArgument = Annotated[str, typer.Argument(help="Name of the key: its user or program.")]
 
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Access keys of this home directory's server: who may call it.\n\nAWS clients use one as a key pair, muster as MUSTER_TOKEN.",
+        "Manage the access keys of this home directory's server.\n\nAWS clients use a key as a key pair, muster as MUSTER_TOKEN.",
         "Example:  muster keys create alice --queue robots",
     )
     group.command(epilog="Example:  muster keys create alice --queue robots")(create)
@@ -34,10 +34,10 @@ def create(
     queue: Annotated[
         list[str] | None, typer.Option(help="A job queue that the key may use; repeatable. All queues by default.")
     ] = None,
-    read_only: Annotated[bool, typer.Option("--read-only", help="The key may look but change nothing.")] = False,
+    read_only: Annotated[bool, typer.Option("--read-only", help="The key may read but change nothing.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Create a key and show it, this once. From now on the server lets in only who has a key or MUSTER_TOKEN."""
+    """Create a key and show it once. From now on the server admits only callers with a key or MUSTER_TOKEN."""
     key = KeyStore(muster_home()).create(name, tuple(queue or ()), read_only)
     if as_json:
         echo_json({**key.describe(), "secretAccessKey": key.secret})
@@ -78,14 +78,14 @@ def list_keys(as_json: JsonOption = False) -> None:
 
 
 def delete(name: NameArgument) -> None:
-    """Delete a key: a running server refuses it from its next request on. After the last one it says who may come in."""
+    """Delete a key: a running server refuses its next request. After the last key, print who can still connect."""
     keys = KeyStore(muster_home())
     keys.delete(name)
     echo(f"deleted key {name}")
     if not keys.load():
         echo(
-            f"""it was the last one of {muster_home()}:
-  a running server lets in only who has its MUSTER_TOKEN, until there is a key again or it is restarted
-  a server that starts from now on takes requests on loopback from its own user without a key
-  a server that other machines can reach (--host) does not start until there is a key or MUSTER_TOKEN"""
+            f"""this was the last key of {muster_home()}:
+  a running server admits only callers with its MUSTER_TOKEN, until a new key exists or it is restarted
+  a server started from now on accepts its own user's requests on loopback without a key
+  a server that other machines can reach (--host) does not start without a key or MUSTER_TOKEN"""
         )

@@ -1,4 +1,4 @@
-"""``muster league``: who drives the fastest laps by one set of rules."""
+"""``muster league``: competitions for the fastest laps under one set of rules."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ muster league table cup -o cup.png   and   muster league verify cup 1 --rerun"""
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Leagues of the racer: create, submit, table, verify and more. Nothing of one is ever changed.",
+        "Manage the racer's leagues: create, submit, table, verify and more. Leagues are append-only.",
         _EXAMPLES,
     )
     group.command(
@@ -56,43 +56,48 @@ def register(app: typer.Typer) -> None:
 
 
 def create(
-    name: Annotated[str, typer.Argument(help="What the league is to be called.")],
+    name: Annotated[str, typer.Argument(help="Name of the league.")],
     track: Annotated[
         list[str],
-        typer.Option(help="A preset, random:SEED, or a track of the store. Repeatable: the laps take turns."),
+        typer.Option(help="A preset, random:SEED, or a track of the store. Repeatable: laps use the tracks in turn."),
     ],
-    laps: Annotated[int, typer.Option(min=1, max=100, help="Of a race, each from the start line.")] = 3,
+    laps: Annotated[int, typer.Option(min=1, max=100, help="Number of laps in a race, each from the start line.")] = 3,
     ranking: Annotated[
-        str, typer.Option(help="What counts: total (of all laps), best (lap), average (of the complete laps).")
+        str, typer.Option(help="The ranking time: total (of all laps), best (lap), average (of the complete laps).")
     ] = "total",
     continuous: Annotated[
         bool,
-        typer.Option(
-            "--continuous/--no-continuous", help="Whether a car that leaves the road is put back and goes on."
-        ),
+        typer.Option("--continuous/--no-continuous", help="Put back a car that leaves the road and let it continue."),
     ] = False,
     off_track_penalty: Annotated[
-        float, typer.Option(min=0, max=3600, help="Seconds for leaving the road; in a continuous race.")
+        float, typer.Option(min=0, max=3600, help="Penalty in seconds for leaving the road, in a continuous race.")
     ] = 1.0,
     crash_penalty: Annotated[
-        float, typer.Option(min=0, max=3600, help="Seconds for touching an obstacle; in a continuous race.")
+        float, typer.Option(min=0, max=3600, help="Penalty in seconds for touching an obstacle, in a continuous race.")
     ] = 1.0,
     max_resets: Annotated[
-        int, typer.Option(min=0, max=10_000, help="How often a car is put back in a lap; once more ends it.")
+        int,
+        typer.Option(min=0, max=10_000, help="Number of times that a car is put back in a lap; the next time ends it."),
     ] = 100,
-    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Simulated time that a lap may take.")] = 1200.0,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Longest simulated time of a lap.")] = 1200.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of every race.")] = 1,
     opens: Annotated[
-        str | None, typer.Option(help="2026-12-01T18:00, or with Z in UTC; at once by default.", show_default=False)
+        str | None,
+        typer.Option(
+            help="Opening time, such as 2026-12-01T18:00 (with Z: in UTC); now by default.", show_default=False
+        ),
     ] = None,
     closes: Annotated[
-        str | None, typer.Option(help="From when on no race is started; never by default.", show_default=False)
+        str | None,
+        typer.Option(help="Closing time, after which no race can start; never by default.", show_default=False),
     ] = None,
-    most_entries: Annotated[int, typer.Option(min=1, max=10_000, help="Of each key or user.")] = 99,
+    most_entries: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Greatest number of entries of each key or user.")
+    ] = 99,
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Create a league. Its rules are never changed."""
+    """Create a league. Its rules can't be changed."""
     if ranking not in RANKINGS:
         raise UsageError(f"--ranking {ranking}: there is no such ranking; {nearest(ranking, RANKINGS)}")
     body = {
@@ -119,7 +124,7 @@ def create(
 
 
 def _moment(option: str, text: str | None) -> float | None:
-    """A time as Unix seconds; of this machine's time zone where it names none. Raises UsageError."""
+    """A time as Unix seconds, in this machine's time zone unless it names one. Raises UsageError."""
     if text is None:
         return None
     try:
@@ -160,7 +165,7 @@ def _state(league: Mapping[str, Any]) -> str:
 def show(
     league: LeagueArgument, entry: OptionalEntry = None, store: StoreOption = None, as_json: JsonOption = False
 ) -> None:
-    """Show the rules of a league; of an entry its model, its evaluation and its laps."""
+    """Show the rules of a league; of an entry its model, its evaluation and its laps; exit 1 where it or its model is altered."""
     path = f"/api/leagues/{named(league)}" + ("" if entry is None else f"/entries/{entry}")
     with controller(store, None) as connect:
         found = connect().get(path, seconds=300)
@@ -170,6 +175,8 @@ def show(
         _tell_league(found)
     else:
         _tell_entry(found)
+    if found.get("problem"):
+        raise typer.Exit(1)
 
 
 def _tell_league(league: Mapping[str, Any]) -> None:
@@ -208,7 +215,7 @@ def _tell_entry(entry: Mapping[str, Any]) -> None:
     if ruling := entry.get("ruling"):
         echo(f"  disqualified: {ruling['reason']}")
     if entry.get("problem"):
-        echo(f"  problem:     {entry['problem']}")
+        echo(f"  problem:     {entry['problem']}" if "race" in entry else f"entry {entry['entry']}: {entry['problem']}")
 
 
 def submit(
@@ -216,23 +223,23 @@ def submit(
     model: ModelArgument,
     racer: Annotated[
         str | None,
-        typer.Option("--as", metavar="RACER", help="Who races; by default the name of the key or the user."),
+        typer.Option("--as", metavar="RACER", help="Name of the racer; by default the name of the key or the user."),
     ] = None,
     detach: Annotated[
-        bool, typer.Option("--detach", help="Submit the race alone; --evaluation enters it when it has ended.")
+        bool, typer.Option("--detach", help="Only submit the race; --evaluation enters it after it has ended.")
     ] = False,
     evaluation: Annotated[
         str | None,
-        typer.Option(metavar="JOB", help="Enter this race, which has ended, instead of a new one.", show_default=False),
+        typer.Option(metavar="JOB", help="Enter this finished race instead of a new one.", show_default=False),
     ] = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Race a model by the rules of a league, follow the race to its end, and enter it for good.
+    """Race a model under the rules of a league, follow the race to its end, and enter it permanently.
 
-    The race is an evaluation like any other, with a controller of its own where none is running. What can be refused is refused before
-    it starts: a model that was altered, a league that is not open, too many entries.
+    The race is an evaluation job, with a temporary controller if none is running. An altered model, a league that is not open and too
+    many entries are refused before it starts.
     """
     name, version = split_model(model)
     if detach and evaluation:
@@ -250,7 +257,10 @@ def submit(
             code = see_through(client, started["jobId"], *([_quietly] if as_json else []))
             if code:
                 raise typer.Exit(code)
-            body["version"], evaluation = started["version"], started["jobId"]  # the newest one may be another by now
+            body["version"], evaluation = (
+                started["version"],
+                started["jobId"],
+            )  # the newest model may have changed since
         entry = client.post(f"{path}/entries", {**body, "job": evaluation}, seconds=300)
         rows = client.get(f"{path}/entries", every=True)
     row = next(each for each in rows if each["entry"] == entry["entry"])
@@ -268,11 +278,11 @@ def _tell_started(started: Mapping[str, Any], league: str, racer: str | None, as
     reference, job = f"{started['model']}@{started['version']}", started["jobId"][:8]
     echo(f"submitted the race of {reference} as {started['jobId']}")
     name = f" --as '{racer}'" if racer else ""
-    echo(f"enter it when it has ended: muster league submit {league} {reference}{name} --evaluation {job}")
+    echo(f"enter it after it has ended: muster league submit {league} {reference}{name} --evaluation {job}")
 
 
 def _quietly(client: Client, job: str) -> int:
-    """Wait for a job; how it ended where it did not succeed. Returns the exit code."""
+    """Wait for a job, and print how it ended if it did not succeed. Returns the exit code."""
     for _ in client.logs(job, follow=True):
         pass
     return 0 if client.get(f"/api/jobs/{job}")["status"] == "SUCCEEDED" else summary(client, job)
@@ -280,7 +290,7 @@ def _quietly(client: Client, job: str) -> int:
 
 def show_table(
     league: LeagueArgument,
-    every: Annotated[bool, typer.Option("--all", help="Show every entry of a racer, not the best one alone.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Show every entry of a racer, not only the best.")] = False,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Write the table as .csv, or as a picture (.png).", show_default=False),
@@ -289,7 +299,7 @@ def show_table(
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show who is ahead: of each racer the best entry, then those that are not ranked and why."""
+    """Show the ranking: each racer's best entry, then unranked entries with the reason."""
     if output is not None:
         check_output(output, overwrite, ".csv", ".png")
     with controller(store, None) as connect:
@@ -317,11 +327,11 @@ def show_table(
 def disqualify(
     league: LeagueArgument,
     entry: EntryArgument,
-    reason: Annotated[str, typer.Option(help="Stands in the table, for good.")],
+    reason: Annotated[str, typer.Option(help="Shown in the table, permanently.")],
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say beside an entry that it does not count, and why. The entry stays as it is. For the owner of the league."""
+    """Mark an entry as disqualified, with a reason. The entry itself stays unchanged. Only the league's owner may do this."""
     with controller(store, None) as connect:
         found = connect().post(f"/api/leagues/{named(league)}/entries/{entry}/disqualify", {"reason": reason})
     if as_json:
@@ -334,13 +344,13 @@ def verify(
     league: LeagueArgument,
     entry: OptionalEntry = None,
     rerun: Annotated[
-        bool, typer.Option("--rerun", help="Race each entry once more, with the same seed, and compare every lap.")
+        bool, typer.Option("--rerun", help="Race each entry again with the same seed, and compare every lap.")
     ] = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that entries and their models are as they were entered; exit 1 where anything differs."""
+    """Check that entries and their models are unchanged; exit 1 if anything differs."""
     path = f"/api/leagues/{named(league)}"
     told = []
     with controller(store, cpus) as connect:
@@ -352,24 +362,24 @@ def verify(
             if rerun and not problems:
                 problems = _again(client, f"{path}/entries/{number}/races", found)
             told.append({"entry": number, "problems": problems})
-            good = "every lap is the same to the last bit" if rerun else "as it was entered, and so is its model"
+            good = "every lap is the same, bit for bit" if rerun else "the entry and its model are unchanged"
             for line in [] if as_json else problems or [good]:
                 echo(f"entry {number}: {line}")
     if as_json:
         echo_json(told, indent=1)
     elif not told:
-        echo(f"{league} is as it was created and has no entries")
+        echo(f"{league} is unchanged and has no entries")
     if any(each["problems"] for each in told):
         raise typer.Exit(1)
 
 
 def _again(client: Client, path: str, entry: Mapping[str, Any]) -> list[str]:
-    """What differs between an entry and its race, driven once more, a line each."""
+    """Differences between an entry and a repetition of its race, one line each."""
     try:
         started = client.post(path, {"directory": os.getcwd()}, seconds=300)
     except NotServing:
         raise
-    except ApiError as error:  # of this entry: its checkpoint is gone, say
+    except ApiError as error:  # of this entry only: for example, its checkpoint was deleted
         return [str(error)]
     if see_through(client, started["jobId"], _quietly):
         return [f"its race was not driven again: job {started['jobId'][:8]} did not succeed"]

@@ -1,4 +1,4 @@
-"""The table of a league: as cells, as CSV, and as a picture that is drawn without a display."""
+"""The table of a league: as cells, as CSV, and as a picture drawn without a display."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _NUMBERS = ("off_tracks", "crashes", "resets")
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """A row of the table as people read it, a text for each of :data:`COLUMNS`."""
+    """A row of the table as text, one cell for each of :data:`COLUMNS`."""
     laps = "-" if row["laps"] is None else f"{row['completed']} of {row['laps']}"
     counts = ["-" if row[key] is None else str(row[key]) for key in _NUMBERS]
-    status = row["status"] if row["status"] == "ranked" else f"{row['status']}: {row['reason']}"
+    told = {"ranked": "ranked", "altered": row["reason"]}
+    status = told.get(row["status"]) or f"{row['status']}: {row['reason']}"
     return [
         str(row["rank"] or "-"),
         str(row["entry"]),
@@ -36,7 +37,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def write(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write the table into ``path``, a .csv (times in seconds) or a .png. Raises UsageError where that can't be."""
+    """Write the table to ``path``, a .csv (times in seconds) or a .png. Raises UsageError if it can't."""
     try:
         write_atomic(path.absolute(), _csv(rows) if path.suffix == ".csv" else _picture(league, rows))
     except ImportError:

@@ -16,9 +16,9 @@ from shared_store.wording import counted
 
 _NEWEST = 20
 _AT_ONCE = 100
-"""Jobs that DescribeJobs takes."""
+"""Greatest number of jobs in a DescribeJobs request."""
 _AUTOMATIC = "automaticEvaluation"
-"""Key of a summary: what an automatic evaluation evaluates, ``RUN@ITERATION``."""
+"""Key of a summary for the subject of an automatic evaluation, ``RUN@ITERATION``."""
 
 
 def register(app: typer.Typer) -> None:
@@ -27,14 +27,14 @@ def register(app: typer.Typer) -> None:
 
 def list_jobs(
     all_: Annotated[
-        bool, typer.Option("--all", "-a", help="All jobs, not the newest 20 without automatic evaluations.")
+        bool, typer.Option("--all", "-a", help="List all jobs, not just the newest 20 without automatic evaluations.")
     ] = False,
-    queue: Annotated[str | None, typer.Option(help="Only of this queue.")] = None,
+    queue: Annotated[str | None, typer.Option(help="List only this queue's jobs.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List jobs, the newest first.
 
-    Evaluations that a controller submits beside a training are counted only; --all lists them, and so does --json.
+    Evaluations that a controller submits beside a training are only counted; --all and --json list them.
     """
     with Client.connect() as client:
         queues = [queue] if queue else client.get("/api/capacity")["queues"]
@@ -68,14 +68,14 @@ def _table(summaries: list[dict[str, Any]]) -> Table:
         table.add_row(
             *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", _nodes(summary)),
             *(when(summary["createdAt"]), took(summary.get("startedAt"), summary.get("stoppedAt"))),
-            # a compiler's message has lines, and brackets that are no markup
+            # a compiler's message has several lines, and brackets that are not markup
             escape(one_line("; ".join(filter(None, (evaluates, reason))))),
         )
     return table
 
 
 def _list_queue(client: Client, queue: str, all_: bool, folded: bool) -> list[dict[str, Any]]:
-    """The newest 20 jobs of a queue, or all; ``folded``: the newest 20 that are no automatic evaluations, and those between."""
+    """The newest 20 jobs of a queue, or all; ``folded``: the newest 20 except automatic evaluations, and the evaluations in between."""
     summaries: list[dict[str, Any]] = []
     more: dict[str, str] = {}
     while True:
@@ -90,7 +90,7 @@ def _list_queue(client: Client, queue: str, all_: bool, folded: bool) -> list[di
 
 
 def _with_origins(client: Client, summaries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The summaries, those of automatic evaluations with what they evaluate: their tag says it, which a listing lacks."""
+    """The summaries, with the subjects of automatic evaluations from their tags, which a listing lacks."""
     named = [each["jobId"] for each in summaries if each["jobName"].startswith("evaluate-")]
     found: dict[str, str] = {}
     for start in range(0, len(named), _AT_ONCE):

@@ -27,14 +27,15 @@ def register(app: typer.Typer) -> None:
 
 def logs(
     job: JobArgument,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until the job ends.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Follow the log until the job ends.")] = False,
     node: Annotated[int | None, typer.Option(help="Only this node.")] = None,
     rank: Annotated[int | None, typer.Option(help="Only this rank.")] = None,
     attempt: Annotated[int | None, typer.Option(help="Only this attempt.")] = None,
-    since: Annotated[str | None, typer.Option(help="Only lines newer than 90s, 10m, 2h or 1d.")] = None,
-    grep: Annotated[str | None, typer.Option(help="Only lines that match this regular expression.")] = None,
+    since: Annotated[str | None, typer.Option(help="Print only lines newer than this: 90s, 10m, 2h or 1d.")] = None,
+    grep: Annotated[str | None, typer.Option(help="Print only lines that match this regular expression.")] = None,
     raw: Annotated[
-        bool, typer.Option("--raw", help="Lines as they are; by default only colours stay, other escapes are shown.")
+        bool,
+        typer.Option("--raw", help="Print lines unchanged; by default only colours stay, and other escapes are shown."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -67,11 +68,11 @@ def logs(
 
 
 def _printed(text: str) -> bool:
-    """Print; False where the reader has had enough (``muster logs … | head``)."""
+    """Print a line; False if the reader closed the pipe (``muster logs … | head``)."""
     try:
         echo_raw(text)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard buffered output
         return False
     return True
 

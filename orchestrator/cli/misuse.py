@@ -1,4 +1,4 @@
-"""Wrong use of the command, in one line: what was typed, what is wrong with it, the nearest name, and which help to read."""
+"""Usage errors in one line: the input, the mistake, the nearest name, and the help to read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orchestrator.domain.errors import UsageError
 from shared_store.wording import explain, nearest
 
 Misuse: type[Exception] = typer.BadParameter.__mro__[2]
-"""What the parser raises. Typer has it from click, or brings its own: the name of the module differs from version to version."""
+"""The parser's exception. Typer takes it from click or has its own, depending on the version."""
 
 _EXPECTED = {
     "int_parsing": "a whole number",
@@ -34,16 +34,16 @@ class Group(TyperGroup):
 
 
 def make_group(about: str, epilog: str) -> typer.Typer:
-    """A group of commands, which alone prints its help."""
+    """A group of commands that prints its help without a subcommand."""
     return typer.Typer(cls=Group, no_args_is_help=True, rich_markup_mode="rich", help=about, epilog=epilog)
 
 
 def told(error: Any, commands: Sequence[str]) -> str:
-    """What is wrong with the command line; empty where the error is that nothing was given, whose help is printed already.
+    """The mistake in the command line; empty if the command line is empty, since the help is already printed.
 
     Args:
         error: A :data:`Misuse`.
-        commands: Names of all commands: the parser does not always say which one it was at.
+        commands: Names of all commands, since the parser does not always report the present one.
     """
     message = error.format_message().strip()
     ctx = getattr(error, "ctx", None)
@@ -76,7 +76,7 @@ def _name(param: Any) -> str:
 
 
 def _wanted(error: Any) -> str:
-    """What was expected of a value, and what was found."""
+    """The expected and the given value."""
     cause = error.__cause__
     if not hasattr(cause, "errors"):
         return str(error.message).rstrip(".")

@@ -1,4 +1,4 @@
-"""``muster models``: the policies that were chosen to be kept."""
+"""``muster models``: the registry of exported policies."""
 
 from __future__ import annotations
 
@@ -14,20 +14,17 @@ from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
 from orchestrator.cli.jobs import JsonOption, scored
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.progress import evaluated
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
 from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
-from shared_store.evaluations import flattened
+from shared_store.evaluations import flattened, in_one_line
 from shared_store.policy_contract import differences, read
 from shared_store.wording import counted
 
-ModelArgument = Annotated[
-    str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version where none is named.")
-]
+ModelArgument = Annotated[str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version by default.")]
 
 _EXAMPLES = """Examples:  muster export ant-1f2e3d4c@best   then   muster models register ant-1f2e3d4c@best --name ant
 muster models verify ant@1"""
@@ -35,7 +32,7 @@ muster models verify ant@1"""
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Keep exported policies: register, list, show, diff, verify. A version is never changed.",
+        "Manage exported policies: register, list, show, diff, verify. Versions are immutable.",
         _EXAMPLES,
     )
     group.command("register", epilog="Example:  muster models register ant-1f2e3d4c@best --name ant")(register_model)
@@ -48,14 +45,14 @@ def register(app: typer.Typer) -> None:
 
 def register_model(
     source: CheckpointArgument,
-    name: Annotated[str, typer.Option(help="Of the model; its versions count up from 1.")],
+    name: Annotated[str, typer.Option(help="Name of the model; its versions count up from 1.")],
     again: Annotated[
-        bool, typer.Option("--again", help="Make another version of a checkpoint that the model has already.")
+        bool, typer.Option("--again", help="Register a checkpoint again that the model already has.")
     ] = False,
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Keep the bundle of a checkpoint, which `muster export` made, as the next version of a model."""
+    """Register a checkpoint's bundle, made by `muster export`, as the next version of a model."""
     run, checkpoint = split_reference(source)
     with controller(store, None) as connect:
         body = {"name": name, "checkpoint": checkpoint, "again": again}
@@ -88,14 +85,14 @@ def list_models(store: StoreOption = None, as_json: JsonOption = False) -> None:
 
 
 def _return(model: dict[str, Any]) -> str:
-    """The mean return of its evaluation of most episodes in the worlds of the training; else the training's score."""
+    """The mean return of its evaluation with the most episodes in the training's worlds, or else the training's score."""
     own = [each for each in model.get("evaluations") or [] if not each.get("config")]
     best = max(own, key=lambda each: each["episodes"], default=None)
     return f"{best['mean_return']:.2f}" if best else scored(model.get("score"), None)
 
 
 def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = False) -> None:
-    """Show where a model comes from, how it was evaluated, and where its bundle is."""
+    """Show a model's origin, evaluation and bundle."""
     found = _read(model, store)
     if as_json:
         echo_json(found, indent=1)
@@ -109,7 +106,7 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
     for evaluation in found.get("evaluations") or []:
         changed = ", ".join(f"{place} {value}" for place, value in flattened(evaluation.get("config") or {}))
         echo(
-            f"  evaluation:  {evaluated(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
+            f"  evaluation:  {in_one_line(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
         )
     if judged := found.get("judged"):
         echo(
@@ -127,12 +124,12 @@ def diff(
     model: ModelArgument,
     other: Annotated[
         str | None,
-        typer.Argument(metavar="NAME[@VERSION]", help="Compare with this one; by default the version before."),
+        typer.Argument(metavar="NAME[@VERSION]", help="Version to compare with; by default the previous one."),
     ] = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what differs between two versions: contract, settings, programs, weights. A line each; exit 1 where anything does."""
+    """List differences between two versions: contract, settings, programs, weights; exit 1 if anything differs."""
     now = _read(model, store)
     if other is None:
         earlier = [version for version in now["versions"] if version < now["version"]]
@@ -162,12 +159,12 @@ def diff(
 
 
 def verify(model: ModelArgument, store: StoreOption = None) -> None:
-    """Read every file of a model and check its digest; exit 1 where one is altered, missing or was added."""
+    """Read every file of a model and check its digest; exit 1 if one was altered, removed or added."""
     found = _read(model, store, verify=True)
     if found.get("problem"):
         echo(f"{found['name']}@{found['version']}: damaged: {found['problem']}")
         raise typer.Exit(1)
-    echo(f"{found['name']}@{found['version']}: every file is as it was registered")
+    echo(f"{found['name']}@{found['version']}: all files are unchanged since registration")
 
 
 def _read(reference: str, store: str | None, **options: Any) -> dict[str, Any]:
@@ -183,16 +180,16 @@ def split_model(reference: str) -> tuple[str, int | None]:
     """Name and version of ``NAME`` or ``NAME@VERSION``. Raises UsageError."""
     name, sign, version = reference.partition("@")
     if sign and not (version.isascii() and version.isdecimal() and 0 < len(version) < 10 and int(version) > 0):
-        raise UsageError(f"{reference}: after @ stands a version, such as {name}@1")
+        raise UsageError(f"{reference}: expected a version after @, such as {name}@1")
     return name, int(version) if sign else None
 
 
 def _weights(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """How the weights differ, in one line; empty where they are the same."""
+    """Difference of the weights, in one line; empty if they are the same."""
     digests = [str(each.get("weights")) for each in (before, now)]
     if digests[0] == digests[1]:
         return ""
-    from orchestrator.cli.comparison.weights import difference  # imports what reads ONNX, where there is such a package
+    from orchestrator.cli.comparison.weights import difference  # imports the ONNX reader, if that package is installed
 
     told = difference(*(Path(each["path"]) / "bundle" / POLICY for each in (before, now)))
     return "" if told == "" else f"weights {told or f'differ: SHA-256 {digests[0][:12]} became {digests[1][:12]}'}"

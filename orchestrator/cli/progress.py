@@ -1,4 +1,4 @@
-"""Following a job to its end: a live bar on a terminal, plain lines otherwise, and what came of it."""
+"""Follow a job to its end: a live bar on a terminal, plain lines otherwise, and the results."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client
 from orchestrator.domain.errors import Unreachable
+from shared_store.evaluations import in_one_line
 from shared_store.wording import counted
 
 _TERMINAL = ("SUCCEEDED", "FAILED")
@@ -22,9 +23,9 @@ _PLAIN_INTERVAL = 2.0
 
 
 def follow(client: Client, job_id: str) -> int:
-    """Show a job until it ends, then its results; returns the command's exit code (0 where it SUCCEEDED).
+    """Show a job until it ends, then its results; returns the command's exit code (0 if it SUCCEEDED).
 
-    A controller that goes away is waited for, or replaced (:attr:`Client.successor`). Raises Unreachable.
+    If the controller goes away, wait for it or replace it (:attr:`Client.successor`). Raises Unreachable.
     """
     detail = client.get(f"/api/jobs/{job_id}")
     if detail["kind"] != "train":
@@ -41,13 +42,13 @@ def follow(client: Client, job_id: str) -> int:
                     attempts = client.get(f"/api/jobs/{job_id}")["attempts"]
                     display.nodes = len(attempts[-1]["nodes"]) if attempts else display.nodes
                 records = []
-                # a job that never started, even one that is over, has no run
+                # a job that never started has no run, even after its end
                 while attempts and (page := client.get(f"/api/runs/{detail['run']}/metrics", after=seen)):
                     records, seen = page, page[-1]["iteration"]
             except Unreachable:
                 client.await_return()
                 continue
-            # not those before a resume
+            # not iterations before a resume
             records = [each for each in records if each["time"] * 1000 >= detail["createdAt"]]
             display.show(job, records[-1] if records else None)
             if over:
@@ -65,7 +66,7 @@ def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def summary(client: Client, job_id: str) -> int:
-    """Print how a job ended and where its results lie; returns the command's exit code."""
+    """Print how a job ended and where its results are; returns the command's exit code."""
     detail = client.get(f"/api/jobs/{job_id}")
     console = Console(highlight=False, soft_wrap=True)
     succeeded = detail["status"] == "SUCCEEDED"
@@ -80,7 +81,7 @@ def summary(client: Client, job_id: str) -> int:
         console.print(f"  first error: node {first['index']}: {one_line(first['error'])}", markup=False)
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
-        console.print(f"  evaluation:  {evaluated(evaluation)}")
+        console.print(f"  evaluation:  {in_one_line(evaluation)}")
     if succeeded and (best := best_told(detail["run"], results.get("best"))):
         console.print(f"  best:        {best}")
     log = (first or attempt["nodes"][0])["log"] if attempt else None
@@ -94,17 +95,8 @@ def summary(client: Client, job_id: str) -> int:
     return 0 if succeeded else 1
 
 
-def evaluated(figures: dict[str, Any]) -> str:
-    """An evaluation in one line."""
-    length, longest = figures["mean_length"], figures["max_length"]
-    return (
-        f"mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
-        f"mean return {figures['mean_return']:.2f} over {counted(figures['episodes'], 'episode')}"
-    )
-
-
 def best_told(run: str, best: Mapping[str, Any] | None) -> str:
-    """The best checkpoint by evaluations in one line; nothing where none can be compared with another."""
+    """The best checkpoint by evaluations in one line; empty without at least two to compare."""
     if not best:
         return ""
     return f"{run}@{best['iteration']}, mean return {best['mean']:.2f}, of {best['of']} checkpoints that are evaluated"
@@ -133,13 +125,13 @@ def _describe(record: dict[str, Any]) -> dict[str, str]:
 
 
 def shown_metrics(record: Mapping[str, Any]) -> str:
-    """The metrics that a task wants to be seen, such as ``  progress 83.1 %``."""
+    """The metrics that a task shows in the progress, such as ``  progress 83.1 %``."""
     shown = record.get("shown")
     return "".join(f"  {one_line(f'{name} {text}')}" for name, text in shown.items()) if isinstance(shown, dict) else ""
 
 
 class Activity:
-    """What a job is busy with: on a terminal one line that is written over, else lines on standard error."""
+    """A job's current activity: on a terminal one overwritten line, otherwise lines on standard error."""
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
@@ -149,7 +141,7 @@ class Activity:
             self._task = self._bar.add_task("", total=None)
 
     def wait(self, client: Client, job_id: str) -> None:
-        """Until the job has started, show its state and why it waits; a controller that goes away is waited for. Raises Unreachable."""
+        """Until the job has started, show its state and why it waits; if the controller goes away, wait for it. Raises Unreachable."""
         shown = ""
         while True:
             try:
@@ -166,7 +158,7 @@ class Activity:
             time.sleep(_POLL)
 
     def show(self, text: str) -> None:
-        """What it does now; ``3 of 8`` at the end moves a bar."""
+        """Show the current activity; ``3 of 8`` at the end moves a bar."""
         if self._bar is None:
             echo(text, err=True)
             return
@@ -176,7 +168,7 @@ class Activity:
         self._bar.update(self._task, description=one_line(text), completed=done, total=total)
 
     def end(self) -> None:
-        """Take the line away: what follows is printed as usual."""
+        """Clear the line; later output is printed as usual."""
         if self._bar is not None:
             self._bar.stop()
 
@@ -188,7 +180,7 @@ class Activity:
 
 
 class _Display:
-    """What both displays know: how far the job is, and how long it will still take."""
+    """Common state of both displays: progress and remaining time."""
 
     def __init__(self, detail: dict[str, Any]) -> None:
         self.total = int(detail["spec"]["train"]["iterations"])
@@ -198,7 +190,7 @@ class _Display:
         self.started = time.monotonic()
 
     def eta(self, record: dict[str, Any]) -> str:
-        """Time left at the pace since the first iteration that was seen (then: of that iteration), as h:mm:ss."""
+        """Remaining time at the pace since the first displayed iteration (at first: of that iteration), as h:mm:ss."""
         now, iteration = time.monotonic(), record["iteration"]
         if self._first is None or iteration < self._first[1]:
             self._first = (now, iteration)
@@ -208,7 +200,7 @@ class _Display:
         return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
 
     def state(self, job: dict[str, Any]) -> str:
-        """State and reason, with what a first start is busy with."""
+        """State and reason, with the activity of a first start."""
         if job["status"] == "RUNNING":
             return f"starting {counted(self.nodes, 'node')}: loading libraries, compiling kernels the first time ({time.monotonic() - self.started:.0f} s)"
         return f"{job['status']}: {one_line(job.get('statusReason', ''))}"

@@ -1,4 +1,4 @@
-"""``muster queues``: the queues, what waits in them and what they hold."""
+"""``muster queues``: the queues, their waiting jobs and their resources in use."""
 
 from __future__ import annotations
 
@@ -21,19 +21,17 @@ def register(app: typer.Typer) -> None:
 
 
 def queues(
-    name: Annotated[
-        str | None, typer.Argument(help="A queue: show the jobs that start next, and why they wait.")
-    ] = None,
+    name: Annotated[str | None, typer.Argument(help="A queue, to show its next jobs and why they wait.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List job queues; of one, the waiting jobs in the order in which they will start.
+    """List job queues, or one queue's waiting jobs in the order in which they will start.
 
-    Queues are made with AWS's own commands: aws batch create-job-queue --endpoint-url …
+    Create queues with AWS's own commands: aws batch create-job-queue --endpoint-url …
     """
     with Client.connect() as client:
         found = client.batch("DescribeJobQueues", **({"jobQueues": [name]} if name else {}))["jobQueues"]
         if name and not found:
-            client.batch("GetJobQueueSnapshot", jobQueue=name)  # refused with the names that there are
+            client.batch("GetJobQueueSnapshot", jobQueue=name)  # refuse an unknown name with the existing ones
         found = [queue for queue in found if _take_snapshot(client, queue, is_named=name is not None)]
         front = _front(client, found[0]) if name else []
     if as_json:

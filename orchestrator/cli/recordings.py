@@ -1,4 +1,4 @@
-"""``muster record`` and ``muster render``: see what a policy does."""
+"""``muster record`` and ``muster render``: recordings, films and pictures of policies."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ SourceArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="RUN[@ITERATION|@best|@latest] | JOB",
-        help="Of a run: its newest checkpoint, that of an iteration, or the one with the best score.",
+        help="A run's newest checkpoint, that of an iteration, or the one with the best score.",
     ),
 ]
-OutOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file that is made.", show_default=False)]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the file where it exists.")]
+OutOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file to write.", show_default=False)]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 _RUNNING = ("STARTING", "RUNNING")
 
 
@@ -51,20 +51,20 @@ def record(
     recover: Annotated[
         Path | None,
         typer.Option(
-            help="Make a readable file of a .mcap.partial that was cut short; nothing is recorded.", metavar="FILE"
+            help="Repair a truncated .mcap.partial into a readable file; nothing is recorded.", metavar="FILE"
         ),
     ] = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """Record what a policy does as an MCAP file, for ROS 2's tools and viewers.
+    """Record a policy in action as an MCAP file, for ROS 2's tools and viewers.
 
-    Foxglove, Lichtblick, PlotJuggler and Rerun open it. Of a RUN, a checkpoint's policy acts with its mean action on fresh worlds, in a job of its own. Of a JOB that is training on this
-    machine, the worlds of its main rank are recorded as they train.
+    Foxglove, Lichtblick, PlotJuggler and Rerun open it. For a RUN, a separate job runs a checkpoint's policy with its mean action in new
+    worlds. For a JOB that is training on this machine, the main rank's worlds are recorded as they train.
     """
     if recover is not None:
         if source is not None or output is not None:
-            raise UsageError("--recover: give the cut file alone; the recovered one lies beside it")
+            raise UsageError("--recover: give only the truncated file; the recovered one is written beside it")
         raise typer.Exit(run_worker("worker.telemetry.live", "--recover", str(recover)))
     if source is None:
         raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
@@ -87,16 +87,16 @@ def record(
 def render(
     source: SourceArgument,
     output: OutOption,
-    worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds, side by side.")] = 4,
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds, side by side.")] = 4,
     seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Simulated time.")] = 6.0,
     size: Annotated[str, typer.Option(help="Width and height of a frame [px].")] = "640x360",
     overwrite: OverwriteOption = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """Film what a checkpoint's policy does, or show six moments of it in a picture.
+    """Film a checkpoint's policy in action, or show six moments of it in a picture.
 
-    The ending of the file says which: .mp4 and .gif are films, .png is a picture.
+    The file's ending decides: .mp4 and .gif are films, .png is a picture.
     """
     if source is None or output is None:
         raise UsageError("give a run, and -o FILE.gif (or .mp4, .png)")
@@ -117,17 +117,17 @@ def render(
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raises UsageError where a file would be replaced that nobody said may be."""
+    """Raises UsageError for an existing file without --overwrite."""
     if path.exists() and not overwrite:
         raise UsageError(f"-o {path}: it exists; --overwrite replaces it")
 
 
 def check_output(path: Path, overwrite: bool, *endings: str) -> None:
-    """Refuse what can't be written before anything runs. Raises UsageError."""
+    """Refuse an output that can't be written before anything runs. Raises UsageError."""
     if path.is_dir():
         raise UsageError(f"-o {path}: it is a directory; name a file in it, such as {path / ('policy' + endings[0])}")
     if path.suffix not in endings:
-        raise UsageError(f"-o {path}: the ending says what it is to be: {', '.join(endings)}")
+        raise UsageError(f"-o {path}: unknown ending; use one of {', '.join(endings)}")
     above = path.absolute().parent
     if not above.is_dir():
         raise UsageError(f"-o {path}: there is no directory {above}; create it first")

@@ -15,7 +15,7 @@ from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.spec.kept_files import changes_with_files
 
-RunArgument = Annotated[str, typer.Argument(help="A run, as `muster show JOB` names it.")]
+RunArgument = Annotated[str, typer.Argument(help="A run; `muster show JOB` prints its name.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -25,16 +25,16 @@ def register(app: typer.Typer) -> None:
 
 def resume(
     run: RunArgument,
-    checkpoint: Annotated[int | None, typer.Option(help="Go on from this iteration instead of the newest.")] = None,
+    checkpoint: Annotated[int | None, typer.Option(help="Resume from this iteration instead of the newest.")] = None,
     nodes: Annotated[
-        int | None, typer.Option(min=1, help="Another number of nodes; the worlds are dealt out anew.")
+        int | None, typer.Option(min=1, help="Number of nodes, if it should change; the worlds are resharded.")
     ] = None,
     set_: SetOption = None,
-    engine: Annotated[str | None, typer.Option(help="What runs it, of the engines that the controller has.")] = None,
+    engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Go on with a run from its newest checkpoint, at the next iteration."""
+    """Resume a run from its newest checkpoint, at the next iteration."""
     with Client.connect() as client:
         elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
         body = {
@@ -60,7 +60,7 @@ def checkpoints(
     verify: Annotated[bool, typer.Option("--verify", help="Read every file and check its digest.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """List a run's checkpoints; with --verify exit 1 where one is damaged."""
+    """List a run's checkpoints; with --verify, exit 1 if one is damaged."""
     with Client.connect() as client:
         found = client.get(f"/api/runs/{named(run)}/checkpoints", verify=verify)
     damaged = [each for each in found if each.get("problem")]

@@ -27,12 +27,12 @@ StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared s
 EngineOption = Annotated[
     list[str] | None,
     typer.Option(
-        help="What runs the nodes: local (the default: processes of this machine), docker (containers of the job's image), ray, "
-        "slurm or aws-batch. Repeatable: the first has the queue default, the others one of their own name."
+        help="Engine that runs the nodes: local (the default: processes on this machine), docker (containers of the job's image), ray, "
+        "slurm or aws-batch. Repeatable: the first gets the queue default, each other a queue of its own name."
     ),
 ]
 CpusOption = Annotated[
-    float | None, typer.Option(min=0.1, help="CPU cores to hand out; those of the machine by default.")
+    float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
 ]
 
 
@@ -48,7 +48,7 @@ def run(
     cpus: CpusOption = None,
     engine: EngineOption = None,
 ) -> None:
-    """Run a job to its end, with a controller of its own where none is running; exit with its result.
+    """Run a job to its end, with a temporary controller if none is running; exit with its result.
 
     Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
@@ -71,7 +71,7 @@ def see_through(client: Client, job: str, follow: Callable[[Client, str], int] =
     try:
         return follow(client, job)
     except KeyboardInterrupt:
-        echo("\nstopping: the job checkpoints and leaves (Ctrl-C again: leave it running)")
+        echo("\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)")
         client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
         follow(client, job)
         return 130
@@ -79,9 +79,9 @@ def see_through(client: Client, job: str, follow: Callable[[Client, str], int] =
 
 def serve(
     host: Annotated[
-        str, typer.Option(help="Address to listen on; off loopback a key (muster keys) or MUSTER_TOKEN is needed.")
+        str, typer.Option(help="Address to listen on; any but loopback requires a key (muster keys) or MUSTER_TOKEN.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free port.")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free port.")] = 8080,
     store: StoreOption = None,
     cpus: CpusOption = None,
     engine: EngineOption = None,
@@ -94,44 +94,46 @@ def serve(
     ] = None,
     retention: Annotated[
         str | None,
-        typer.Option(help="How long the history of finished jobs is kept, such as 90d; for ever by default."),
+        typer.Option(help="Time to keep the history of finished jobs, such as 90d; unlimited by default."),
     ] = None,
     min_free: Annotated[
         str,
         typer.Option(
-            help="What must be free on the volumes of the store and the database for a gang to start, such as 1GiB or 5%; 0: "
-            "nothing. By default 1GiB, of a small volume 5%.",
+            help="Free space on the volumes of the store and the database below which no gang starts, such as 1GiB or 5%; 0: "
+            "no limit. By default 1GiB, or 5% of a small volume.",
             show_default=False,
         ),
     ] = "",
     rate_limit: Annotated[
         int,
-        typer.Option(min=0, help="Requests per second that each key may send, twice as many at once; 0: any number."),
+        typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited."),
     ] = 1000,
     trust_proxy: Annotated[
         list[str] | None,
         typer.Option(
-            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are believed; repeatable. "
+            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted; repeatable. "
             "None by default."
         ),
     ] = None,
     submit_rate_limit: Annotated[
-        int, typer.Option(min=0, help="SubmitJob requests per second that each key may send (AWS: 50); 0: any number.")
+        int, typer.Option(min=0, help="SubmitJob requests per second of each key (AWS: 50); 0: unlimited.")
     ] = 0,
     secrets: Annotated[
         str | None,
         typer.Option(
-            help="Give jobs the secrets that their definitions name: a JSON file of names and values, or env for the variables "
+            help="Source of the secrets that job definitions name: a JSON file of names and values, or env for the variables "
             "MUSTER_SECRET_<name>. Jobs that name secrets are refused by default."
         ),
     ] = None,
     webhooks: Annotated[
         str | None,
-        typer.Option(help="Tell others when jobs end: a JSON file of URLs and secrets; see `muster webhooks --help`."),
+        typer.Option(
+            help="Send a message when jobs end: a JSON file of URLs and secrets; see `muster webhooks --help`."
+        ),
     ] = None,
 ) -> None:
-    """Run the controller as a server. Running jobs outlive it; the next one finds them."""
-    from orchestrator.server import Server  # imports what only a controller needs
+    """Run the controller as a server. Running jobs outlive it; the next controller finds them."""
+    from orchestrator.server import Server  # imports dependencies of the controller only
 
     for name in engine or ():
         check_engine(name)
@@ -162,10 +164,11 @@ def serve(
     echo(server.access.admitted())
     echo(f"home {muster_home()}, store {server.store.path}")
     try:
-        ended.wait()
+        while not ended.wait(1.0):  # Python sees a signal that another thread took when this one wakes
+            pass
     finally:
         server.close()
-    echo("stopped; running jobs go on and the next `muster serve` finds them")
+    echo("stopped; running jobs continue and the next `muster serve` finds them")
 
 
 def _min_free(text: str) -> MinFree:
@@ -177,7 +180,7 @@ def _min_free(text: str) -> MinFree:
 
 @contextlib.contextmanager
 def controller(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[Callable[[], Client]]:
-    """A function that connects to the controller of this home directory, or brings one where there is none (any more)."""
+    """A function that connects to the controller of this home directory, or starts one if none is running."""
     with contextlib.ExitStack() as stack:
 
         def connect() -> Client:
@@ -212,7 +215,7 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
     server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",))
     server.start()
     try:
-        with Client(server.url, server.access.own_token) as client:  # it may have keys, and this command none of them
+        with Client(server.url, server.access.own_token) as client:  # it may require a key that this command lacks
             yield client
     finally:
         server.close()

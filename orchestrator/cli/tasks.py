@@ -1,4 +1,4 @@
-"""``muster tasks``: what can be trained, with what each task sees, does and is rewarded for."""
+"""``muster tasks``: the tasks, with their observations, actions and rewards."""
 
 from __future__ import annotations
 
@@ -21,15 +21,17 @@ def register(app: typer.Typer) -> None:
 
 
 def tasks(
-    name: Annotated[str | None, typer.Argument(help="A task, or module:Class: show its terms and numbers.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="A task, or module:Class, whose terms and numbers to show.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the tasks that are installed here; of one, all its terms and numbers.
+    """List the installed tasks, or all terms and numbers of one task.
 
-    The weights of reward terms are changed in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
+    Change the weights of reward terms in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
     """
     if sys.stderr.isatty():
-        echo("importing the simulation, some seconds …", err=True)
+        echo("importing the simulation, which takes some seconds …", err=True)
     found = _ask_worker([name] if name else [])
     if as_json:
         echo_json(found, indent=1)
@@ -49,7 +51,7 @@ def tasks(
 
 
 def _print(table: Table) -> None:
-    """On a terminal wrap the text of cells between words, never within a name; for another program print every row as one line."""
+    """Print a table: on a terminal, wrap cells between words but never within a name; for another program, one line per row."""
     terminal, wide = Console(), Console(width=10 * WHOLE)
     if not sys.stdout.isatty():
         wide.print(table, soft_wrap=True)
@@ -63,11 +65,11 @@ def _print(table: Table) -> None:
 
 
 def _ask_worker(names: list[str]) -> list[dict[str, Any]]:
-    """Ask another process, since tasks import the simulation and this package never does.
+    """Ask a subprocess, since tasks import the simulation and this package never does.
 
     Raises:
-        SpecError: There is no such task.
-        ServerError: Tasks can't be looked at here.
+        SpecError: The task does not exist.
+        ServerError: Tasks can't be listed here.
     """
     if find_spec("newton") is None:
         raise ServerError("tasks can't be listed where no simulation is installed: pip install 'muster[worker]'")
@@ -79,13 +81,13 @@ def _ask_worker(names: list[str]) -> list[dict[str, Any]]:
         raise SpecError(said[-1])
     if asked.returncode:
         raise ServerError(f"tasks can't be listed: {said[-1]}")
-    # what a module of the user's prints while it is imported comes before
+    # a user's module may print before it while it is imported
     found: list[dict[str, Any]] = json.loads(asked.stdout.splitlines()[-1])
     return found
 
 
 def _terms(section: str, rows: list[dict[str, str]]) -> Table:
-    """A section of a declaration; columns in which nothing stands are left out."""
+    """A section of a declaration, without empty columns."""
     table = Table(box=None, pad_edge=False, title=section.upper(), title_justify="left", title_style="")
     columns = [column for column in rows[0] if any(row[column] for row in rows)]
     for column in columns:

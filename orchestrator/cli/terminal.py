@@ -1,7 +1,7 @@
-"""Printing: whatever others wrote (names, reasons, log lines, errors) reaches the terminal as text, never as its commands.
+"""Printing: foreign text (names, reasons, log lines, errors) reaches the terminal as text, never as control sequences.
 
-Every command prints through :func:`echo` and :class:`Console`. Control characters, escape sequences and what turns or hides text
-are shown escaped (``\\x1b``, ``\\u202e``); newlines and tabs stay.
+Every command prints through :func:`echo` and :class:`Console`. Control characters, escape sequences, and characters that reverse or hide
+text are shown escaped (``\\x1b``, ``\\u202e``); newlines and tabs stay.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _UNSAFE = re.compile(
 )
 _NO_COLOUR = "\x1b[0m"
 WHOLE = 1000
-"""Width for another program, and for what is to be read in full: nothing is cut."""
+"""Width for other programs and for output in full: nothing is cut."""
 
 
 def visible(text: str, colours: bool = False) -> str:
-    """``text`` with all that a terminal would act on escaped; with ``colours``, colour sequences stay and end with the text."""
+    """``text`` with all control sequences escaped; with ``colours``, colour sequences stay and are reset at the end."""
     if _UNSAFE.search(text) is None:
         return text
 
@@ -44,17 +44,17 @@ def visible(text: str, colours: bool = False) -> str:
 
 
 def one_line(text: str) -> str:
-    """A reason or an error as one line: a line of its own could pass for one of ours."""
+    """A reason or an error as one line, since further lines could pass for Muster's own."""
     return visible(" ".join(text.split()))
 
 
 def echo(text: str, err: bool = False) -> None:
-    """Print ``text`` and a newline, on standard error with ``err``."""
+    """Print ``text`` and a newline, with ``err`` on standard error."""
     echo_raw(visible(text), err)
 
 
 def echo_raw(text: str, err: bool = False) -> None:
-    """:func:`echo` for what is visible already, or is wanted as it is; one write, so that lines of others stay apart."""
+    """:func:`echo` without escaping, in one write, so that lines of concurrent writers don't mix."""
     print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)
 
 
@@ -69,7 +69,7 @@ def echo_json(value: Any, indent: int | None = None) -> None:
 
 
 class Console(rich.console.Console):
-    """Rich's console; the text in what it renders is made :func:`visible`, its own styles and cursor movements are not touched."""
+    """Rich's console with rendered text made :func:`visible`; its own styles and cursor movements are unchanged."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(visible(text), **options)  # before it is measured
@@ -80,10 +80,10 @@ class Console(rich.console.Console):
 
 
 def print_cut(table: Table) -> None:
-    """One line a row: on a terminal the last column is cut to what the others leave of its width, for another program all is whole."""
+    """One line per row: on a terminal the last column is cut to the remaining width; for another program nothing is cut."""
     console, wide = Console(), Console(width=10 * WHOLE)
     widths = [max(wide.measure(cell).maximum for cell in (each.header, *each.cells)) for each in table.columns]
-    for column, width in zip(table.columns[:-1], widths, strict=False):  # rich would shrink all of them alike
+    for column, width in zip(table.columns[:-1], widths, strict=False):  # rich would shrink all columns equally
         column.min_width = width
     taken = sum(2 + width for width in widths[:-1])
     if not sys.stdout.isatty():
@@ -99,6 +99,6 @@ class _Formatter(logging.Formatter):
 
 
 def log_visibly() -> None:
-    """Have the controller's warnings, which name jobs and repeat errors, printed as text, too."""
+    """Escape the controller's warnings too, since they name jobs and repeat errors."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_Formatter())

@@ -1,13 +1,9 @@
-"""``muster tracks``: what the racer drives on."""
+"""``muster tracks``: the racer's tracks."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,15 +16,16 @@ from orchestrator.cli.recordings import OverwriteOption, check_output
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.domain.errors import ServerError, UsageError
+from orchestrator.spec.tracks import ask
 
 TrackArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="A preset (oval), a seed (random:7), or a track of the store.")
 ]
 OutOption = Annotated[
     Path | None,
-    typer.Option("--output", "-o", help="Write a picture (.png), or the track itself (.npy).", show_default=False),
+    typer.Option("--output", "-o", help="Write the track as a picture (.png) or as data (.npy).", show_default=False),
 ]
-NewName = Annotated[str, typer.Option("--name", help="What the track is to be called.")]
+NewName = Annotated[str, typer.Option("--name", help="Name of the track.")]
 
 _EXAMPLES = """Examples:  muster tracks show random:7 -o track.png
 muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
@@ -36,7 +33,7 @@ muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Tracks of the racer: list, show, make, import. A track is never changed.",
+        "Manage the racer's tracks: list, show, make, import. Tracks are immutable.",
         _EXAMPLES,
     )
     group.command("list", epilog="Example:  muster tracks list --json")(list_tracks)
@@ -78,21 +75,22 @@ def show(
 
 
 def make(
-    name: Annotated[str, typer.Argument(help="What the track is to be called.")],
+    name: Annotated[str, typer.Argument(help="Name of the track.")],
     preset: Annotated[
         str | None, typer.Option(help="Exact straights and arcs: oval, rounded-rectangle, chicane.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Draw a closed curve from this number.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of a random closed curve.")] = None,
     length: Annotated[
-        float | None, typer.Option(help="Of the centre line, in metres; the preset's own, or 30.")
+        float | None, typer.Option(help="Length of the centre line, in metres; by default the preset's own, or 30.")
     ] = None,
-    width: Annotated[float | None, typer.Option(help="Of the road, in metres; 1 by default.")] = None,
-    spacing: Annotated[float | None, typer.Option(help="Between waypoints, in metres; 0.15 by default.")] = None,
+    width: Annotated[float | None, typer.Option(help="Width of the road, in metres; 1 by default.")] = None,
+    spacing: Annotated[float | None, typer.Option(help="Spacing of waypoints, in metres; 0.15 by default.")] = None,
     roughness: Annotated[
-        float | None, typer.Option(help="Of a drawn curve: 0 makes a circle, 1 is wild; 0.7 by default.")
+        float | None, typer.Option(help="Variation of a random curve: 0 is a circle, 1 is wild; 0.7 by default.")
     ] = None,
     least_radius: Annotated[
-        float | None, typer.Option(help="Of a drawn curve, in metres; 0.75 by default.", show_default=False)
+        float | None,
+        typer.Option(help="Least radius of a random curve, in metres; 0.75 by default.", show_default=False),
     ] = None,
     direction: Annotated[
         str | None, typer.Option(help="counter-clockwise (the default) or clockwise.", show_default=False)
@@ -102,7 +100,7 @@ def make(
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a track of a preset or from a seed, and keep it in the store."""
+    """Make a track from a preset or a seed, and store it."""
     if (preset is None) == (seed is None):
         raise UsageError("give one of --preset (oval, rounded-rectangle, chicane) and --seed N")
     given = {"length": length, "width": width, "spacing": spacing, "direction": direction}
@@ -130,31 +128,20 @@ def import_file(
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a track of DeepRacer's community format and keep it in the store."""
+    """Check a track in DeepRacer's community format, and store it."""
     order = {"action": "import", "file": str(file.absolute()), "name": name}
     _tell(_ask(order, store, output, overwrite), output, as_json)
 
 
 def _ask(order: Mapping[str, Any], store: str | None, output: Path | None = None, overwrite: bool = False) -> Any:
-    """Have another process do it: tracks are the worker's, and this package never imports it. Raises UsageError, ServerError."""
+    """Have another process do it, in the controller's store. Raises UsageError, ServerError."""
     if output is not None:
         check_output(output, overwrite, ".png", ".npy")
-    if find_spec("numpy") is None:
-        raise ServerError("tracks need numpy, which this environment lacks: pip install 'muster[worker]'")
     with controller(store, None) as connect:
         place = connect().get("/api/capacity")["store"]
     if not Path(place).is_dir():
         raise ServerError(f"the controller's store, {place}, is not on this machine; run the command where it is")
-    whole = {**order, "store": place, "output": str(output.absolute()) if output else None}
-    asked = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.racer", json.dumps(whole)], capture_output=True, text=True, check=False
-    )
-    said = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
-    if asked.returncode == 2:
-        raise UsageError(said[-1])
-    if asked.returncode:
-        raise ServerError(f"worker.racer: {said[-1]}")
-    return json.loads(asked.stdout)
+    return ask({**order, "store": place, "output": str(output.absolute()) if output else None})
 
 
 def _tell(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:
@@ -183,6 +170,6 @@ def _width(track: Mapping[str, Any]) -> str:
 
 
 def _origin(origin: Mapping[str, Any]) -> str:
-    """Where a track comes from, then what was asked for besides."""
+    """The origin of a track, then its settings."""
     keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
     return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)

@@ -1,4 +1,4 @@
-"""``muster verify-resume``: whether a run that is killed and goes on ends with the same bits as one that is not."""
+"""``muster verify-resume``: check that a killed and resumed run ends bit-identical to an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def verify_resume(
     spec: SpecArgument,
     at: Annotated[int, typer.Option(help="Kill the main rank right after this iteration.")],
     iterations: Annotated[
-        int | None, typer.Option(help="Iterations to train after that one; as many as before it by default.")
+        int | None, typer.Option(help="Iterations to train after that; by default as many as before.")
     ] = None,
     set_: SetOption = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """Prove that a training survives a crash: train it twice, kill one, compare all that they end with.
+    """Prove that a training survives a crash: train twice, kill one, compare the results bit by bit.
 
-    The spec's training runs for AT + ITERATIONS iterations, once straight and once with SIGKILL of the main rank right after
-    iteration AT, before anything of that iteration is written (MUSTER_KILL_AT in the job's environment; it counts in the first
-    attempt only). The gang starts again from its last checkpoint. Then every tensor and value of both last checkpoints, worlds
-    by their global index, and every metric but times is compared bit by bit: exit 0 where all are equal, 1 at the first that
-    differs. On CPUs they must be equal; a GPU adds in no fixed order. Both runs stay in the store.
+    The spec's training runs for AT + ITERATIONS iterations twice: once uninterrupted, and once with SIGKILL of the main rank right after
+    iteration AT, before anything of that iteration is written (MUSTER_KILL_AT in the job's environment, which affects only the first
+    attempt). The gang restarts from its last checkpoint. Then every tensor and value of both last checkpoints, with worlds by global
+    index, and every metric except times is compared bit by bit: exit 0 if all are equal, 1 at the first difference. On CPUs they must be
+    equal; GPUs add in no fixed order. Both runs stay in the store.
     """
     loaded = specfile.load(spec, set_)
     straight, killed = _pair(loaded, spec, at, iterations)
@@ -60,7 +60,7 @@ def verify_resume(
 
 
 def _pair(spec: Spec, source: str, at: int, iterations: int | None) -> tuple[Spec, Spec]:
-    """The specs of the straight run and of the one that is killed. Raises SpecError."""
+    """The specs of the uninterrupted and the killed run. Raises SpecError."""
     if spec.train is None:
         raise SpecError(f"{source}: verify-resume needs a job that trains; this is a {spec.kind} job")
     if at < 1:
@@ -68,23 +68,23 @@ def _pair(spec: Spec, source: str, at: int, iterations: int | None) -> tuple[Spe
     after = at if iterations is None else iterations
     if after < 1:
         raise SpecError(
-            f"--iterations {after}: at least one iteration must follow --at {at}, or there is nothing to go on with"
+            f"--iterations {after}: at least one iteration must follow --at {at}, or nothing can be resumed"
         )
     changes: dict[str, Any] = {
         "train": spec.train.model_copy(update={"iterations": at + after}),
         "nodes": spec.nodes.model_copy(update={"min": spec.nodes.max}),
         "on_child_failure": "restart",
-        "evaluation": None,  # jobs of their own, which the comparison has no use for
+        "evaluation": None,  # separate jobs that the comparison doesn't need
     }
     attempts = max(2, spec.retry.attempts)
-    # a straight run that was restarted would not be one
+    # a restart would interrupt the uninterrupted run
     straight = {"name": f"{spec.name[:80]}-straight", "retry": Retry(attempts=1)}
     killed = {"name": f"{spec.name[:80]}-killed", "retry": Retry(attempts=attempts)}
     return spec.model_copy(update=changes | straight), spec.model_copy(update=changes | killed)
 
 
 def _notes(spec: Spec, at: int) -> list[str]:
-    """What to know about this verification before it runs."""
+    """Notes on this verification before it runs."""
     notes, every = [], spec.checkpoint.every
     if isinstance(every, int) and every >= at:
         notes.append(
@@ -96,12 +96,12 @@ def _notes(spec: Spec, at: int) -> list[str]:
             f"note: both runs take {counted(spec.nodes.max, 'node')}; another number of ranks adds in another order"
         )
     if spec.resources.gpus:
-        notes.append("note: GPUs add in no fixed order; a difference in the last bits is no defect there")
+        notes.append("note: GPUs add in no fixed order, so a difference in the last bits is not a defect there")
     return notes
 
 
 def _train(connect: Connect, spec: Spec, source: str, **environment: str) -> dict[str, Any]:
-    """Run one training to its end; returns the job's detail. Raises typer.Exit where it does not succeed."""
+    """Run one training to its end; returns the job's detail. Raises typer.Exit if it does not succeed."""
     client = connect()
     job = submit_spec(client, spec, source, environment)["jobId"]
     if code := see_through(client, job):
@@ -111,18 +111,18 @@ def _train(connect: Connect, spec: Spec, source: str, **environment: str) -> dic
 
 
 def _restart(client: Client, detail: dict[str, Any], at: int) -> str:
-    """How the killed run died and where it went on. Raises typer.Exit where it was not killed as asked."""
+    """How the killed run died and where it resumed. Raises typer.Exit if it was not killed as requested."""
     ended = detail["attempts"][0]["nodes"][0].get("reason", "")
     if len(detail["attempts"]) < 2 or "SIGKILL" not in ended:
         echo(f"the main rank was not killed after iteration {at} ({ended or 'no reason'}): nothing is proven")
         raise typer.Exit(1)
     log = "\n".join(line["text"] for line in client.logs(detail["id"], attempt=2, rank=0))
     found = re.search(r"resumed from checkpoint (\d{8})-", log)
-    return f"by SIGKILL after iteration {at}; it went on from iteration {int(found[1]) if found else 0}"
+    return f"by SIGKILL after iteration {at}; it resumed from iteration {int(found[1]) if found else 0}"
 
 
 def _compare(client: Client, spec: Spec, source: str, first: str, second: str) -> int:
-    """Compare both runs where torch is: in a job. Prints what it says; returns the exit code."""
+    """Compare both runs in a job, which has torch. Prints its output; returns the exit code."""
     comparison = Spec(
         name=f"{spec.name[:80]}-compare",
         queue=spec.queue,

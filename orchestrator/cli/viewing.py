@@ -1,4 +1,4 @@
-"""``muster view``: see a training as it runs, a checkpoint's policy or a recording in a browser."""
+"""``muster view``: view a running training, a checkpoint's policy or a recording in a browser."""
 
 from __future__ import annotations
 
@@ -31,34 +31,41 @@ def view(
             help="A training that runs on this machine; a checkpoint's policy; a recording (.mcap, .mcap.partial, .rrd).",
         ),
     ],
-    worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds, of a JOB or a RUN.")] = 4,
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds to show of a JOB or RUN.")] = 4,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Of a RUN: end when each world has ended so many.", show_default=False)
+        int | None,
+        typer.Option(min=1, help="For a RUN: end after this many episodes of each world.", show_default=False),
     ] = None,
     port: Annotated[
         int | None,
         typer.Option(
-            min=1, max=65535, help="Of the page; by default 9090, or a free one where it is taken.", show_default=False
+            min=1,
+            max=65535,
+            help="Port of the page; by default 9090, or a free one if it is in use.",
+            show_default=False,
         ),
     ] = None,
     browser: Annotated[
         bool | None,
         typer.Option(
             "--browser/--no-browser",
-            help="Open the page; by default where there is a terminal and a display.",
+            help="Open the page; by default only with a terminal and a display.",
             show_default=False,
         ),
     ] = None,
     memory: Annotated[
-        str, typer.Option(help="What is kept for a page that is opened later; then the oldest goes: 256MB, 1GB.")
+        str,
+        typer.Option(
+            help="Memory for data kept for pages opened later, such as 256MB or 1GB; beyond it the oldest data goes."
+        ),
     ] = "256MB",
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """See a training as it runs, a checkpoint's policy or a recording in a browser.
+    """View a running training, a checkpoint's policy or a recording in a browser.
 
-    The page has the worlds in 3-D, the curve of the return, the reward terms and the log. It is Rerun's web viewer, on this machine's
-    loopback, and needs no internet: pip install 'muster\\[viz]'.
+    The page shows the worlds in 3-D, the curve of the return, the reward terms and the log. It is Rerun's web viewer, on this machine's
+    loopback, and needs no internet access: pip install 'muster\\[viz]'.
     """
     if not re.fullmatch(r"[1-9][0-9]{0,5}(MB|GB)", memory):
         raise UsageError(f"--memory {memory}: expected a number with MB or GB, such as 256MB")
@@ -70,16 +77,16 @@ def view(
         if not path.is_file():
             raise UsageError(f"{source}: there is no such file")
         if path.suffix not in _FILES:
-            raise UsageError(f"{source}: give a recording, which ends on .mcap, .mcap.partial or .rrd")
+            raise UsageError(f"{source}: give a recording with the ending .mcap, .mcap.partial or .rrd")
         if episodes is not None:
-            raise UsageError("--episodes: it is for the policy of a RUN; a recording is shown whole")
+            raise UsageError("--episodes: only the policy of a RUN takes it; a recording is shown whole")
         raise typer.Exit(run_worker("worker.telemetry.view", "--file", str(path), *given))
     with controller(store, cpus) as connect:
         client = connect()
         run, live = source_of(client, source)
         if not Path(run["path"]).is_dir():
             raise ServerError(
-                f"run {run['run']} lies at {run['path']}, which can't be seen from this machine; call muster view where the store is"
+                f"run {run['run']} lies at {run['path']}, which is not visible from this machine; run muster view on a machine with the store"
             )
         if live is not None:
             if episodes is not None:
@@ -93,6 +100,6 @@ def view(
 
 
 def _has_display() -> bool:
-    """Whether a browser that is opened would be seen by somebody."""
+    """Whether a user would see an opened browser."""
     has = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
     return bool(has) and sys.stdout.isatty() and not os.environ.get("SSH_CONNECTION")

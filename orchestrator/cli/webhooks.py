@@ -1,4 +1,4 @@
-"""``muster webhooks``: who is told when jobs end."""
+"""``muster webhooks``: messages to other programs when jobs end."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from shared_store.wording import counted
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Webhooks of a controller: who is told when jobs end.\n\nThey are those of `muster serve --webhooks FILE`, a JSON "
-        'object of names: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}.',
+        "List and test the controller's webhooks, which report the end of jobs.\n\nConfigure them with `muster serve --webhooks FILE`, a JSON "
+        'object by name: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}.',
         "Examples:  muster webhooks test chat   then   muster webhooks list",
     )
     group.command("list", epilog="Example:  muster webhooks list --json | jq '.[].failed'")(list_webhooks)
@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
 
 
 def list_webhooks(as_json: JsonOption = False) -> None:
-    """List the webhooks: how many messages wait for each, and those that were given up."""
+    """List the webhooks, with their waiting messages and those given up."""
     with Client.connect() as client:
         found = client.get("/api/webhooks")
     if as_json:
@@ -54,9 +54,9 @@ def test(
     name: Annotated[str, typer.Argument(help="Of the webhook.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Send a sample, once; exit 1 where the receiver does not accept it.
+    """Send a sample once; exit 1 if the receiver does not accept it.
 
-    It is signed like any message, and is none of those that `muster webhooks list` counts.
+    It is signed like any message, but `muster webhooks list` does not count it.
     """
     with Client.connect() as client:
         sent = client.post(f"/api/webhooks/{named(name)}/test", {}, seconds=60)
@@ -64,6 +64,6 @@ def test(
         echo_json(sent)
     else:
         echo(f"{name}: {sent['receiver']} {sent['problem'] or 'accepted the sample'} (webhook-id {sent['id']})")
-        echo("a sample is sent once, about no job; it is none of the messages that muster webhooks list counts")
+        echo("this sample belongs to no job; muster webhooks list does not count it")
     if sent["problem"]:
         raise typer.Exit(1)

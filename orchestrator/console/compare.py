@@ -10,7 +10,7 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import controller_of, permitted_run, visible_runs
+from orchestrator.api.context import permitted_run, reconciler_of, visible_runs
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import run_routes
 from orchestrator.api.permissions import Operation, current_identity
@@ -90,14 +90,14 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     """The names that are meant, in the order of the patterns, separated by spaces or given one by one. Raises ClientError."""
     chosen: dict[str, None] = {}
     known: list[str] | None = None
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     for pattern in (part for each in patterns for part in each.split()):
         if not any(sign in pattern for sign in "*?["):
             chosen[pattern] = None
             continue
         if known is None:
-            with controller.database.session() as session:
-                known = [run.name for run in visible_runs(session, controller.store)]
+            with reconciler.database.session() as session:
+                known = [run.name for run in visible_runs(session, reconciler.store)]
         fitting = [name for name in known if fnmatchcase(name, pattern)]
         if not fitting:
             raise ClientError(f"no run is called like {pattern[:128]}; the page of runs has their names", 404)
@@ -109,13 +109,13 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
 
 def _groups(request: Request, names: Sequence[str]) -> list[Group]:
     """The runs in groups, shared by all who look at the same. Raises ClientError where one may not be seen, or does not exist."""
-    key = (id(controller_of(request)), current_identity.get(), tuple(names))
+    key = (id(reconciler_of(request)), current_identity.get(), tuple(names))
     return _recent.get(key, lambda: grouped(map(partial(_facts, request), names)))
 
 
 def _facts(request: Request, name: str) -> RunFacts:
     described = run_routes.run_detail(request, name)
-    run = permitted_run(controller_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(reconciler_of(request), name, Operation.READ_METRICS)
     try:
         records = sampled(run, _RECORDS)
     except OSError as error:

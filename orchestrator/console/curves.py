@@ -25,7 +25,7 @@ from typing import Any
 
 from fastapi import Query, Request
 
-from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Recent
@@ -53,7 +53,7 @@ def run_curves(
     points: int = Query(default=POINTS, ge=2, le=_MOST_POINTS),
 ) -> dict[str, Any]:
     """A window of a run's metrics."""
-    run = permitted_run(controller_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(reconciler_of(request), name, Operation.READ_METRICS)
     key = (str(run.path), tuple(names), begin, end, points)
     try:
         return _recent.get(key, partial(curves_of, run, names, begin, end, points))
@@ -73,19 +73,17 @@ def curves_of(
         end: Last iteration; the newest where None.
         points: Iterations that are answered at most; the first and the last of the window are among them.
     """
-    newest = history_of(run).last() or {}
-    last = int(newest.get("iteration") or 0)
+    last = max((each["iteration"] for each in sampled(run, 2)), default=0)
     until = last if end is None else min(end, last)
     count = until - begin + 1
     if count <= 0:
-        records = []
+        found = []
     elif count <= _MOST_READ and (begin > 1 or count < points):
-        records = history_of(run).after(begin - 1, count)
+        found = history_of(run).after(begin - 1, count)
     else:
-        records = sampled(run, min(_MOST_READ, points * math.ceil(last / count)))
-    records = thinned([each for each in records if begin <= each["iteration"] <= until], points)
-    wanted = names or sorted({name for each in records for name in each if name != "iteration"})
-    return {"first": begin, "last": last, **columns(records, wanted)}
+        found = sampled(run, min(_MOST_READ, points * math.ceil(last / count)))
+    records = thinned([each for each in found if begin <= each["iteration"] <= until], points)
+    return {"first": begin, "last": last, **columns(records, names or ["*"])}
 
 
 def thinned(records: Sequence[Mapping[str, Any]], points: int) -> list[Mapping[str, Any]]:
@@ -96,7 +94,12 @@ def thinned(records: Sequence[Mapping[str, Any]], points: int) -> list[Mapping[s
 
 
 def columns(records: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, Any]:
-    """``iterations``, and of each metric that has numbers its values in ``series``; a group's name ends on ``*``."""
+    """``iterations``, and of each metric that has numbers its values in ``series``; a group's name ends on ``*``.
+
+    A metric with a value for each rank is one of each: ``rank_collect_seconds/0``.
+    """
+    iterations = [each["iteration"] for each in records]
+    records = [_single(each) for each in records]
     known = {name for each in records for name in each if name != "iteration"}
     wanted: dict[str, None] = {}
     for name in names:
@@ -104,7 +107,12 @@ def columns(records: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[
         wanted |= dict.fromkeys(fitting)
     series = {name: [number(each.get(name)) for each in records] for name in wanted if name in known}
     there = {name: values for name, values in series.items() if any(value is not None for value in values)}
-    return {"iterations": [each["iteration"] for each in records], "series": there}
+    return {"iterations": iterations, "series": there}
+
+
+def _single(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    lists = {name: values for name, values in record.items() if isinstance(values, list)}
+    return {**record, **{f"{name}/{i}": value for name, values in lists.items() for i, value in enumerate(values)}}
 
 
 def number(value: Any) -> float | None:

@@ -12,7 +12,7 @@ from fastapi import Request, Response
 from fastapi.responses import RedirectResponse
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.routes import job_detail
 from orchestrator.api.permissions import Operation, current_identity
@@ -24,15 +24,15 @@ from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.run_files import File, files_of
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
-from shared_store.metrics import history_of
+from shared_store.metrics import history_of, sampled
 
 router = page_router()
 
-_recent = Recent(1.0)
+_recent = Recent()
 _RECORDS = 200
 """Iterations that one event brings; a page that has missed more reads its curves again."""
 _CHILDREN = 100
@@ -42,17 +42,17 @@ _CHILDREN = 100
 @router.get("/jobs/{reference}")
 def job(request: Request, reference: str) -> Response:
     """The page; by a name or the start of an id, the way to it."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     detail = job_detail(request, reference)
     if detail["id"] != reference:
         return RedirectResponse(f"/jobs/{detail['id']}", 303)
-    described = batch.call(controller, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
+    described = batch.call(reconciler, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
     array = described.get("arrayProperties", {})
-    before = before_it(controller, detail)
+    before = before_it(reconciler, detail)
     spec = detail["spec"] or {}
     is_visible = detail["results"] is not None
-    files = _files(controller, detail["run"]) if is_visible else []
-    rows = _rows(controller, detail)
+    files = _files(reconciler, detail["run"]) if is_visible else []
+    rows = _rows(reconciler, detail)
     return render(
         request,
         "job.html",
@@ -82,8 +82,8 @@ def job(request: Request, reference: str) -> Response:
 @router.get("/jobs/{reference}/stream")
 def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     """What changes of the page, and what its log has anew. The id of an event is what the page has then, of both."""
-    controller = controller_of(request)
-    key = (id(controller), current_identity.get(), chosen.job)
+    reconciler = reconciler_of(request)
+    key = (id(reconciler), current_identity.get(), chosen.job)
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
     iteration, places = _had(last_id(request))
     log = LiveLog(chosen, chosen.end() if places is None else places)
@@ -93,12 +93,11 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 def _look(request: Request, job_id: str) -> dict[str, Any]:
     """The parts of the page that change; shared by all who look at it."""
     detail = job_detail(request, job_id)
-    is_visible = detail["results"] is not None
-    return {"facts": facts_of(detail), **_rows(controller_of(request), detail), "hasRun": is_visible}
+    return {"facts": facts_of(detail), **_rows(reconciler_of(request), detail)}
 
 
-def _rows(controller: Controller, detail: Mapping[str, Any]) -> dict[str, Any]:
-    found = checkpoints_of(controller, detail["run"]) if detail["results"] is not None else {}
+def _rows(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:
+    found = checkpoints_of(reconciler, detail["run"]) if detail["results"] is not None else {}
     return {"attempts": attempts_of(detail), "checkpoints": found}
 
 
@@ -127,7 +126,7 @@ class _Feed:
         self.facts = seen["facts"]
         for name, rows in (("attempts", self.attempts), ("checkpoints", self.checkpoints)):
             events += [Event(name, each.data) for each in rows.changes(seen[name], {})]
-        if seen["hasRun"]:
+        if self.facts["run"]:
             events += self._curves()
         lines, is_behind = self.log.changes()
         events += [lines] if lines else []
@@ -137,16 +136,14 @@ class _Feed:
 
     def _curves(self) -> list[Event]:
         """New iterations; ``again`` where an attempt went back behind what the page has, or it has missed too much."""
-        history = history_of(self.run)
-        newest = int((history.last() or {}).get("iteration") or 0)
+        newest = max((each["iteration"] for each in sampled(self.run, 2)), default=0)
         had, self.iteration = self.iteration, newest
         if had is None or newest == had:
             return []
-        records = history.after(had, _RECORDS + 1) if newest > had else []
+        records = history_of(self.run).after(had, _RECORDS + 1) if newest > had else []
         if newest < had or len(records) > _RECORDS:
             return [Event("metrics", {"again": True})]
-        names = sorted({name for each in records for name in each})
-        return [Event("metrics", columns(records, names))]
+        return [Event("metrics", columns(records, ["*"]))]
 
 
 def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
@@ -162,9 +159,9 @@ def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
     return None, None
 
 
-def _files(controller: Controller, name: str) -> list[File]:
+def _files(reconciler: Reconciler, name: str) -> list[File]:
     try:
-        return files_of(permitted_run(controller, name, Operation.READ_RUN))
+        return files_of(permitted_run(reconciler, name, Operation.READ_RUN))
     except (ClientError, DamagedFile, OSError):
         return []
 

@@ -9,8 +9,8 @@ from fastapi import Depends, Request, Response
 
 from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.checkpoints import choose
-from orchestrator.api.context import Context, controller_of, permitted_run
+from orchestrator.api.checkpoints import CONFLICT, choose
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import clones, continuing, routes, runs
 from orchestrator.api.native.continuing import Changes
@@ -19,9 +19,8 @@ from orchestrator.api.native.routes import permitted_job
 from orchestrator.api.permissions import Operation
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
-from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import short_id
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
@@ -39,7 +38,7 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
     text = "A training saves a checkpoint before it leaves, and can be resumed. What waits is cancelled."
     form.confirm(Question(f"Stop {name}?", text, "Stop"))
     reason = f"stopped in the console by {permissions.current_identity.get().name}"
-    batch.call(controller_of(request), "TerminateJob", {"jobId": job, "reason": reason})
+    batch.call(reconciler_of(request), "TerminateJob", {"jobId": job, "reason": reason})
     return done(request, f"/jobs/{job}", f"{name} is asked to stop")
 
 
@@ -47,7 +46,10 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
 def save(request: Request, reference: str) -> Response:
     """Have a training save a checkpoint now."""
     job, _, _, _ = _job(request, reference, Operation.CHECKPOINT_JOB)
-    return done(request, f"/jobs/{job}", routes.save_now(request, job)["answer"])
+    answer = routes.save_now(request, job)["answer"]
+    if not answer.startswith("checkpoint "):
+        raise ClientError(answer, CONFLICT)
+    return done(request, f"/jobs/{job}", answer)
 
 
 @router.post("/jobs/{reference}/resume")
@@ -64,7 +66,7 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         )
         form.confirm(Question(f"Go on from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
-    told = runs.resume(controller_of(request), run, Changes(iteration, _changes(form), directory))
+    told = runs.resume(reconciler_of(request), run, Changes(iteration, _changes(form), directory))
     return done(request, f"/jobs/{told['jobId']}", f"resumed {run.name} from iteration {told['iteration']}")
 
 
@@ -73,7 +75,7 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
     """Submit a job that begins a new run with the weights of a checkpoint."""
     run, directory = _run(request, reference, Operation.CLONE_RUN)
     name = _named(form, "the new run")
-    told = clones.clone(controller_of(request), run, name, Changes(_checkpoint(form), _changes(form), directory))
+    told = clones.clone(reconciler_of(request), run, name, Changes(_checkpoint(form), _changes(form), directory))
     parent = told["parent"]
     return done(request, f"/jobs/{told['jobId']}", f"cloned {parent['run']}@{parent['iteration']} as run {told['run']}")
 
@@ -124,22 +126,17 @@ def _beside(request: Request, reference: str, form: Form, kind: str) -> Response
 
 def _submitted(request: Request, document: Mapping[str, Any], directory: str, what: str) -> Response:
     """Submit a job and go to its page. Raises ClientError."""
-    controller = controller_of(request)
     try:
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    controller.check_writable(adds=True)
-    with controller.writing, controller.database.session() as session:
-        answer, _ = continuing.submit(Context(session, controller), spec, directory, what, {})
-    controller.wake()
+    answer = continuing.submit_alone(reconciler_of(request), spec, directory, what)
     return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']}")
 
 
 def _job(request: Request, reference: str, operation: Operation) -> tuple[str, str, str, str]:
     """Id, title, run and working directory of a job with which the caller may do this. Raises ClientError."""
-    with controller_of(request).database.session() as session:
+    with reconciler_of(request).database.session() as session:
         job = permitted_job(session, reference, operation)
         return job.id, f"{job.name} ({short_id(job.id)})", job.run, job.gang.options.directory
 
@@ -147,12 +144,12 @@ def _job(request: Request, reference: str, operation: Operation) -> tuple[str, s
 def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, str]:
     """The run of a job, with which the caller may do this, and the job's working directory. Raises ClientError."""
     _, _, run, directory = _job(request, reference, Operation.READ_JOB)
-    return permitted_run(controller_of(request), run, operation), directory
+    return permitted_run(reconciler_of(request), run, operation), directory
 
 
 def _trained(request: Request, run: Run) -> Mapping[str, Any]:
-    controller: Controller = controller_of(request)
-    with controller.database.session() as session:
+    reconciler: Reconciler = reconciler_of(request)
+    with reconciler.database.session() as session:
         spec = runs.spec_of(session, run) or {}
     if not spec.get("train"):
         raise ClientError(f"run {run.name} is no training, so it has no policy")

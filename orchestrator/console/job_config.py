@@ -14,7 +14,7 @@ from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import runs
 from orchestrator.api.permissions import Operation
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import Job
 from shared_store.files import DamagedFile
 
@@ -52,13 +52,13 @@ def _shown(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"
 
 
-def before_it(controller: Controller, detail: Mapping[str, Any]) -> tuple[str, str, Mapping[str, Any]] | None:
+def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, str, Mapping[str, Any]] | None:
     """What the job's configuration is compared with: a title, an address and a spec; None where there is nothing.
 
     That is the job before it in its run, else the run whose weights a clone began with.
     """
     queues = permissions.visible_queues()
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         query = select(Job).where(
             Job.run == detail["run"], Job.created_at < detail["createdAt"], Job.id != detail["id"]
         )
@@ -75,7 +75,7 @@ def before_it(controller: Controller, detail: Mapping[str, Any]) -> tuple[str, s
         if not isinstance(name, str):
             return None
         try:
-            run = permitted_run(controller, name, Operation.READ_RUN)
+            run = permitted_run(reconciler, name, Operation.READ_RUN)
             spec = runs.spec_of(session, run)
         except (ClientError, DamagedFile, OSError):
             return None  # deleted, or another's

@@ -12,7 +12,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native import runs
 from orchestrator.api.permissions import Operation
 from orchestrator.console import words
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
 from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
@@ -40,6 +40,7 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "status": status,
         "reason": (detail["statusReason"] or "") if status != Status.SUCCEEDED else "",
         "open": "" if is_over else "yes",
+        "run": "yes" if detail["results"] is not None else "",
         "saves": "yes" if status == Status.RUNNING and training else "",
         "done": iteration,
         "iterations": iterations or 1,
@@ -90,8 +91,8 @@ def _attempt(attempt: Mapping[str, Any], begin: int, end: int, saves: bool) -> d
         "took": words.duration((stopped - started) / 1000) if started and stopped else "",
         "since": words.moment(started) if started and not stopped else "",
         "cost": cost + lost_words,
-        "from": f"{max(0.0, 100 * (first - begin) / (end - begin)):.2f}",
-        "span": f"{max(0.4, 100 * ((stopped or end) - first) / (end - begin)):.2f}",
+        "from": f"{max(0.0, 100 * (first - begin) / (end - begin)):.1f}",
+        "span": f"{max(0.4, 100 * ((stopped or end) - first) / (end - begin)):.1f}",
         "nodes": _where(attempt["nodes"]),
     }
 
@@ -147,10 +148,10 @@ def _automatic(told: Mapping[str, Any] | None) -> str:
     return "; ".join([*parts, *([told["problem"]] if told["problem"] else [])])
 
 
-def checkpoints_of(controller: Controller, run: str) -> dict[str, dict[str, Any]]:
+def checkpoints_of(reconciler: Reconciler, run: str) -> dict[str, dict[str, Any]]:
     """The rows of a run's newest checkpoints and its best one, by name, the newest first; none where they can't be seen."""
     try:
-        found = permitted_run(controller, run, Operation.READ_CHECKPOINTS)
+        found = permitted_run(reconciler, run, Operation.READ_CHECKPOINTS)
         return _checkpoints(found)
     except (ClientError, OSError):
         return {}

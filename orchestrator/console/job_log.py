@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.routes import permitted_job, positions_of
 from orchestrator.api.permissions import Operation
@@ -35,10 +35,10 @@ def chosen_log(
     attempt: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
 ) -> Chosen:
     """The lines of the job that are asked for; empty numbers mean all. Raises ClientError."""
-    controller = controller_of(request)
-    with controller.database.session() as session:
+    reconciler = reconciler_of(request)
+    with reconciler.database.session() as session:
         job = permitted_job(session, reference, Operation.READ_JOB_LOGS)
-        run, job_id = controller.store.run(job.run), job.id
+        run, job_id = reconciler.store.run(job.run), job.id
     numbers = (int(each) if each else None for each in (node, rank, attempt))
     return Chosen(run, job_id, *numbers)
 

@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import controller_of, queue_names
+from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
 from orchestrator.api.permissions import current_identity
@@ -19,7 +19,7 @@ from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.queries import short_id
 from shared_store.wording import counted
@@ -50,10 +50,10 @@ def jobs(
     page: int = Query(default=1, ge=1, le=10**6),
 ) -> Response:
     """The table."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     wanted = _wanted(state, queue, search)
-    rows, totals = _window(controller, wanted, page)
-    with controller.database.session() as session:
+    rows, totals = _window(reconciler, wanted, page)
+    with reconciler.database.session() as session:
         queues = queue_names(session)
     chosen = {"state": state, "queue": queue, "search": search}
     return render(
@@ -81,7 +81,7 @@ def jobs_stream(
 ) -> Response:
     """What changes in a window of the table."""
     wanted, table = _wanted(state, queue, search), Rows()
-    look = partial(_window, controller_of(request), wanted, page)
+    look = partial(_window, reconciler_of(request), wanted, page)
 
     def changes() -> Sequence[Event]:
         return table.changes(*look())
@@ -92,10 +92,10 @@ def jobs_stream(
 @router.post("/jobs/stop")
 def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Stop the jobs that were chosen, or all that the filter finds."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     if form.one("all") == "yes":
         wanted = _wanted(form.one("state"), form.one("queue"), form.one("search"))
-        with controller.database.session() as session:
+        with reconciler.database.session() as session:
             ids = ids_of(session, wanted)
     else:
         ids = form.every("job")
@@ -107,7 +107,7 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     errors = []
     reason = f"stopped in the console by {current_identity.get().name}"
     for start in range(0, len(ids), _AT_ONCE):
-        answer = batch.call(controller, "TerminateJobs", {"jobs": ids[start : start + _AT_ONCE], "reason": reason})
+        answer = batch.call(reconciler, "TerminateJobs", {"jobs": ids[start : start + _AT_ONCE], "reason": reason})
         errors += answer["errors"]
     if errors:
         raise ClientError(f"{len(errors)} of {several} can't be stopped: {errors[0]['message']}", 403)
@@ -122,15 +122,15 @@ def _wanted(state: str, queue: str, search: str) -> Wanted:
     return Wanted(GROUPS[state], queue, search)
 
 
-def _window(controller: Controller, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def _window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Rows of a page of the table, by id, and the totals; shared by all who look at the same."""
-    key = (id(controller), current_identity.get(), wanted, page)
-    return _recent.get(key, partial(_read_window, controller, wanted, page))
+    key = (id(reconciler), current_identity.get(), wanted, page)
+    return _recent.get(key, partial(_read_window, reconciler, wanted, page))
 
 
-def _read_window(controller: Controller, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def _read_window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     start = (page - 1) * ROWS
-    found = page_of_jobs(controller, wanted, start, ROWS)
+    found = page_of_jobs(reconciler, wanted, start, ROWS)
     rows = {job["id"]: _row(job) for job in found["jobs"]}
     total, counts = found["total"], found["counts"]
     totals = {

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fastapi import Depends, Request, Response
 
-from orchestrator.api.context import controller_of, queue_names
+from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
 from orchestrator.api.permissions import current_identity
 from orchestrator.console import words
@@ -24,7 +24,7 @@ _INTERVAL = 1.0
 def keys(request: Request) -> Response:
     """The list."""
     rows = _rows(request)
-    with controller_of(request).database.session() as session:
+    with reconciler_of(request).database.session() as session:
         queues = queue_names(session)
     blank = dict.fromkeys(("name", "id", "rights", "created", "own"), "")
     return render(

@@ -10,14 +10,14 @@ from urllib.parse import urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.native.queue_overview import FIRST, overview
 from orchestrator.api.permissions import current_identity
 from orchestrator.console import words
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.queries import short_id
 from shared_store.wording import counted
@@ -32,7 +32,7 @@ _recent = Recent()
 @router.get("/queues")
 def queues(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """All tables, or of one queue with more of its jobs."""
-    tables = _tables(controller_of(request), queue)
+    tables = _tables(reconciler_of(request), queue)
     return render(
         request,
         "queues.html",
@@ -47,7 +47,7 @@ def queues(request: Request, queue: str = Query(default="", max_length=128)) -> 
 @router.get("/queues/stream")
 def queues_stream(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """What changes in the tables."""
-    look = partial(_tables, controller_of(request), queue)
+    look = partial(_tables, reconciler_of(request), queue)
     known = {name: Rows(name) for name in _ROWS}
 
     def changes() -> Sequence[Event]:
@@ -56,14 +56,14 @@ def queues_stream(request: Request, queue: str = Query(default="", max_length=12
     return stream(request, changes)
 
 
-def _tables(controller: Controller, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+def _tables(reconciler: Reconciler, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
     """The rows of every table, by key; shared by all who look at the same."""
-    key = (id(controller), current_identity.get(), queue)
-    return _recent.get(key, partial(_read_tables, controller, queue))
+    key = (id(reconciler), current_identity.get(), queue)
+    return _recent.get(key, partial(_read_tables, reconciler, queue))
 
 
-def _read_tables(controller: Controller, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
-    found = overview(controller, queue)
+def _read_tables(reconciler: Reconciler, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+    found = overview(reconciler, queue)
     waiting = [
         {**job, "queue": each["name"], "place": place}
         for each in found["queues"]

@@ -12,7 +12,7 @@ from urllib.parse import quote
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.routing import page_router
@@ -80,7 +80,7 @@ def _walk(directory: Path, depth: int) -> Iterator[Path]:
 @router.get("/runs/{name}/files/{path:path}")
 def file(request: Request, name: str, path: str) -> Response:
     """A file of a run: a picture as one, all others as a download."""
-    run = permitted_run(controller_of(request), name, Operation.READ_RUN)
+    run = permitted_run(reconciler_of(request), name, Operation.READ_RUN)
     parts = path.split("/")
     if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):
         raise ClientError(f"run {run.name} shows no file {path[:100]!r}", 404)

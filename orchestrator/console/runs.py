@@ -8,7 +8,7 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.native import run_routes
 from orchestrator.api.native.runs import last_metrics, list_runs
 from orchestrator.api.permissions import current_identity
@@ -17,7 +17,7 @@ from orchestrator.console.curves import number
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
 from shared_store.evaluations import flattened
 
@@ -47,7 +47,7 @@ def runs(
     request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
 ) -> Response:
     """The list, by name, a page at a time."""
-    rows = _window(controller_of(request), search, after)
+    rows = _window(reconciler_of(request), search, after)
     is_full = len(rows) == ROWS
     return render(
         request,
@@ -66,15 +66,15 @@ def runs_stream(
     request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
 ) -> Response:
     """What changes in a page of the list."""
-    table, controller = Rows(), controller_of(request)
-    return stream(request, lambda: table.changes(_window(controller, search, after), {}), _INTERVAL)
+    table, reconciler = Rows(), reconciler_of(request)
+    return stream(request, lambda: table.changes(_window(reconciler, search, after), {}), _INTERVAL)
 
 
 @router.get("/runs/{name}")
 def run(request: Request, name: str) -> Response:
     """One run."""
     described, tables = _read_run(request, name)
-    metrics = last_metrics(controller_of(request).store.run(name)) or {}
+    metrics = last_metrics(reconciler_of(request).store.run(name)) or {}
     return render(
         request,
         "run.html",
@@ -95,12 +95,12 @@ def run_stream(request: Request, name: str) -> Response:
     """What changes in the tables of a run; ``changed`` when its metrics go on."""
     _ = run_routes.run_detail(request, name)  # refused at once, if at all
     known = {key: Rows(key) for key in _TABLES}
-    controller, before = controller_of(request), [-1]
+    reconciler, before = reconciler_of(request), [-1]
 
     def changes() -> Sequence[Event]:
         _, tables = _read_run(request, name)
         found = [event for key, rows in tables.items() for event in known[key].changes(rows, {})]
-        iteration = (last_metrics(controller.store.run(name)) or {}).get("iteration", 0)
+        iteration = (last_metrics(reconciler.store.run(name)) or {}).get("iteration", 0)
         if iteration != before[0]:
             before[0] = iteration
             found.append(Event("changed", {"iteration": iteration}))
@@ -109,15 +109,15 @@ def run_stream(request: Request, name: str) -> Response:
     return stream(request, changes)
 
 
-def _window(controller: Controller, search: str, after: str) -> dict[str, dict[str, Any]]:
+def _window(reconciler: Reconciler, search: str, after: str) -> dict[str, dict[str, Any]]:
     """Rows of a page of the list, by the run's name; shared by all who look at the same."""
 
     def look() -> dict[str, dict[str, Any]]:
-        with controller.database.session() as session:
-            found = list_runs(controller, session, after, ROWS, search)
+        with reconciler.database.session() as session:
+            found = list_runs(reconciler, session, after, ROWS, search)
         return {each["run"]: _row(each) for each in found}
 
-    return _listed.get((id(controller), current_identity.get(), search, after), look)
+    return _listed.get((id(reconciler), current_identity.get(), search, after), look)
 
 
 def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, dict[str, dict[str, Any]]]]:
@@ -132,7 +132,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, di
         }
         return described, {key: {row["key"]: row for row in map(of, given[key])} for key, of in _TABLES.items()}
 
-    return _recent.get((id(controller_of(request)), current_identity.get(), name), look)
+    return _recent.get((id(reconciler_of(request)), current_identity.get(), name), look)
 
 
 def _row(run: Mapping[str, Any]) -> dict[str, Any]:

@@ -63,8 +63,10 @@ def spark(values: Sequence[float]) -> str:
     if len(values) < 2:
         return ""
     low, high = min(values), max(values)
-    width, height = _SPARK[0] / (len(values) - 1), (_SPARK[1] - 4) / ((high - low) or 1)
-    return " ".join(f"{i * width:.1f},{_SPARK[1] - 2 - (each - low) * height:.1f}" for i, each in enumerate(values))
+    width, height, span = _SPARK[0] / (len(values) - 1), _SPARK[1] - 4, (high - low) or 1
+    return " ".join(
+        f"{i * width:.1f},{_SPARK[1] - 2 - (each - low) / span * height:.1f}" for i, each in enumerate(values)
+    )
 
 
 def bound(row: Mapping[str, Any], **targets: str) -> Markup:

@@ -21,7 +21,7 @@ import httpx
 from sqlalchemy import ColumnElement, event, func, select, update
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Job, JobQueue, WebhookDelivery, now
@@ -46,11 +46,11 @@ class Deliveries:
     """The threads, one for each webhook; :meth:`note` is called by the database as jobs end."""
 
     def __init__(
-        self, controller: Controller, webhooks: Sequence[Webhook], link: str, pauses: Sequence[float] = PAUSES
+        self, reconciler: Reconciler, webhooks: Sequence[Webhook], link: str, pauses: Sequence[float] = PAUSES
     ) -> None:
         """``link``: where this controller listens; ``pauses``: seconds after each failed try."""
         self.webhooks = {webhook.name: webhook for webhook in webhooks}
-        self._controller, self._database, self._link, self._pauses = controller, controller.database, link, pauses
+        self._reconciler, self._database, self._link, self._pauses = reconciler, reconciler.database, link, pauses
         self._backoff = Backoff(log)
         self._ending = threading.Event()
         self._wake = {name: threading.Event() for name in self.webhooks}
@@ -66,7 +66,7 @@ class Deliveries:
     def start(self) -> None:
         """Go on with what an earlier controller has left, but for webhooks that are not in the file any more."""
         if self.webhooks:  # a controller without any, such as that of `muster run`, leaves what waits to the next one
-            with suppress(DatabaseError), self._controller.writing, self._database.session() as session:
+            with suppress(DatabaseError), self._reconciler.writing, self._database.session() as session:
                 gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
                 said = "no webhook is called so any more"
                 session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
@@ -135,7 +135,7 @@ class Deliveries:
         while not self._ending.is_set():
             wake.clear()  # before the look: what is committed after it wakes the thread
             try:
-                pause = _IDLE if self._controller.trouble is not None else self._deliver_next(webhook)
+                pause = _IDLE if self._reconciler.trouble is not None else self._deliver_next(webhook)
             except DatabaseError:  # said by the controller
                 pause = _IDLE
             except Exception as error:
@@ -158,15 +158,15 @@ class Deliveries:
             body, job = row.body, session.get(Job, row.job)
         if body is None and job is not None:
             body = _json(self._message(webhook, job)).decode()
-            with self._controller.writing, self._database.session() as session:
+            with self._reconciler.writing, self._database.session() as session:
                 session.get_one(WebhookDelivery, row.id).body = body  # before it is sent: each try has the same
         problem = "its job is forgotten" if body is None else self._send(webhook, row.id, body.encode())
         self._note_try(webhook, row.id, problem, final=body is None)
         return 0.0
 
     def _note_try(self, webhook: Webhook, identity: str, problem: str | None, *, final: bool) -> None:
-        monitoring = self._controller.monitoring
-        with self._controller.writing, self._database.session() as session:
+        monitoring = self._reconciler.monitoring
+        with self._reconciler.writing, self._database.session() as session:
             row = session.get_one(WebhookDelivery, identity)
             if problem is None:
                 session.delete(row)
@@ -214,7 +214,7 @@ class Deliveries:
     def _message(self, webhook: Webhook, job: Job) -> dict[str, Any]:
         attempts = self._attempts(job)
         name = run_of(job)
-        checkpoint, summary = _evaluated(self._controller.store.run(name), job)
+        checkpoint, summary = _evaluated(self._reconciler.store.run(name), job)
         evaluation = {key: summary[key] for key in _SHOWN} if summary else None
         data = {
             "job": job.id,

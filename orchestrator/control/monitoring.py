@@ -25,7 +25,7 @@ from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 
 if TYPE_CHECKING:
-    from orchestrator.control.reconciler import Controller
+    from orchestrator.control.reconciler import Reconciler
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _WAITS = (0.1, 0.5, 1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 24 * 3600)
@@ -114,29 +114,29 @@ class Monitoring:
         event.listen(session, "after_commit", note, once=True)
 
 
-def exposition(controller: Controller) -> bytes:
+def exposition(reconciler: Reconciler) -> bytes:
     """All of it in Prometheus's text format."""
     now = CollectorRegistry()
-    now.register(_Moment(controller))
-    return generate_latest(controller.monitoring.registry) + generate_latest(now)
+    now.register(_Moment(reconciler))
+    return generate_latest(reconciler.monitoring.registry) + generate_latest(now)
 
 
 class _Moment(Collector):
     """What there is while Prometheus looks."""
 
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
+    def __init__(self, reconciler: Reconciler) -> None:
+        self._reconciler = reconciler
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         return ()
 
     def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily]:
-        controller = self._controller
+        reconciler = self._reconciler
         yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
         try:
-            with controller.database.session() as session:
+            with reconciler.database.session() as session:
                 found = [*self._jobs(session), *self._attempts(session)]
-            usable = controller.trouble is None
+            usable = reconciler.trouble is None
         except DatabaseError:  # then the scrape says this, and what needs no database
             found, usable = [], False
         yield _gauge("muster_database_usable", "1 while the database can be used, else 0.", [], {(): float(usable)})
@@ -154,7 +154,7 @@ class _Moment(Collector):
         yield _gauge("muster_jobs", "Jobs by state, as long as their history is kept.", ["queue", "status"], counts)
         since = select(Job.queue, func.min(Job.queued_since)).where(Job.status == Status.RUNNABLE, Job.kind != "array")
         waits = {
-            (queue,): max(0.0, (self._controller.clock.now() - oldest) / 1000)
+            (queue,): max(0.0, (self._reconciler.clock.now() - oldest) / 1000)
             for queue, oldest in session.execute(since.group_by(Job.queue))
             if oldest is not None
         }
@@ -165,13 +165,16 @@ class _Moment(Collector):
         held: dict[str, Sums[tuple[str, ...]]] = {"gpus": Sums(), "cpus": Sums()}
         rates: dict[tuple[str, ...], float] = {}
         iterations: dict[tuple[str, ...], float] = {}
-        for job, attempt in open_attempts(session, self._controller.work_queue.active()):
+        for job, attempt in open_attempts(session, self._reconciler.work_queue.active()):
             labels = (job.queue, _engine(attempt))
             given = held_by(attempt)
             held["gpus"][labels] += given.gpus
             held["cpus"][labels] += given.cpus  # type: ignore[assignment]
-            main = job.gang.main
-            told = self._controller.bus.progress(job.id, attempt.number, main) or {}
+            try:
+                main = job.gang.main
+            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+                continue
+            told = self._reconciler.bus.progress(job.id, attempt.number, main) or {}
             for key, into in (("steps_per_second", rates), ("iteration", iterations)):
                 if isinstance(value := told.get(key), int | float):
                     into[*labels, job.id, job.name, job.run] = float(value)
@@ -185,19 +188,19 @@ class _Moment(Collector):
         yield _gauge("muster_training_iteration", "Iterations that a running training has done.", of_job, iterations)
 
     def _volumes(self) -> GaugeMetricFamily:
-        disk = self._controller.disk
+        disk = self._reconciler.disk
         short = {(name,): float(disk.shortage(name) is not None) for name in disk.names}
         said = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
         return _gauge("muster_volume_short", said, ["volume"], short)
 
     def _hosts(self) -> Iterator[GaugeMetricFamily]:
         hosts, gpus, cpus = Sums[tuple[str, ...]](), Sums[tuple[str, ...]](), Sums[tuple[str, ...]]()
-        for host in self._controller.engine.capacity():
-            if not host.away:
-                engine = (engine_of(host.name),)
-                hosts[engine] += 1
-                gpus[engine] += len(host.gpus)
-                cpus[engine] += host.cpus  # type: ignore[assignment]
+        for name, capacity in self._reconciler.engine.capacity().items():
+            for host in [host for host in capacity.places if not host.away]:
+                if not host.queue:
+                    hosts[(name,)] += 1
+                gpus[(name,)] += len(host.gpus)
+                cpus[(name,)] += host.cpus  # type: ignore[assignment]
         for name, amounts in (("hosts", hosts), ("gpus", gpus), ("cpus", cpus)):
             what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as it told them last."
             yield _gauge(f"muster_{name}", what, ["engine"], amounts)

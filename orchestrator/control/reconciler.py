@@ -12,21 +12,24 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-from sqlalchemy import func, select, update
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.control.attempts import Attempts, StoreUnavailable
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
+from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.snapshot import open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
-from orchestrator.domain.job import TERMINAL, WAITING, Ending, Status
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.columns import storable
 from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.models import Job, JobQueue, now
 from orchestrator.persistence.queries import ask_to_end
@@ -54,7 +57,7 @@ _SWEEP_INTERVAL = 2.0
 log = logging.getLogger("muster.controller")
 
 
-class Controller:
+class Reconciler:
     """Drives every job of a database to its end."""
 
     def __init__(
@@ -192,7 +195,7 @@ class Controller:
             self._failed(what, ids[0], error)
             return ids
         for job_id in ids:
-            self._backoff.worked((what, job_id))
+            self._backoff.worked((what, job_id), lasting=True)
         return []
 
     def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
@@ -207,11 +210,10 @@ class Controller:
         """Note what went wrong with a job: logged once, shown as its reason, and tried again later and later."""
         expected = isinstance(error, StoreUnavailable)
         reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
+        reason = excerpt(storable(reason), LONGEST_REASON)
         if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", None if expected else error):
             with self.database.session() as session:  # by its id alone: its row may be what is damaged
-                told = (
-                    update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason[:1024])
-                )
+                told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
                 session.execute(told)
 
     def _advance(self, session: Session, job: Job) -> None:
@@ -228,56 +230,13 @@ class Controller:
     def _look_again(self, ids: Collection[str]) -> None:
         """Requests have changed these jobs: what failed of them is tried at once."""
         for job_id in ids:
-            for what in ("settle", "advance", "start"):
+            for what in ("settle", "advance", "cancel", "preempt", "start"):
                 self._backoff.hurry((what, job_id))
         self.work_queue.look_again(ids)
 
-    # -- jobs without a gang ------------------------------------------------------------------------------------------
-
     def _settle(self, session: Session, job: Job) -> None:
-        """A job that has no gang: ended on request, held back by others, an array by its children, or ready to run."""
         self.work_queue.note([job])
-        if job.is_terminal or job.open_attempt is not None:
-            return
-        if job.queued_since is None:
-            job.queued_since = job.created_at - self.clock.drift
-        if job.kind == "array":
-            self._settle_array(session, job)
-        elif job.stop_reason is not None:
-            job.move(Status.FAILED, job.stop_reason)
-        elif job.status in (Status.SUBMITTED, Status.PENDING):
-            states = {each.on_id: self._state(session, each.on_id) for each in job.dependencies}
-            failed = [on for on, status in states.items() if status == Status.FAILED]
-            pending = [on for on, status in states.items() if status != Status.SUCCEEDED]
-            if failed:
-                job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
-            elif pending:
-                others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
-                job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
-            else:
-                job.move(Status.RUNNABLE, WAITING)
-        elif job.status == Status.RUNNABLE:
-            _ = job.gang  # raises where the row is damaged, which is why the job is looked at
-
-    def _settle_array(self, session: Session, job: Job) -> None:
-        """An array is over when its last child is; one failed child makes it FAILED."""
-        query = select(Job.status, func.count()).where(Job.parent == job.id).group_by(Job.status)
-        counts: dict[str, int] = {status: count for status, count in session.execute(query)}
-        left = sum(count for status, count in counts.items() if not Status(status).is_terminal)
-        if job.status == Status.SUBMITTED:
-            job.move(Status.PENDING, f"an array of {job.array_size}")
-        if left:
-            return
-        failed = counts.get(Status.FAILED, 0)
-        if failed:
-            job.move(Status.FAILED, job.stop_reason or f"{failed} of {job.array_size} array jobs failed")
-        else:
-            job.move(Status.SUCCEEDED, "all array jobs succeeded")
-
-    @staticmethod
-    def _state(session: Session, job_id: str) -> str:
-        job = session.get(Job, job_id)
-        return job.status if job is not None else Status.FAILED
+        settle(session, job, self.clock)
 
     # -- admission ----------------------------------------------------------------------------------------------------
 
@@ -310,7 +269,6 @@ class Controller:
                 self.work_queue.active(),
                 self._leading,
                 self.engine.names[0],
-                self.engine.queueing,
             )
         decisions = decide(snapshot)
         self._report, self._leading = decisions.report, decisions.leading
@@ -321,23 +279,23 @@ class Controller:
 
     def _carry_out(self, decisions: Decisions) -> None:
         """Each decision by itself: one that fails does not stop the others."""
-        for cancel in decisions.cancels:
-            self._guarded("cancel", [cancel.job], partial(self._cancel, cancel))
-        for preempt in decisions.preempts:
-            self._guarded("preempt", [preempt.job], partial(self._preempt, preempt))
-        for start in decisions.starts:
-            self._guarded("start", [start.job], partial(self._start, start))
+        bodies: list[tuple[str, str, Callable[[Session, Job], None]]] = [
+            *(("cancel", each.job, partial(self._cancel, each)) for each in decisions.cancels),
+            *(("preempt", each.job, partial(self._preempt, each)) for each in decisions.preempts),
+            *(("start", each.job, partial(self._start, each)) for each in decisions.starts),
+        ]
+        for what, job_id, body in bodies:
+            if not self._backoff.waits((what, job_id)):
+                self._guarded(what, [job_id], body)
 
     @staticmethod
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
         job.cancelled, job.stop_reason = True, cancel.reason
 
-    @staticmethod
-    def _preempt(preempt: Preempt, session: Session, job: Job) -> None:
-        by, attempt = session.get_one(Job, preempt.by), job.open_attempt
-        if attempt is not None and attempt.ending is None:
-            attempt.ending = Ending.PREEMPTED
-            attempt.status_reason = f"preempted by job {by.name} ({by.id[:8]})"
+    def _preempt(self, preempt: Preempt, session: Session, job: Job) -> None:
+        by = session.get_one(Job, preempt.by)
+        if attempt := job.open_attempt:
+            self.attempts.preempt(session, job, attempt, f"preempted by job {by.name} ({by.id[:8]})")
 
     def _start(self, start: Start, session: Session, job: Job) -> None:
         # a request may have ended the job since the snapshot was taken

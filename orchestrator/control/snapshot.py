@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
@@ -12,7 +12,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_named_by
 from orchestrator.control.usage import placements_of, usage_at
 from orchestrator.domain.gang import Shape
-from orchestrator.domain.hosts import Host, Placement, engine_of
+from orchestrator.domain.hosts import Capacity, Host, Placement, Queued, engine_of
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence import models
@@ -39,24 +39,22 @@ _LOADED_AT_ONCE = 500
 def take_snapshot(
     session: Session,
     clock: Clock,
-    hosts: Sequence[Host],
+    capacities: Mapping[str, Capacity],
     waiting: Sequence[Waiting],
     active: Sequence[str],
     leading: Mapping[str, Leading] | None = None,
     first: str = "local",
-    queueing: Collection[str] = (),
 ) -> Snapshot:
     """Everything that the pass depends on, as it is now.
 
     Args:
         session: The session.
         clock: Tells what time it is.
-        hosts: All that the engines have.
+        capacities: All that the engines have, by their names.
         waiting: The jobs that wait for room.
         active: Ids of the jobs that may hold some.
         leading: What the last pass found at the head of each queue.
         first: The controller's first engine.
-        queueing: Engines that queue by themselves: what runs there takes nothing away from what is handed to them.
     """
     policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
     queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
@@ -64,12 +62,14 @@ def take_snapshot(
         each.name: read_compute_environment(each, first) for each in session.scalars(select(models.ComputeEnvironment))
     }
     holding = open_attempts(session, active)
+    # what runs on an engine that queues by itself takes nothing away from what is handed to it
+    queueing = {name for name, capacity in capacities.items() if isinstance(capacity, Queued)}
     counted = [(job, attempt) for job, attempt in holding if engine_of(attempt.nodes[0].host) not in queueing]
     decays = {name: queue.policy.decay_seconds for name, queue in queues.items() if queue.policy}
     return Snapshot(
         now=clock.now(),
         drift=clock.drift,
-        hosts=hosts,
+        hosts=_places(capacities),
         compute_environments=ces,
         queues=queues,
         waiting=waiting,
@@ -103,7 +103,11 @@ def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Sh
     ces = {row.name: read_compute_environment(row, first) for row in rows}
     engines = dict.fromkeys(ce.engine for ce in ces.values() if ce.engine is not None)
     elastic = [name for name, ce in ces.items() if ce.engine is not None and engine.is_elastic([ce.engine])]
-    return fit(shape, read_queue(queue, {}), ces, engine.capacity(engines, patience), elastic)
+    return fit(shape, read_queue(queue, {}), ces, _places(engine.capacity(engines, patience)), elastic)
+
+
+def _places(capacities: Mapping[str, Capacity]) -> Sequence[Host]:
+    return [host for capacity in capacities.values() for host in capacity.places]
 
 
 def read_queue(queue: JobQueue, policies: Mapping[str, SchedulingPolicy]) -> Queue:
@@ -144,8 +148,10 @@ def new_nodes(placements: Sequence[Placement]) -> list[Node]:
 
 
 def _running(job: Job, attempt: Attempt) -> Running:
-    # empty where the row is damaged, which the controller says of the job
-    options = job.gang.options if job.node_properties else NativeOptions()
+    try:
+        options = job.gang.options
+    except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+        options = NativeOptions()
     return Running(
         job=job.id,
         name=job.name,

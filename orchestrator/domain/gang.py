@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from orchestrator.domain.native_options import NativeOptions
+from orchestrator.domain.native_options import MalformedOptions, NativeOptions
 from orchestrator.domain.resources import Resources
 
 
@@ -62,6 +62,8 @@ class NodeSpec:
 
     command: tuple[str, ...]
     environment: Mapping[str, str]
+    ranks: int
+    """Training processes; 1 where the definition does not say."""
     resources: Resources
     container: Mapping[str, Any]
     """``containerProperties`` unchanged, from which engines read volumes, limits and the like."""
@@ -139,9 +141,14 @@ def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
 
 def _node_spec(container: Mapping[str, Any]) -> NodeSpec:
     resources = {entry["type"]: entry["value"] for entry in container.get("resourceRequirements") or []}
+    environment = {entry["name"]: entry.get("value", "") for entry in container.get("environment") or []}
+    ranks = environment.get("MUSTER_RANKS_PER_NODE", "1")
+    if not re.fullmatch("[1-9][0-9]{0,5}", ranks):
+        raise MalformedOptions(f"MUSTER_RANKS_PER_NODE is {ranks[:20]!r}, not a whole number from 1 on")
     return NodeSpec(
         command=tuple(container.get("command") or ()),
-        environment={entry["name"]: entry.get("value", "") for entry in container.get("environment") or []},
+        environment=environment,
+        ranks=int(ranks),
         resources=Resources(
             cpus=float(resources.get("VCPU", container.get("vcpus", 1))),
             gpus=int(resources.get("GPU", 0)),

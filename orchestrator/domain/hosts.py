@@ -1,7 +1,8 @@
-"""Machines, and the placement of a gang's nodes on them."""
+"""Machines, what engines have of them, and the placement of a gang's nodes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,6 +26,8 @@ class Host:
     machine: str = ""
     """Shared by the hosts of several engines that are one machine: capacity allocated on one is unavailable on the others. Empty: the
     machine is this host's alone."""
+    queue: bool = False
+    """It is no machine but what an engine with a queue of its own gives to a gang at most: see :class:`Limit`."""
 
     @cached_property
     def resources(self) -> Resources:
@@ -35,6 +38,56 @@ class Host:
         """The same host with these amounts."""
         return replace(self, cpus=cpus, gpus=gpus, memory=memory)
 
+
+@dataclass(frozen=True)
+class Limit:
+    """The most that a gang may have of a queue whose machines are not known."""
+
+    queue: str
+    """The engine's name, a slash, and the queue's."""
+    resources: Resources
+    """Of all nodes together."""
+
+
+@dataclass(frozen=True)
+class Hosts:
+    """The capacity of an engine that runs each node where Muster places it."""
+
+    machines: Sequence[Host]
+    """Every host with all that it has, free or not."""
+
+    @property
+    def places(self) -> Sequence[Host]:
+        """What gangs are placed on."""
+        return self.machines
+
+
+@dataclass(frozen=True)
+class Queued:
+    """The capacity of an engine that queues and places gangs by itself.
+
+    A gang that fits while nothing runs is handed over at once, and what runs there is not counted.
+    """
+
+    limits: Sequence[Host] | Limit
+    """Its machines, or the most that a gang may have where it does not tell them."""
+
+    @property
+    def machines(self) -> Sequence[Host]:
+        """Every host that is known."""
+        return () if isinstance(self.limits, Limit) else self.limits
+
+    @property
+    def places(self) -> Sequence[Host]:
+        """What gangs are placed on to see whether they fit."""
+        if not isinstance(self.limits, Limit):
+            return self.limits
+        most = self.limits.resources
+        gpus = tuple(str(number) for number in range(most.gpus))
+        return (Host(self.limits.queue, most.cpus, gpus, most.memory, queue=True),)
+
+
+Capacity = Hosts | Queued
 
 HERE = "localhost"
 """The machine on which the controller runs."""

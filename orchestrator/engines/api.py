@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.hosts import Capacity, Placement
 from shared_store.contract import NodeContract
 from shared_store.log_files import LIMIT
 from shared_store.wording import nearest
@@ -63,6 +63,10 @@ class Gang:
     """Seconds without an iteration after which a rank counts as stuck."""
     log_limit: int = LIMIT
     """Bytes of each node's log that are kept."""
+    ranks: Sequence[int] = ()
+    """Training processes by node index; empty: one on each."""
+    is_native: bool = False
+    """It came from a job YAML, so that each of its nodes has Muster."""
     is_gang: bool = True
     """False for a single-node job, whose environment has no node variables on AWS."""
     array: tuple[int, int] | None = None
@@ -131,7 +135,7 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
             store=gang.store,
             epoch=gang.epoch,
             job_epoch=gang.job_epoch,
-            ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
+            ranks_per_node=gang.ranks[index] if gang.ranks else 1,
             grace=gang.grace,
             queue=gang.queue,
             compute_environment=gang.compute_environment,
@@ -236,6 +240,8 @@ class NodeStatus:
     """128 + n for signal n; None while it runs, or if the end was not observed."""
     gpus: tuple[str, ...] = ()
     """Ids of those that it has, from an engine that hands them out itself and tells."""
+    host: str = ""
+    """Name of the host that it is on, from an engine that places gangs by itself, once it tells."""
     stale: str = ""
     """Why this is an older status, from an engine that keeps the last one while its scheduler does not answer."""
 
@@ -314,8 +320,6 @@ class Engine(Protocol):
     """
 
     name: str
-    queues: bool
-    """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
     elastic: bool
     """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
     images: bool
@@ -323,8 +327,11 @@ class Engine(Protocol):
     address: str | None
     """Address of this machine as its nodes see it, where the bus has to listen; None for loopback."""
 
-    def capacity(self) -> Sequence[Host]:
-        """Every host with all that it has, free or not. Their names begin with the engine's and a slash."""
+    def capacity(self) -> Capacity:
+        """``Hosts`` to place gangs on, or ``Queued`` of an engine that queues and places them by itself: always the same of the two.
+
+        Names of hosts begin with the engine's and a slash.
+        """
         ...
 
     def plan(self, gang: Gang) -> Plan[Any]:

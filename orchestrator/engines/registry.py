@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
-from orchestrator.domain.hosts import Host, engine_of
+from orchestrator.domain.hosts import Capacity, engine_of
 from orchestrator.engines.api import (
     Engine,
     EngineError,
@@ -61,11 +61,6 @@ class EngineSet:
     def names(self) -> Sequence[str]:
         return list(self.engines)
 
-    @property
-    def queueing(self) -> frozenset[str]:
-        """Those that queue by themselves."""
-        return frozenset(name for name, engine in self.engines.items() if engine.queues)
-
     def is_elastic(self, names: Iterable[str]) -> bool:
         """Whether one of these engines may have more hosts later."""
         return any(self.engines[name].elastic for name in names if name in self.engines)
@@ -75,17 +70,17 @@ class EngineSet:
         """Of this machine as the engines' nodes see it, beside loopback."""
         return sorted({engine.address for engine in self.engines.values() if engine.address})
 
-    def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Sequence[Host]:
-        """The hosts of all engines, or of these, as each told them last.
+    def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Mapping[str, Capacity]:
+        """The capacity of all engines, or of these, by their names, as each told it last.
 
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
         deadline = time.monotonic() + patience
-        hosts: list[Host] = []
-        for name in self.engines if names is None else names:
-            if runner := self._runners.get(name):
-                hosts += runner.capacity(max(0.0, deadline - time.monotonic()))
-        return hosts
+        return {
+            name: self._runners[name].capacity(max(0.0, deadline - time.monotonic()))
+            for name in (self.engines if names is None else names)
+            if name in self._runners
+        }
 
     def health(self) -> Mapping[str, Health]:
         """How each engine answers, by its name."""

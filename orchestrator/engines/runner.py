@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Capacity, Hosts
 from orchestrator.engines.api import (
     Engine,
     EngineError,
@@ -82,14 +82,14 @@ class Runner:
         """Handles of the gangs that are being looked at."""
         self._seen: dict[Handle, GangStatus] = {}
         """By handle: the newest picture."""
-        self._telling: Future[Sequence[Host]] | None = None
-        self._hosts: Sequence[Host] = ()
+        self._telling: Future[Capacity] | None = None
+        self._capacity: Capacity = Hosts(())
         self._told_at: int | None = None
         self._backoff = Backoff(log)
         self._since: float | None = None
         """Since when the present call is being carried out (monotonic [s])."""
         with suppress(EngineError):
-            self._hosts = self._tell_hosts()
+            self._capacity = self._tell_capacity()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"engine {engine.name}", daemon=True)
         self._thread.start()
@@ -122,15 +122,15 @@ class Runner:
 
     # -- what the controller asks -------------------------------------------------------------------------------------
 
-    def capacity(self, patience: float = 0.0) -> Sequence[Host]:
-        """The hosts that the engine told last. Asks for them again, and waits for that for ``patience`` seconds at most."""
+    def capacity(self, patience: float = 0.0) -> Capacity:
+        """What the engine told last of its hosts or limits. Asks for them again, and waits for that for ``patience`` seconds at most."""
         with self._lock:
             if self._telling is None or self._telling.done():
-                self._telling = self._submit(self._tell_hosts)
+                self._telling = self._submit(self._tell_capacity)
             telling = self._telling
         if patience and not self.silence:
             wait([telling], patience)
-        return self._hosts
+        return self._capacity
 
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it, on the caller's thread. Raises EngineError."""
@@ -145,7 +145,12 @@ class Runner:
         if launch is None:
             if self._backoff.waits(("launch", gang)):
                 raise self._refused[gang]
-            planned = plan()
+            try:
+                planned = plan()
+            except Transient as error:
+                self._refused[gang] = error
+                self._failed(("launch", gang), error)
+                raise
             launch = self._launches[gang] = self._submit(lambda: self._start(planned))
             launch.add_done_callback(lambda _: self._changed())
         if not launch.done():
@@ -227,7 +232,7 @@ class Runner:
             raise
         except OSError as error:
             raise Transient(f"the {name} engine can't {what} now ({error}); trying again") from error
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a library that wants to end the process must not end a thread
             said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
             raise EngineFault(
                 f"the {name} engine failed to {what} ({said}); the controller's log has the details; trying again"
@@ -236,18 +241,18 @@ class Runner:
     def _failed(self, subject: Hashable, error: EngineError) -> None:
         self._backoff.failed(subject, str(error), error.__cause__ if isinstance(error, EngineFault) else None)
 
-    def _tell_hosts(self) -> Sequence[Host]:
+    def _tell_capacity(self) -> Capacity:
         try:
-            hosts = self._call("tell its hosts", self.engine.capacity)
+            capacity = self._call("tell its hosts", self.engine.capacity)
         except EngineError as error:
             self._failed("hosts", error)
             raise
         self._backoff.worked("hosts")
         self._told_at = int(time.time() * 1000)
-        if hosts != self._hosts:
-            self._hosts = hosts
+        if capacity != self._capacity:
+            self._capacity = capacity
             self._changed()
-        return hosts
+        return capacity
 
     def _start(self, plan: Plan[Any]) -> Handle:
         subject = ("launch", plan.gang.name)

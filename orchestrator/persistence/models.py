@@ -187,7 +187,7 @@ class Job(Base):
 
     @validates("status_reason", "stop_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(reason, LONGEST_REASON)
+        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
 
     @property
     def gang(self) -> GangSpec:
@@ -251,7 +251,7 @@ class AutomaticEvaluation(Base):
 
     @validates("problem")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(reason, LONGEST_REASON)
+        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
 
 
 class WebhookDelivery(Base):
@@ -292,8 +292,8 @@ class Attempt(Base):
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     epoch: Mapped[int]
-    compute_environment: Mapped[str | None] = mapped_column("pool", default=None)
-    """Its name; ``pool`` in SQL."""
+    compute_environment: Mapped[str | None] = mapped_column(default=None)
+    """Its name."""
     handle: Mapped[str | None] = mapped_column(default=None)
     """The engine's name for the gang; None until it was launched."""
     ending: Mapped[str | None] = mapped_column(default=None)
@@ -320,7 +320,7 @@ class Attempt(Base):
 
     @validates("status_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(reason, LONGEST_REASON)
+        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
 
     def node(self, index: int) -> Node | None:
         """Its node of this index; None if it has none, because it was started with fewer nodes."""

@@ -53,12 +53,18 @@ def never_fits(shape: Shape, hosts: Sequence[Host], elastic: bool = False) -> st
         if not any(_room(node, host) for host in hosts):
             best = max(hosts, key=lambda h: (len(h.gpus) >= node.gpus, h.cpus >= node.cpus, h.memory), default=None)
             has = amounts(best.resources) if best else "nothing: there is no host"
-            return f"each node needs {amounts(node)}; the largest host has {has}"
+            return f"each node needs {amounts(node)}; {limit_of(hosts) or f'the largest host has {has}'}"
     if elastic:
         return None
     if too_few := _too_few_hosts(shape, hosts):
         return too_few
-    return f"{needs(shape)}; all hosts together have {together(hosts)}"
+    return f"{needs(shape)}; {limit_of(hosts) or f'all hosts together have {together(hosts)}'}"
+
+
+def limit_of(hosts: Iterable[Host]) -> str | None:
+    """What an engine's own queue gives, in words; None for hosts that are machines."""
+    queue = next((host for host in hosts if host.queue), None)
+    return f"queue {queue.name} gives a gang at most {amounts(queue.resources)}" if queue else None
 
 
 def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:

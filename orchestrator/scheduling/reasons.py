@@ -13,7 +13,7 @@ from orchestrator.domain.gang import Shape
 from orchestrator.domain.resources import EPSILON, Resources
 from orchestrator.scheduling.free_resources import FreeResources
 from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
-from orchestrator.scheduling.placement import count_of, needs, together
+from orchestrator.scheduling.placement import count_of, limit_of, needs, together
 from orchestrator.scheduling.reservation import Reservation
 from orchestrator.scheduling.snapshot import Waiting
 
@@ -127,6 +127,8 @@ class WaitReport:
         if self._resources.cpus[ce] + EPSILON < shape.least.cpus:
             left = count_of(max(0.0, self._resources.cpus[ce]), "CPU")
             return f"{needs(shape)}; compute environment {ce} may use {left} more at this time"
+        if limit := limit_of(self._resources.totals(ce)):
+            return f"{needs(shape)}; {limit}"
         enough = shape.least <= sum((host.resources for host in hosts), Resources())
         return f"{needs(shape)}; {together(hosts)} free{', but not in one piece for each node' if enough else ''}"
 

@@ -9,7 +9,7 @@ from typing import Any
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec import strict_yaml
 from orchestrator.spec.changes import override
-from orchestrator.spec.kept_files import with_files
+from orchestrator.spec.kept_files import check_texts, refuse_paths, with_files
 from orchestrator.spec.model import Spec, validate
 from shared_store.files import DamagedFile, read_json
 
@@ -30,6 +30,26 @@ def load(path: str, assignments: list[str] | None = None) -> Spec:
     if isinstance(document, dict):
         document = with_files(document, path, lines)
     return validate(_with_hyperparameters(document, path, lines), path, lines)
+
+
+def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
+    """The spec in a YAML text that a request brought: without aliases, and without paths of files that belong into the job.
+
+    Args:
+        text: The YAML.
+        source: What to call it in an error.
+        whole: Also have a process try the texts that stand in the place of files, which takes a second or more.
+
+    Raises:
+        SpecError: As :func:`load`.
+    """
+    document, lines = _parsed(text, source, aliases=False)
+    if isinstance(document, dict):
+        refuse_paths(document, source, lines)
+    spec = validate(document, source, lines)
+    if whole:
+        check_texts(document, source, lines)
+    return spec
 
 
 def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.Path, int]) -> Any:
@@ -59,9 +79,14 @@ def read(path: str) -> tuple[Any, Mapping[strict_yaml.Path, int]]:
         raise SpecError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise SpecError(f"{path}: not a text file (UTF-8)") from None
+    return _parsed(text, path, aliases=True)
+
+
+def _parsed(text: str, source: str, *, aliases: bool) -> tuple[Any, Mapping[strict_yaml.Path, int]]:
+    """The document, and the line of each key path. Raises SpecError."""
     try:
-        return strict_yaml.load(text, aliases=True)
+        return strict_yaml.load(text, aliases=aliases)
     except strict_yaml.YamlError as error:
         key = f"{error.key}: " if error.key else "not valid YAML: "
-        where = f"{path}:{error.line}" if error.line else path
+        where = f"{source}:{error.line}" if error.line else source
         raise SpecError(f"{where}: {key}{error}") from None

@@ -6,9 +6,10 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from orchestrator.domain.errors import SpecError
@@ -44,23 +45,61 @@ def with_files(
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
     """
     result = dict(document)
+    for section, field, value, how in _fields(document, task):
+        if isinstance(value, str):
+            try:
+                content = _content(value, how)
+            except SpecError as error:
+                raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+            values = result[section]
+            result[section] = {**values, "config": {**values["config"], field: content}}
+    return result
+
+
+def refuse_paths(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
+    """Refuse paths in a document that a request brought: the files are not on this machine. Arguments as :func:`with_files`.
+
+    Raises:
+        SpecError: A path stands where the content of its file belongs; one line with key and line.
+    """
+    for section, field, value, how in _fields(document):
+        if isinstance(value, str):
+            form = "{file: NAME, text: …}" if how.form == "text" else "the value in it"
+            raise SpecError(
+                f"{place_of((section, 'config', field), source, lines)}found a path; only `muster submit` and `muster run` read "
+                f"files, so write what the file holds: {form}"
+            )
+
+
+def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
+    """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
+    for section, field, value, how in _fields(document):
+        text = value.get("text") if isinstance(value, Mapping) else None
+        if how.form != "text" or not isinstance(text, str):
+            continue
+        name = str(value.get("file") or field)
+        try:
+            _check_size(name, value)
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / "text"
+                path.write_text(text, encoding="utf-8")
+                _check(str(path), how, name)
+        except SpecError as error:
+            raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+
+
+def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tuple[str, str, Any, KeptFile]]:
+    """Section, name and value of the given fields that may name a file; of a task that is installed."""
     for section in _SECTIONS:
-        values = result.get(section)
+        values = document.get(section)
         config = values.get("config") if isinstance(values, Mapping) else None
         if not isinstance(values, Mapping) or not isinstance(config, Mapping):
             continue
         name = values.get("task", task)
         kind = task_config(name) if isinstance(name, str) else None
-        kept = {}
         for field, how in kept_files(kind).items():
-            if isinstance(path := config.get(field), str):
-                try:
-                    kept[field] = _content(path, how)
-                except SpecError as error:
-                    raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
-        if kept:
-            result[section] = {**values, "config": {**config, **kept}}
-    return result
+            if field in config:
+                yield section, field, config[field], how
 
 
 def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], changes: Sequence[str] | None) -> list[str]:
@@ -112,19 +151,24 @@ def _content(path: str, how: KeptFile) -> Any:
             raise SpecError(f"{path}{where}: it is not JSON ({getattr(error, 'msg', 'nested too deeply')})") from None
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
-    # the job's spec is JSON in a text of JSON
-    if (size := len(json.dumps(json.dumps(value)))) > MOST:
-        raise SpecError(f"{path}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
+    _check_size(path, value)
     _check(path, how)
     return value
 
 
-def _check(path: str, how: KeptFile) -> None:
-    """Have another process check the file: what tasks are made of is the worker's. Raises SpecError."""
+def _check_size(name: str, value: Any) -> None:
+    """Raises SpecError."""
+    # the job's spec is JSON in a text of JSON
+    if (size := len(json.dumps(json.dumps(value)))) > MOST:
+        raise SpecError(f"{name}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
+
+
+def _check(path: str, how: KeptFile, name: str = "") -> None:
+    """Have another process check the file: what tasks are made of is the worker's. Raises SpecError, in which ``name`` stands for the path."""
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     if checked.returncode:
         said = checked.stderr.strip().splitlines() or [f"{how.check} ended with exit code {checked.returncode}"]
-        raise SpecError(said[-1])
+        raise SpecError(said[-1].replace(path, name or path, 1))

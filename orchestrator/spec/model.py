@@ -235,12 +235,20 @@ class Spec(Section):
         default=300.0, description="of one training iteration; a rank that takes longer is stuck, such as 5m"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _no_second_kind(cls, document: Any) -> Any:
+        """First of all: what else is wrong with a section that should not be there helps nobody."""
+        given = [kind for kind in KINDS if document.get(kind) is not None] if isinstance(document, Mapping) else []
+        if len(given) > 1:
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found {' and '.join(given)}")
+        return document
+
     @model_validator(mode="after")
     def _one_kind(self) -> Spec:
         given = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(given) != 1:
-            found = f"found {' and '.join(given)}" if given else "found none"
-            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; {found}")
+        if not given:
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found none")
         if self.evaluation is not None and self.train is None:
             raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
         if self.race is not None and (self.nodes.max > 1 or self.resources.gpus > 1):

@@ -70,6 +70,8 @@ def effective_problem(
         made = settings(**{**base, **given})
         if hasattr(made, "check_observations"):
             made.check_observations(config.observation_groups)
+        if hasattr(made, "check_actions"):
+            made.check_actions(config.chooses)
     except ValidationError as error:
         first: Any = error.errors(include_url=False)[0]
         if first["loc"]:

@@ -43,30 +43,33 @@ class Commands:
     """
 
     def __init__(self, contract: Contract, names: Mapping[str, str] | None = None, strict: bool = False) -> None:
-        if contract.discrete or not contract.actions:
-            what = "chooses among " if contract.discrete else "does not say what its actions are: "
+        if not contract.actions:
+            told = ", ".join(contract.action_names[:5])
             raise Refused(
-                f"task {contract.task} can't drive joints: the policy {what}{', '.join(contract.action_names[:5])}"
+                f"task {contract.task} can't drive joints: the policy does not say what its actions are: {told}"
             )
+        self._choices = _choices(contract) if contract.discrete else None
         if ruled := [action for action in contract.actions if action.rule]:
             raise Refused(
                 f"task {contract.task}: the command of {ruled[0].name} has a rule that the node lacks: {ruled[0].rule}"
             )
-        self.actions = contract.actions
+        self.actions = _joints(contract.actions[0]) if contract.discrete else contract.actions
         renamed = names or {}
-        self.joints = [renamed.get(action.name, action.name) for action in contract.actions]
+        self.joints = [renamed.get(action.name, action.name) for action in self.actions]
         self.kinds = {
-            kind: [index for index, action in enumerate(contract.actions) if action.kind == kind] for kind in KINDS
+            kind: [index for index, action in enumerate(self.actions) if action.kind == kind] for kind in KINDS
         }
         self.kinds = {kind: columns for kind, columns in self.kinds.items() if columns}
-        self._scale = np.array([action.scale for action in contract.actions])
-        self._offset = np.array([action.offset for action in contract.actions])
-        clips = [action.clip or (-np.inf, np.inf) for action in contract.actions]
+        self._scale = np.array([action.scale for action in self.actions])
+        self._offset = np.array([action.offset for action in self.actions])
+        clips = [action.clip or (-np.inf, np.inf) for action in self.actions]
         self._least, self._most = np.array(clips).T
-        self._low, self._high = np.array([limits(action, strict) for action in contract.actions]).T
+        self._low, self._high = np.array([limits(action, strict) for action in self.actions]).T
 
     def command(self, action: np.ndarray) -> Command:
-        """Commands for the policy's action, shape ``(actions,)``, finite."""
+        """Commands for the policy's action, shape ``(actions,)``, finite; or for the number of its choice, shape ``(1,)``."""
+        if self._choices is not None:
+            return Command(self._choices[int(np.clip(round(float(action[0])), 0, len(self._choices) - 1))], 0)
         value = self._offset + self._scale * np.clip(action.astype(np.float64), self._least, self._most)
         limited = np.clip(value, self._low, self._high)
         return Command(limited, int((limited != value).sum()))
@@ -103,6 +106,26 @@ class Commands:
                 f"{action.default_position:.4f}, {gains}{effort}"
             )
         return lines
+
+
+def _choices(contract: Contract) -> np.ndarray:
+    """The commands of each choice, shape ``(choices, joints)``. Raises Refused where the contract lacks them."""
+    wanted = [(each.joint, each.kind) for each in contract.actions[0].targets]
+    for action in contract.actions:
+        if not wanted or [(each.joint, each.kind) for each in action.targets] != wanted:
+            raise Refused(
+                f"task {contract.task} can't drive joints: the contract does not say what the choice {action.name} asks of them; "
+                "export the policy again, of a task that declares it"
+            )
+    return np.array([[each.value for each in action.targets] for action in contract.actions])
+
+
+def _joints(choice: Action) -> tuple[Action, ...]:
+    """The joints that a choice commands, as actions without gains and limits: the contract has none of them."""
+    return tuple(
+        Action(each.joint, each.kind, each.unit, 1.0, 0.0, None, 0.0, 0.0, 0.0, None, None, "")
+        for each in choice.targets
+    )
 
 
 def limits(action: Action, strict: bool) -> tuple[float, float]:

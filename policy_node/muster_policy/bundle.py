@@ -51,7 +51,7 @@ def open_bundle(path: Path) -> Bundle:
         Refused: It is not a bundle, or a file differs.
     """
     if not path.is_dir():
-        raise Refused(f"{path}: it is no directory; name a bundle that `muster export` made")
+        raise Refused(f"{path}: it is not a directory; name a bundle that `muster export` made")
     manifest = _manifest(path)
     content: dict[str, bytes] = {}
     for name, entry in sorted(manifest["files"].items()):
@@ -88,7 +88,7 @@ def _manifest(path: Path) -> dict[str, Any]:
             sound &= isinstance(entry["size"], int) and isinstance(entry["sha256"], str)
             sound &= bool(parts) and not Path(name).is_absolute() and ".." not in parts
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise Refused(f"{path}: {MANIFEST} is no manifest of a bundle; export the policy again") from None
+        raise Refused(f"{path}: {MANIFEST} is not a bundle's manifest; export the policy again") from None
     if not sound:
         raise Refused(f"{path}: {MANIFEST} was altered (SHA-256 differs); copy the bundle once more")
     return manifest

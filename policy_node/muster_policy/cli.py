@@ -21,7 +21,7 @@ from muster_policy.snapshot import IMU
 
 EXAMPLES = """\
 examples:
-  muster-policy go1-policy --check                     the bundle is whole and acts as it should; nothing is opened
+  muster-policy go1-policy --check                     verify the bundle and its actions, without a connection
   muster-policy go1-policy                             with a router (rmw_zenohd) on this host
   muster-policy go1-policy --listen tcp/0.0.0.0:7447   be the router; the robot's nodes connect to this host
   muster-policy go1-policy --remap imu:=/imu/data --joints names.txt --controller forward_position_controller
@@ -29,7 +29,7 @@ examples:
 It reads joint_states (sensor_msgs/JointState) and, where the policy needs them, imu (sensor_msgs/Imu), odom
 (nav_msgs/Odometry), cmd_vel (geometry_msgs/Twist), commands/NAME (std_msgs/Float64MultiArray) and images
 (sensor_msgs/Image). It publishes joint_commands (sensor_msgs/JointState), /rosout and /diagnostics, and begins a fresh
-episode when std_msgs/Empty comes on ~/reset. docs/policy-node.md says more.
+episode when std_msgs/Empty arrives on ~/reset. docs/policy-node.md says more.
 """
 
 
@@ -86,21 +86,26 @@ def parser() -> argparse.ArgumentParser:
         "--trigger",
         choices=("timer", "joint_states"),
         default="timer",
-        help="act by the clock, or when a joint state has come (default: timer)",
+        help="act by the clock, or on each joint state (default: timer)",
     )
     add(
         "--timeout",
         type=_positive,
         metavar="SECONDS",
-        help="age from which on sensors are too old (default: three control steps, at least 0.02)",
+        help="age at which measurements are too old [s] (default: three control steps, at least 0.02)",
     )
-    add("--joints", type=Path, metavar="FILE", help="lines `policy_joint = robot_joint`, for joints of another name")
+    add(
+        "--joints",
+        type=Path,
+        metavar="FILE",
+        help="lines `policy_joint = robot_joint`, for joints with other names on the robot",
+    )
     add("--remap", action="append", default=[], metavar="TOPIC:=NAME", help="use another topic; may be repeated")
-    add("--controller", metavar="NAME", help="publish std_msgs/Float64MultiArray on NAME/commands, too")
+    add("--controller", metavar="NAME", help="also publish std_msgs/Float64MultiArray on NAME/commands")
     add("--strict-limits", action="store_true", help="keep position targets within the joints' ranges")
     add("--domain", type=_whole, default=None, metavar="ID", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
     add("--namespace", default="/", help="of the node")
-    add("--name", default="muster_policy", help="of the node (default: muster_policy)")
+    add("--name", default="muster_policy", help="name of the node (default: muster_policy)")
     add("--distro", choices=DISTRIBUTIONS, default="jazzy", help="ROS 2 of the robot (default: jazzy)")
     add(
         "--connect",
@@ -114,7 +119,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _settings(given: argparse.Namespace, bundle: Bundle) -> Settings:
-    names = [action.name for action in bundle.contract.actions]
+    names = [action.name for action in bundle.contract.actions if action.kind != "choice"]
+    names += [target.joint for action in bundle.contract.actions for target in action.targets]
     for group in bundle.contract.groups:
         names += [name for term in group.terms if term.element == "joint" for name in term.elements]
     return Settings(
@@ -148,7 +154,7 @@ def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
+        reason = getattr(error, "strerror", None) or "it is not text"
         raise Refused(f"--joints {path}: it can't be read ({reason})") from None
     found: dict[str, str] = {}
     for number, line in enumerate(lines, 1):

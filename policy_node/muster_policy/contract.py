@@ -11,7 +11,7 @@ import numpy as np
 
 from muster_policy.errors import Refused
 
-FORMAT = 2
+FORMAT = 3
 """The newest version of the document that the node reads."""
 Pair = tuple[float, float]
 
@@ -82,6 +82,16 @@ class Group:
 
 
 @dataclass(frozen=True)
+class Target:
+    """What a choice asks of one joint: the value of a command of this kind [unit]."""
+
+    joint: str
+    kind: str
+    unit: str
+    value: float
+
+
+@dataclass(frozen=True)
 class Action:
     """One number that the policy asks for: the joint's command is ``offset + scale * clip(action)``."""
 
@@ -97,6 +107,8 @@ class Action:
     effort_limit: float | None
     range: Pair | None
     rule: str
+    targets: tuple[Target, ...] = ()
+    """Of a choice."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +254,9 @@ def _action(found: Mapping[str, Any]) -> Action:
         effort_limit=None if limit is None else float(limit),
         range=_pair(found.get("range")),
         rule=found["rule"],
+        targets=tuple(
+            Target(each["joint"], each["kind"], each["unit"], float(each["value"])) for each in found.get("targets", ())
+        ),
     )
 
 

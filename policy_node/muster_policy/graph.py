@@ -23,12 +23,15 @@ from muster_policy.wire import (
     gid_of,
     node_token,
     parse_token,
+    read_attachment,
     ros_type,
     topic_key,
 )
 
 Received = Callable[[bytes, str, str], None]
 """Called with a message's bytes, its ROS type and its type hash, on Zenoh's own thread."""
+Answer = Callable[[bytes], None]
+"""Answers a request of a service with the bytes of its response; to be called once, on any thread."""
 
 
 def open_session(connect: str | None, listen: str | None) -> zenoh.Session:
@@ -136,6 +139,26 @@ class Node:
 
         key = topic_key(self.domain, full, "*", "*")
         self._ears.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(hear, indirect=False)))
+
+    def serve(self, name: str, kind: str, asked: Callable[[Answer], None]) -> None:
+        """Offer a service of a ROS type without parameters: ``asked`` gets the answer to each request, and must not wait for anything."""
+        full = self.full_name(name)
+        _, key = self.declare("SS", full, kind, Qos())
+
+        def hear(query: zenoh.Query) -> None:
+            known = query.attachment and read_attachment(query.attachment.to_bytes())
+            if not known:
+                return  # no client of ROS
+
+            def answer(data: bytes) -> None:
+                with contextlib.suppress(zenoh.ZError), query:
+                    query.reply(key, data, attachment=attachment(known[0], time.time_ns(), known[2]))
+
+            asked(answer)
+
+        ear = zenoh.handlers.Callback(hear, indirect=False)
+        # clients of rmw_zenoh ask complete queryables alone
+        self._ears.append(self.session.declare_queryable(key, ear, complete=True))
 
     def watch_graph(self) -> None:
         """Begin to know the endpoints of others."""

@@ -17,8 +17,13 @@ TWIST = "geometry_msgs/msg/Twist"
 IMAGE = "sensor_msgs/msg/Image"
 ARRAY = "std_msgs/msg/Float64MultiArray"
 EMPTY = "std_msgs/msg/Empty"
+RESET = "std_srvs/srv/Empty"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 LOG = "rcl_interfaces/msg/Log"
+NOTHING = b"\0\1\0\0\0"
+"""CDR of a message without fields: ROS 2 writes one byte."""
+_SERVICES = {RESET: "RIHS01_5888399dedec5ccc85ea6451949fd2c9f97bfdf963f9a588821639fcd31b5d19"}
+"""Type hashes of services, as ROS 2 publishes them since Jazzy: rosbags computes those of messages."""
 
 
 class Messages:
@@ -34,11 +39,11 @@ class Messages:
         self._hashes: dict[str, str] = {}
 
     def type_hash(self, name: str) -> str:
-        """``RIHS01_…`` of a type; for Humble, the placeholder."""
+        """``RIHS01_…`` of a type of messages, or of one of the node's services; for Humble, the placeholder."""
         if self.distribution == "humble":
             return NO_HASH
         if name not in self._hashes:
-            self._hashes[name] = str(self._store.hash_rihs01(name))
+            self._hashes[name] = _SERVICES.get(name) or str(self._store.hash_rihs01(name))
         return self._hashes[name]
 
     def make(self, name: str, /, **fields: Any) -> Any:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import gc
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from muster_policy.actions import Command, Commands
 from muster_policy.bundle import Bundle
 from muster_policy.errors import Refused
-from muster_policy.graph import Node, open_session
+from muster_policy.graph import Answer, Node, open_session
 from muster_policy.inputs import Inputs
 from muster_policy.lines import Lines
-from muster_policy.messages import ARRAY, DIAGNOSTICS, EMPTY, JOINT_STATE, LOG, Messages
+from muster_policy.messages import ARRAY, DIAGNOSTICS, EMPTY, JOINT_STATE, LOG, NOTHING, RESET, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
@@ -111,6 +112,8 @@ class PolicyNode:
         self.timeout = settings.timeout or max(3.0 / self.rate, 0.02)
         self.figures = Figures()
         self.stopping, self._reset = threading.Event(), threading.Event()
+        self._asking: deque[Answer] = deque()
+        """Requests of a reset that wait for their answer."""
         self.runner = Runner(
             self.inputs, self.observations, policy, self.commands, self.timeout, self._publish, self._say
         )
@@ -150,6 +153,7 @@ class PolicyNode:
         self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
         node.watch_graph()
         node.subscribe("~/reset", EMPTY, self._hear_reset)
+        node.serve("~/reset", RESET, self._ask_reset)
         for each in self.inputs.all:
             node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))
         self._tell(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
@@ -157,6 +161,18 @@ class PolicyNode:
     def _hear_reset(self, data: bytes, kind: str, type_hash: str) -> None:
         if kind == EMPTY:
             self._reset.set()
+
+    def _ask_reset(self, answer: Answer) -> None:
+        self._asking.append(answer)
+        self._reset.set()
+
+    def _do_reset(self) -> None:
+        """Begin a fresh episode, and tell those that asked before it began."""
+        self._reset.clear()
+        asked = [self._asking.popleft() for _ in range(len(self._asking))]
+        self.runner.reset()
+        for answer in asked:
+            answer(NOTHING)
 
     def _loop(self) -> None:
         gc.collect()
@@ -171,8 +187,7 @@ class PolicyNode:
             if now > ends:
                 break
             if self._reset.is_set():
-                self._reset.clear()
-                self.runner.reset()
+                self._do_reset()
             acted = self.runner.step(now, due=due is not None)
             if due is not None and acted:
                 self._measure(due, now)

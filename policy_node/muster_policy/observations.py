@@ -47,6 +47,7 @@ class Observations:
     def __init__(self, contract: Contract) -> None:
         self._contract = contract
         names = [action.name for action in contract.actions if action.kind != "choice"]
+        names += [target.joint for action in contract.actions for target in action.targets]
         for group in contract.groups:
             names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
         self.joints = tuple(dict.fromkeys(names))
@@ -202,6 +203,8 @@ class Observations:
         return lambda snapshot: snapshot.commands[name][:count]
 
     def _action(self, term: Term) -> Reader:
+        if self._contract.discrete:
+            raise Refused("the node does not keep the numbers of choices")
         names = list(self._contract.action_names)
         columns = np.array([names.index(name) for name in term.elements])
         if term.quantity == "last_action":

@@ -100,15 +100,15 @@ class Runner:
             return False
         if slow := self.inputs.too_slow(now):
             if self.mode is Mode.ACTING:
-                why = f"{self._topic(slow[0].topic)} asks for less than the policy was ever told to do"
-                self._stop(why, "when that is over")
+                why = f"{self._topic(slow[0].topic)} asks for less than any command in training"
+                self._stop(why, "when that ends")
             return False
         if not due or (self.mode is Mode.WAITING and now < self._settled):
             return False
         if self.mode is Mode.WAITING:
             self._forget()
             self.mode = Mode.ACTING
-            self._say("all inputs are there: it commands the joints now, with a fresh episode", False)
+            self._say("all inputs have arrived: it commands the joints now, in a new episode", False)
         return self._act(now)
 
     def reset(self) -> None:
@@ -117,7 +117,7 @@ class Runner:
         self.counts.resets += 1
         if self.mode is Mode.STOPPED:
             self.mode = Mode.WAITING
-            self._say("reset: it waits for its inputs", False)
+            self._say("reset: the node waits for its inputs", False)
 
     def end(self, why: str) -> None:
         """If the node commands the robot, hold it where it is; then give no further command."""
@@ -129,7 +129,7 @@ class Runner:
     def _act(self, now: float) -> bool:
         silent = {each.topic for each in self.inputs.silent_commands(now)}
         for topic in sorted(silent - self._silent):
-            self._say(f"{self._topic(topic)} is silent: velocity 0 is asked for", True)
+            self._say(f"{self._topic(topic)} is silent: the command is velocity 0", True)
         self._silent = silent
         with np.errstate(over="ignore"):  # a float32 overflow is found below
             seen = self.observations.build(self.inputs.snapshot(now))
@@ -155,7 +155,7 @@ class Runner:
         self.mode = Mode.STOPPED if goes_on is None else Mode.WAITING
         self.counts.stops += 1
         self._say(
-            f"{why}: one last command holds the joints where they are; it goes on {goes_on or 'after ~/reset'}", True
+            f"{why}: one last command holds the joints where they are; it resumes {goes_on or 'after ~/reset'}", True
         )
 
     def _hold(self) -> None:

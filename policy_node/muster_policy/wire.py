@@ -71,7 +71,7 @@ def ros_type(name: str) -> str:
 
 
 def topic_key(domain: int, topic: str, kind: str, type_hash: str) -> str:
-    """The key on which messages of a topic are put.
+    """The key on which messages of a topic are put, or a service is asked.
 
     Args:
         domain: ROS domain.
@@ -110,13 +110,13 @@ def endpoint_token(
     message: tuple[str, str],
     qos: Qos,
 ) -> str:
-    """The liveliness token of a publisher or subscription.
+    """The liveliness token of a publisher, a subscription or a service.
 
     Args:
         domain: ROS domain.
         session: Id of the Zenoh session.
         ids: Of the node and of the endpoint in the session.
-        kind: ``MP`` or ``MS``.
+        kind: ``MP``, ``MS`` or ``SS``.
         names: Namespace and name of the node.
         topic: Full name.
         message: ROS type and type hash.

@@ -36,7 +36,7 @@ def addresses(bench: RayBench) -> dict[str, str]:
 
 
 def test_hosts_are_the_nodes_that_have_cpus(bench: RayBench) -> None:
-    hosts = {host.name: host for host in bench.engine.capacity()}
+    hosts = {host.name: host for host in bench.engine.capacity().machines}
     assert sorted(hosts) == ["ray/n1", "ray/n2", "ray/n3"]
     assert (hosts["ray/n1"].cpus, hosts["ray/n1"].gpus, hosts["ray/n1"].memory) == (2.0, ("0", "1"), 1907)
     assert hosts["ray/n1"].single and bench.engine.address is None
@@ -205,9 +205,9 @@ def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: RayBench)
     wait_for(lambda: not bench.engine.observe(handle)[2].running, 60, "its end is seen")
     assert [node.running for node in bench.engine.observe(handle)] == [True, True, False]
     assert bench.stopped(handle)[:2] == [143, 143]
-    wait_for(lambda: len(bench.engine.capacity()) == 2, 60, "the host is gone")
+    wait_for(lambda: len(bench.engine.capacity().machines) == 2, 60, "the host is gone")
     bench.cluster.add("n3", PYTHONPATH=str(bench.cluster.modules))
-    wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "it is back")
+    wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "it is back")
 
 
 def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBench) -> None:
@@ -218,10 +218,10 @@ def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBenc
     subprocess.run(command, check=True, capture_output=True)
     assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
     assert bench.log().count("saved") == 2
-    wait_for(lambda: len(bench.engine.capacity()) == 2, 20, "no more a host")
+    wait_for(lambda: len(bench.engine.capacity().machines) == 2, 20, "no more a host")
     bench.cluster.kill("n2")
     bench.cluster.add("n2")
-    wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "its successor is one")
+    wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "its successor is one")
 
 
 def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> None:
@@ -238,7 +238,7 @@ def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> 
     bench.cluster.start_head()
     wait_for(lambda: not bench.engine._watch.problem(), 60, "it is back")
     assert all(node.running for node in bench.engine.observe(handle)) and bench.driver() == driver
-    assert len(bench.engine.capacity()) == 3
+    assert len(bench.engine.capacity().machines) == 3
     assert bench.stopped(handle) == [75, 75, 75]
     after = bench.ready(bench.gang(attempt=2))
     assert bench.stopped(after) == [143, 143, 143]

@@ -86,7 +86,7 @@ def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path)
     bench = RayBench(growing, tmp_path)
 
     def names() -> list[str]:
-        return [host.name for host in bench.engine.capacity()]
+        return [host.name for host in bench.engine.capacity().machines]
 
     def machines() -> int:
         return sum(1 for node in bench.engine._watch.seen["nodes"] if node["cpus"])

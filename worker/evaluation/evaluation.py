@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from shared_store.checkpoints import best_evaluated, list_checkpoints
-from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, list_evaluations
+from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, in_one_line, list_evaluations
 from shared_store.files import write_json
 from shared_store.layout import Run
 from shared_store.pairs import are_paired, paired, read_returns
-from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.statistics import Sample, difference, share
 from worker.evaluation.table import write_table
 from worker.learning.algorithm import Policy
+from worker.learning.report import shown_of
 
 if TYPE_CHECKING:
     from worker.evaluation.race import Race
@@ -42,6 +42,7 @@ class Evaluation:
         weights: Weight of each reward term.
         seed: Of the worlds.
         seconds: How long it took, by the clock [s].
+        shown: Unit of each metric that the task wants to be seen, such as ``{"metric_progress": "%"}``.
     """
 
     checkpoint: str
@@ -51,6 +52,7 @@ class Evaluation:
     weights: Mapping[str, float]
     seed: int | None
     seconds: float
+    shown: Mapping[str, str]
 
     @property
     def episodes(self) -> int:
@@ -68,11 +70,7 @@ class Evaluation:
         return float(self.played.lengths.mean())
 
     def __str__(self) -> str:
-        percent = round(100 * self.mean_length / self.max_length)
-        return (
-            f"evaluation: mean episode length {self.mean_length:.1f} of {self.max_length} ({percent} %), "
-            f"mean return {self.mean_return:.2f} over {counted(self.episodes, 'episode')}"
-        )
+        return f"evaluation: {in_one_line(self.summary())}"
 
     def summary(self) -> dict[str, Any]:
         """Everything but the episodes themselves, as JSON values; lengths in steps, intervals of 95 %."""
@@ -103,6 +101,7 @@ class Evaluation:
                 for name in self._named("reward_")
             },
             "metrics": {name: self._described(f"metric_{name}") for name in self._named("metric_")},
+            **shown_of({name: float(played.term(name).mean()) for name in self.shown}, self.shown),
             "seconds": self.seconds,
         }
 
@@ -178,6 +177,7 @@ def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, s
         weights=getattr(task.config, "rewards", {}),
         seed=seed,
         seconds=time.perf_counter() - started,
+        shown=task.shown_metrics,
     )
 
 

@@ -14,9 +14,9 @@ from worker.learning.totals import Totals
 if TYPE_CHECKING:
     from worker.tasks.task import Task
 
-SIGNALS = ("stopping", "save_now", "failed_saves", "busy", "stall", "iteration_seconds")
+SIGNALS = ("stopping", "save_now", "failed_saves", "busy", "stall", "iteration_seconds", "long")
 """Per-rank flags summed over the ranks each iteration: stop requests, save requests, failed saves, ranks whose earlier saves the
-volume does not take, save stall [s], iteration time [s]."""
+volume does not take, save stall [s], iteration time [s], iterations that a stop may not be able to await."""
 
 
 class Exchange:

@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -35,6 +36,7 @@ class StopRequest:
     def __init__(self) -> None:
         self.requested = False
         self.save_requested = False
+        self._since = 0.0
 
     def listen(self) -> StopRequest:
         """Catch the signals from now on."""
@@ -46,7 +48,29 @@ class StopRequest:
         )  # Python stacks to stderr, for where ptrace is not allowed
         return self
 
+    def when_late(self, seconds: float, late: Callable[[], object]) -> None:
+        """Call ``late`` on a thread of its own, ``seconds`` after a request to exit. The main thread calls this once.
+
+        The thread hears of the signal also while the main thread is inside a library's call, where Python runs no handlers.
+        """
+        heard, write_end = os.pipe()
+        os.set_blocking(write_end, False)
+        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+
+        def wait() -> None:
+            while not self.requested and not {signal.SIGTERM, signal.SIGINT} & set(os.read(heard, 64)):
+                pass
+            time.sleep(seconds)
+            late()
+
+        threading.Thread(target=wait, name="stop", daemon=True).start()
+
+    def is_older(self, seconds: float) -> bool:
+        """Whether an exit was requested more than ``seconds`` ago."""
+        return self.requested and time.monotonic() - self._since > seconds
+
     def _request(self, number: int, frame: object) -> None:
+        self._since = self._since or time.monotonic()
         self.requested = True
 
     def _request_save(self, number: int, frame: object) -> None:

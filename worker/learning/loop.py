@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +25,9 @@ from worker.learning.failures import Failures
 from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup
+from worker.learning.leaving import patience_of
 from worker.learning.randomness import held_out_seed, seed_generators
-from worker.learning.report import Report, Stopwatch, figures_of, shown_of
+from worker.learning.report import Report, Stopwatch, figures_of, shown_of, straggler
 from worker.learning.reporter import Fence, Gate, Reporter
 from worker.learning.setup import (
     build_algorithm,
@@ -72,7 +72,11 @@ class Loop:
         self.share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
         self._kill_at = kill_at(os.environ, job) if gang.is_main else None
         self.cadence = Cadence(training.save_every)
-        self._save_is_due = self._order_is_due = False
+        self._save_is_due = self._order_is_due = self._is_scheduled = False
+        self._longest = patience_of(os.environ) / 2
+        """Duration of an iteration [s] above which each one is saved: a stop may have to leave in the middle of the next one."""
+        self.exits = False
+        """Whether a request to exit is being carried out."""
         self.task, self.algorithm = self._build()
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
@@ -126,7 +130,7 @@ class Loop:
         progress = self.state.progress
         report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
         attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
-        self._say("\n".join([*self.task.notes(), self._beginning()]))
+        self.say("\n".join([*self.task.notes(), self._beginning()]))
         self._stopwatch.begin()
         try:
             while progress.iteration < self.training.iterations:
@@ -141,7 +145,7 @@ class Loop:
                 self._tell_captured()
                 self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
                 if self._handle(signals):
-                    self._say(f"asked to stop: left after iteration {progress.iteration} of {self.training.iterations}")
+                    self.say(f"asked to stop: left after iteration {progress.iteration} of {self.training.iterations}")
                     return EX_TEMPFAIL
             self._finish()
             return 0
@@ -169,7 +173,7 @@ class Loop:
             and any(part.captured for part in parts)
         ):
             self._told_captured = True
-            self._say(
+            self.say(
                 "captured as CUDA graphs: "
                 + ", ".join(f"{part.name} ({part.seconds:.1f} s to record)" for part in parts if part.captured)
             )
@@ -177,12 +181,13 @@ class Loop:
     def _handle(self, signals: dict[str, float]) -> bool:
         """Save when a save is due, and log the results of earlier saves; returns whether the gang exits (then everything is saved)."""
         state, iteration = self.state, self.state.progress.iteration
-        stopping = signals["stopping"] > 0
+        self.exits = stopping = signals["stopping"] > 0
         if signals["failed_saves"] > 0:
             state.saver.abandon()
-        if self.cadence.due(iteration, signals) or signals["save_now"] > 0:
-            self._save_is_due = True
         is_last = stopping or iteration == self.training.iterations
+        scheduled = self.cadence.due(iteration, signals) or signals["save_now"] > 0 or is_last
+        self._is_scheduled = self._is_scheduled or scheduled
+        self._save_is_due = self._save_is_due or scheduled or signals["long"] > 0
         # While the volume hangs, a save is postponed and training continues. All ranks decide alike.
         if is_last or (self._save_is_due and not signals["busy"]):
             self._save_is_due = False
@@ -197,8 +202,8 @@ class Loop:
 
     def _order(self, *, wait: bool = False) -> None:
         """Order a checkpoint of the state after the last whole iteration."""
-        self._order_is_due = False
-        self.state.save(self.reporter if self.gang.is_main else None, wait=wait)
+        scheduled, self._order_is_due, self._is_scheduled = self._is_scheduled, False, False
+        self.state.save(self.reporter if self.gang.is_main else None, wait=wait, scheduled=scheduled)
         self._stall_seconds = self.state.saver.stall
 
     def _beginning(self) -> str:
@@ -272,7 +277,7 @@ class Loop:
             self._warnings += 1
             if self._warnings <= WARNINGS:
                 said += "; from now on only counted" if self._warnings == WARNINGS else ""
-                self._say(f"warning: iteration {iteration}: {said}")
+                self.say(f"warning: iteration {iteration}: {said}")
                 self._failures.tell()
             return
         self._failures.tell()
@@ -308,6 +313,7 @@ class Loop:
             "busy": saver.is_busy,
             "stall": saver.stall,
             "iteration_seconds": self._stopwatch.iteration,
+            "long": max(self._stopwatch.iteration, self._stopwatch.running) > self._longest,
         }
 
     def _collect(self) -> None:
@@ -375,11 +381,11 @@ class Loop:
             )
         self.beacon.tell(done=True)
         self._failures.tell(again=True)
-        self._say(f"evaluating checkpoint {name}")
+        self.say(f"evaluating checkpoint {name}")
         worlds = self.held_out_worlds()
         glance = self._glance(worlds)
         result = evaluate(worlds, self.algorithm.policy(), self.gang, checkpoint=name)
-        self._say(str(result))
+        self.say(str(result))
         if not self.gang.is_main:
             return
         try:
@@ -388,13 +394,13 @@ class Loop:
 
             plot: Path | None = plot_reward(self.job.run)
         except (OSError, ValueError) as error:
-            self._say(f"warning: the evaluation or the plot could not be written ({error})")
+            self.say(f"warning: the evaluation or the plot could not be written ({error})")
             plot = None
-        self._say(f"last checkpoint: {self.job.run.checkpoints / name}")
+        self.say(f"last checkpoint: {self.job.run.checkpoints / name}")
         if best := best_words(self.job.run):
-            self._say(best)
+            self.say(best)
         if plot:
-            self._say(f"reward plot: {plot}")
+            self.say(f"reward plot: {plot}")
         if glance:
             self._show(glance)
 
@@ -411,9 +417,9 @@ class Loop:
         path = self.job.run.metrics / "policy.png"
         try:
             write_atomic(path, glance.picture(self.config))
-            self._say(f"picture of the policy: {path}")
+            self.say(f"picture of the policy: {path}")
         except Exception as error:
-            self._say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
+            self.say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
 
     def held_out_worlds(self) -> Task:
         """The worlds of the evaluation: those of training, or, if worlds are drawn at random, others with another seed."""
@@ -426,23 +432,11 @@ class Loop:
         begin_evaluation(worlds, *told, adaptive_steps(self.task))
         return worlds
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Log ``text`` on the main rank; does not wait."""
         if self.gang.is_main:
             self.reporter.do(_print, text)
 
 
 def _print(text: str) -> None:
     print(text, flush=True)
-
-
-def straggler(seconds: list[float]) -> dict[str, float]:
-    """The rank with the longest rollout in the previous iteration, and its excess over the median: all others wait for it.
-
-    Args:
-        seconds: By rank; empty figures for a gang of one.
-    """
-    if len(seconds) == 1:
-        return {}
-    slowest = max(range(len(seconds)), key=seconds.__getitem__)
-    usual = statistics.median(seconds)
-    return {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import psutil
 import torch
 
 from worker.distributed import Gang
@@ -77,8 +78,7 @@ def free_bytes(gang: Gang) -> int:
     """Memory that this rank can still take: of its GPU, or its share of the host's memory (or of its control group's)."""
     if gang.device != "cpu":
         return torch.cuda.mem_get_info(gang.device)[0]
-    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    free = int(fields["MemAvailable"].split()[0]) * 1024
+    free = psutil.virtual_memory().available
     group = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):  # no control groups of version 2, or no limit
         limit = int((group / "memory.max").read_text())

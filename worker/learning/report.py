@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,11 @@ class Stopwatch:
     def begin(self) -> None:
         """The first iteration begins now."""
         self._read_at = time.perf_counter()
+
+    @property
+    def running(self) -> float:
+        """Seconds since the last iteration that was read."""
+        return time.perf_counter() - self._read_at
 
     def start(self) -> None:
         """The first part begins now."""
@@ -183,7 +189,24 @@ def _slow(record: dict[str, float | int | None]) -> str:
 _SLOW = 0.1
 _NOTICED = 0.1
 """Seconds of an iteration."""
+_MOST_RANKS = 32
+"""Ranks of which each is told by itself in a record."""
 
 
 def _text(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
+
+
+def straggler(seconds: list[float]) -> dict[str, Any]:
+    """The rank with the longest rollout in the previous iteration, and its excess over the median: all others wait for it.
+
+    Args:
+        seconds: By rank; empty figures for a gang of one. They are part of the figures of at most 32 ranks.
+    """
+    if len(seconds) == 1:
+        return {}
+    slowest = max(range(len(seconds)), key=seconds.__getitem__)
+    usual = statistics.median(seconds)
+    figures = {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
+    by_rank = [float(f"{each:.4g}") for each in seconds]
+    return {**figures, **({"rank_collect_seconds": by_rank} if len(seconds) <= _MOST_RANKS else {})}

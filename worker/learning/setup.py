@@ -85,7 +85,8 @@ def build_algorithm(
     *,
     rehearsal: bool = False,
 ) -> Algorithm:
-    """Raises UserError for settings that the algorithm refuses, and where it lacks what every algorithm has. All ranks call it.
+    """Build the algorithm. Raises UserError for settings that it refuses, and for a class that is not a complete algorithm. All ranks
+    call it.
 
     Args:
         rehearsal: See :attr:`Setting.rehearsal`.
@@ -105,31 +106,31 @@ def observed(task: Task) -> TensorDict:
 
 
 def transition(task: Task, observations: TensorDict) -> Transition:
-    """What the task's last step did, live."""
+    """Live views of the result of the task's last step."""
     ended = TensorDict(task.terminal_groups, [task.world_count], device=task.device)
     return Transition(observations, ended, task.rewards, task.dones, task.time_outs)
 
 
 def described_policy(training: Training, task: Task) -> ExportedPolicy | None:
-    """The policy of this training as it will be exported, with new weights; None, with a warning, where its algorithm fails to make one.
+    """The policy of this training in its exported form, with new weights; None, with a warning, if its algorithm fails to make one.
 
-    torch's generator is left as it was: weights are drawn from it.
+    The state of torch's generator is restored, since weights are drawn from it.
     """
     with torch.random.fork_rng(devices=[]):
         try:
             return training.algorithm_type.build_policy(training.settings, spaces_of(task), "cpu").module()
-        except Exception as error:  # of a user's own class: training goes on, and the export will say it again
+        except Exception as error:  # of a user's own class: training continues, and the export will report it again
             what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             print(f"warning: algorithm {training.algorithm} gives no policy that could be exported: {what}", flush=True)
             return None
 
 
 def describe(training: Training, task: Task, exported: ExportedPolicy | None = None) -> dict[str, Any]:
-    """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job.
+    """The entries of a checkpoint's manifest about its policy, for evaluation and export without the job.
 
     Args:
-        training: What is trained.
-        task: Its worlds.
+        training: The training.
+        task: Its task, with worlds.
         exported: See :func:`worker.tasks.policy_contract.policy_contract`.
     """
     spaces, name = spaces_of(task), training.job.section["task"]
@@ -149,9 +150,9 @@ def describe(training: Training, task: Task, exported: ExportedPolicy | None = N
 
 
 def write_contract(job: Job, document: dict[str, Any]) -> None:
-    """Write the run's ``contract.json``, where it is not there yet or says something else. Main rank only.
+    """Write the run's ``contract.json`` if it is missing or differs. Main rank only.
 
-    A volume that is full does not end training: the contract is in every checkpoint, too. Raises StaleEpoch.
+    A full volume does not end training, since every checkpoint has the contract too. Raises StaleEpoch.
     """
     check_epoch(job.run, job.epoch)
     try:
@@ -162,7 +163,7 @@ def write_contract(job: Job, document: dict[str, Any]) -> None:
 
 
 def contract_from(facts: Mapping[str, Any], checkpoint: str) -> Contract | None:
-    """The policy contract in a checkpoint's manifest; None where an older version wrote it. Raises UserError for one that can't be read."""
+    """The policy contract in a checkpoint's manifest; None if an older version wrote it. Raises UserError if it can't be read."""
     if "contract" not in facts:
         return None
     try:
@@ -172,16 +173,16 @@ def contract_from(facts: Mapping[str, Any], checkpoint: str) -> Contract | None:
 
 
 def begin_as_trained(task: Task, checkpoint: Checkpoint) -> None:
-    """Prepare worlds in which a checkpoint's policy acts: curricula and adaptive numbers stand as they did in its training."""
+    """Prepare worlds for a checkpoint's policy: set curricula and adaptive numbers as in its training."""
     facts = checkpoint.manifest
     told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
     begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
 
 
 def check_contract(checkpoint: Checkpoint, task: Task) -> None:
-    """Raise UserError where the task's observations, actions or commands mean something else than when the checkpoint's policy learnt.
+    """Raise UserError if the meaning of the task's observations, actions or commands changed since the checkpoint's training.
 
-    Of a checkpoint without a contract only sizes are compared.
+    For a checkpoint without a contract, only sizes are compared.
     """
     facts = checkpoint.manifest
     name = facts["task"]

@@ -1,4 +1,4 @@
-"""Reading a checkpoint: no code runs while it loads, and worlds come by global index, whatever shards they lie in."""
+"""Read a checkpoint without running code from it, and its worlds by global index, whatever their shards."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from worker.errors import UserError
 def read_file(checkpoint: Checkpoint, name: str, device: str = "cpu") -> dict[str, Any]:
     """The content of one file of ``checkpoint``: dictionaries and lists of tensors and plain values.
 
-    Raises UserError where it holds anything else; nothing of that is imported or run (``weights_only=True``).
+    Raises UserError for any other content, which is neither imported nor run (``weights_only=True``).
     """
     where = f"checkpoint {checkpoint.name}: {name}"
     try:
@@ -27,7 +27,7 @@ def read_file(checkpoint: Checkpoint, name: str, device: str = "cpu") -> dict[st
             f"{where} {what}: only tensors and plain values are loaded, and nothing of it was run; choose a checkpoint "
             "that you trust"
         ) from error
-    except Exception as error:  # whatever a file that is no checkpoint's provokes in torch's reader
+    except Exception as error:  # torch's reader can raise anything on a file that is not a checkpoint
         said = str(error).splitlines() or [type(error).__name__]
         raise UserError(f"{where} can't be loaded: {said[0]}") from error
     if not isinstance(content, dict):
@@ -36,7 +36,7 @@ def read_file(checkpoint: Checkpoint, name: str, device: str = "cpu") -> dict[st
 
 
 class Shards:
-    """The files ``rank-<k>.pt`` of one checkpoint, each read once and only when something of it is wanted."""
+    """The files ``rank-<k>.pt`` of one checkpoint, each read once, on first use."""
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.checkpoint = checkpoint
@@ -45,7 +45,7 @@ class Shards:
         self._read: dict[int, dict[str, Any]] = {}
 
     def rank(self, rank: int) -> dict[str, Any]:
-        """What rank ``rank`` saved: ``worlds`` and ``generators``. Raises UserError, as :func:`read_file`."""
+        """The saved ``worlds`` and ``generators`` of rank ``rank``. Raises UserError, as :func:`read_file`."""
         if rank not in self._read:
             self._read[rank] = read_file(self.checkpoint, f"rank-{rank}.pt")
         return self._read[rank]

@@ -1,7 +1,7 @@
-"""The whole state of training, saved in shards and dealt out again.
+"""The whole state of training, saved in shards and resharded on resume.
 
 ``learner.pt`` (main rank): weights, optimizer, normalisers, learning rate, progress. ``rank-<k>.pt`` (each rank): every tensor of
-its worlds, and its generators. Worlds have global indices, so that shards can be dealt to any number of ranks.
+its worlds, and its generators. Worlds have global indices, so they can be resharded to any number of ranks.
 Files are written with ``torch.save`` and only ever read with ``weights_only=True``: loading runs no code.
 """
 
@@ -45,26 +45,26 @@ if TYPE_CHECKING:
 
 
 class Ended(NamedTuple):
-    """What ended in one iteration, in the worlds of all ranks."""
+    """Episodes that ended in one iteration, over all ranks."""
 
     steps: int
     """Control steps of each world."""
     episodes: float
-    """How many episodes ended."""
+    """Number of episodes that ended."""
     returns: float
     """The sum of their returns."""
     squares: float = math.nan
-    """The sum of the squares of their returns; unknown in checkpoints that were saved before there were squares."""
+    """The sum of the squares of their returns; unknown in older checkpoints."""
 
 
 @dataclass
 class Progress:
-    """How far training is."""
+    """Progress of training."""
 
     iteration: int = 0
     """Iterations done."""
     env_steps: int = 0
-    """Steps of all worlds together."""
+    """Total steps over all worlds."""
     reward: float | None = None
     """Mean return of the episodes that ended in the last iteration in which any ended; None before the first."""
     episode_length: float | None = None
@@ -74,26 +74,27 @@ class Progress:
     score_error: float | None = None
     """Standard error of the score: the standard deviation of these episodes' returns over the square root of their number."""
     score_episodes: int = 0
-    """How many episodes the score is a mean of."""
+    """Number of episodes in the score."""
     recent: list[list[float]] = field(default_factory=list)
-    """The newest iterations, as many as the score needs: the fields of :class:`Ended`, as lists, which checkpoints can hold."""
+    """The newest iterations, as many as the score needs: the fields of :class:`Ended`, as lists for checkpoints."""
 
     def saved(self) -> dict[str, Any]:
-        """All fields, for a thread that writes them while training goes on: the entries of ``recent`` never change, the list does."""
+        """All fields, for a thread that writes them while training continues: the entries of ``recent`` never change, only the list
+        does."""
         return {**vars(self), "recent": list(self.recent)}
 
     def count(self, steps: int, episodes: float, returns: float, squares: float, *, worlds: int, longest: int) -> None:
-        """Note what ended in an iteration, and work out the score and its error.
+        """Record the episodes that ended in an iteration, and update the score and its error.
 
-        The score covers at least :data:`EPISODES` episodes, one for each world, and at least as many steps as an episode can have: over
-        less, only those that ended early would count, which are falls.
+        The score covers at least :data:`EPISODES` episodes, one for each world, and at least as many steps as the longest episode. With
+        fewer, only early ends would count, which are falls.
 
         Args:
-            steps: Of each world.
-            episodes: How many ended, in the worlds of all ranks.
+            steps: Steps of each world.
+            episodes: Number of episodes that ended, over all ranks.
             returns: Sum of their returns.
             squares: Sum of the squares of their returns.
-            worlds: Of all ranks.
+            worlds: Number of worlds of all ranks.
             longest: Steps of the longest episode.
         """
         self.recent.append(list(Ended(steps, episodes, returns, squares)))
@@ -111,11 +112,11 @@ class Progress:
 
 
 EPISODES = 100
-"""A score is the mean over so many episodes, at least."""
+"""Least number of episodes in a score."""
 
 
 class TrainingState:
-    """What is saved and restored: the learner, this rank's worlds, the progress."""
+    """The saved and restored state: the learner, this rank's worlds, the progress."""
 
     def __init__(
         self,
@@ -146,16 +147,16 @@ class TrainingState:
         self.ordered_at: int | None = None
         """Iteration of the newest save that was ordered, or of the checkpoint that was loaded."""
         self.load_seconds = 0.0
-        """How long it took to read and take over the checkpoint that was loaded [s]; its digests not counted."""
+        """Time to read and load the checkpoint [s], without checking its digests."""
         self.learning_rate: float | None = None
-        """The learning rate after the newest iteration, or the one with which a resumed run goes on; kept in the manifest."""
+        """The learning rate after the newest iteration, or the first one of a resumed run; kept in the manifest."""
         self.set_anew: Sequence[str] = ()
         """One log line for each value that this job's settings replace in the checkpoint."""
 
     def copy(self, iteration: int) -> None:
-        """Copy what a save after ``iteration`` needs.
+        """Copy the state for a save after ``iteration``.
 
-        Called before the host waits for the iteration's numbers, it takes no time on a device, which copies once it has come so far.
+        Called before the host waits for the iteration's numbers, it costs the host no time: the device copies when it gets there.
         """
         worlds = {"first": self.share.first, "count": self.share.count}
         self._copied = (
@@ -174,13 +175,14 @@ class TrainingState:
         """Whether the present state has been copied already."""
         return self._copied[0] == self.progress.iteration
 
-    def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
+    def save(self, reporter: Reporter | None = None, *, wait: bool = True, scheduled: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
 
         Args:
             reporter: The checkpoint is committed after what ``reporter`` has been given so far: a run that goes on from it has the
                 metrics records before it.
             wait: For earlier saves that are still being written, as long as they take.
+            scheduled: Whether the job asked for a checkpoint at this iteration.
 
         Raises:
             StaleEpoch: A newer attempt owns the run.
@@ -195,7 +197,7 @@ class TrainingState:
             files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": self.progress.saved()}
         if reporter:
             reporter.do(self.saver.note_records, iteration)
-        facts = self._manifest() if self.gang.is_main else None
+        facts = {**self._manifest(), "scheduled": scheduled} if self.gang.is_main else None
         self.saver.save(iteration, files, facts, after_records=reporter is not None, wait=wait)
         self.ordered_at = iteration
 
@@ -204,9 +206,8 @@ class TrainingState:
         return {_OF_ALGORITHM + name: tensor for name, tensor in self.algorithm.world_state().items()}
 
     def finish(self) -> list[str]:
-        """Wait until every save is durable or has failed; every rank calls it. Returns lines for the log.
-
-        Raises StaleEpoch where a newer attempt owns the run.
+        """Wait until every save is durable or has failed; every rank calls it. Returns lines for the log. Raises StaleEpoch if a newer
+        attempt owns the run.
         """
         lines = [] if self.gang.is_main else self.saver.wait()
         if self.gang.greatest(self.saver.failures):
@@ -237,12 +238,12 @@ class TrainingState:
         }
 
     def restore(self) -> Checkpoint | None:
-        """Go on from the newest good checkpoint, or from the chosen one; None where there is none. All ranks call it.
+        """Resume from the newest good checkpoint, or from the chosen one; None without any. All ranks call it.
 
-        The main rank chooses and verifies; damaged ones are named and set aside.
+        The main rank chooses and verifies; damaged checkpoints are reported and set aside.
 
         Raises:
-            UserError: The checkpoint does not fit this job; the message says in what.
+            UserError: The checkpoint does not fit this job; the message names the difference.
             DamagedCheckpoint: The chosen one can't be used, or the newest one has a newer format.
         """
         checkpoint, problem = None, ""
@@ -263,21 +264,21 @@ class TrainingState:
 
     def _choose(self) -> Checkpoint | None:
         def damaged(checkpoint: Checkpoint, error: DamagedCheckpoint) -> None:
-            if isinstance(error, NewerFormat):  # the run's history goes on there, where this program can't follow
+            if isinstance(error, NewerFormat):  # the run's history continues in a format that this version can't read
                 raise error
             place = set_aside(checkpoint)
             print(f"warning: {error}; it was set aside as {place.name} and the one before it is used", flush=True)
 
         check_epoch(
             self.job.run, self.job.epoch
-        )  # a rank that was frozen here must not clear away its successor's work
+        )  # a rank that was frozen until now must not delete its successor's work
         sweep(self.job.run)
         return newest_checkpoint(
             self.job.run, chosen=self.job.checkpoint, chosen_since=self.job.job_epoch, damaged=damaged
         )
 
     def load(self, checkpoint: Checkpoint) -> None:
-        """Take over the state of ``checkpoint``. Raises UserError where it does not fit."""
+        """Load the state of ``checkpoint``. Raises UserError if it does not fit."""
         started = time.perf_counter()
         self._check_fit(checkpoint)
         learner = read_file(checkpoint, "learner.pt", self.gang.device)
@@ -295,7 +296,7 @@ class TrainingState:
         self.load_seconds = time.perf_counter() - started
 
     def _changed(self, checkpoint: Checkpoint) -> set[str]:
-        """The algorithm's settings that differ from those of ``checkpoint``, or that the job gives and did not give there."""
+        """The algorithm's settings that differ from those of ``checkpoint``, or that this job sets and that one did not."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
         given = (f"train.{section_of(here['algorithm'])}", "settings")
         pairs = [(setting_at(there, key) or {}, setting_at(here, key) or {}) for key in given]
@@ -313,7 +314,7 @@ class TrainingState:
         if difference:
             ours = difference[0] in settings
             key, old, new = innermost(*difference)
-            if ours:  # as a job's YAML calls it
+            if ours:  # its name in a job's YAML
                 key = f"{section_of(there['algorithm'])}.{key.removeprefix('settings.')}"
             raise UserError(
                 f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "
@@ -337,7 +338,7 @@ class TrainingState:
             own = {name: state.pop(name) for name in list(state) if name.startswith(_OF_ALGORITHM)}
             self.task.load_state_dict(state)
             self.algorithm.load_world_state({name.removeprefix(_OF_ALGORITHM): own[name] for name in own})
-            if len(bounds) == self.gang.size:  # dealt out anew, a rank's own generators have no counterpart
+            if len(bounds) == self.gang.size:  # after resharding, a rank's own generators have no counterpart
                 restore_generators(shards.rank(self.gang.rank)["generators"])
         except (ValueError, KeyError, TypeError) as error:
             raise UserError(f"checkpoint {checkpoint.name}: {error}") from error

@@ -16,13 +16,13 @@ def give_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint
     """Load the weights of the teacher that a new run's settings name. All ranks call it.
 
     Args:
-        job: Names the store in which the teacher's run is.
+        job: The job, in the same store as the teacher's run.
         gang: The ranks.
-        algorithm: Asks for a teacher, or does not.
-        adopted: The checkpoint with whose weights the run begins: where it was made with the same teacher, it holds the teacher.
+        algorithm: The algorithm, with or without a teacher.
+        adopted: The checkpoint with the run's initial weights; if it was made with the same teacher, it holds the teacher.
 
     Raises:
-        UserError: There is no such checkpoint, it is of an older Muster, or the weights do not fit.
+        UserError: The checkpoint does not exist, is of an older Muster, or its weights do not fit.
     """
     if not isinstance(algorithm, Student) or not (reference := algorithm.teacher_checkpoint):
         return
@@ -36,7 +36,7 @@ def give_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint
 def _learnt(job: Job, gang: Gang, reference: str) -> dict[str, Any]:
     """The algorithm's state in the checkpoint ``RUN`` or ``RUN@ITERATION``."""
     name, _, iteration = reference.partition("@")
-    copy = job.run.teacher(name)  # made when the job was submitted, unless the teacher's run was yet to come
+    copy = job.run.teacher(name)  # chosen when the job was submitted, unless the teacher's run did not exist yet
     held = gang.tell(copy.checkpoints.is_dir())
     checkpoint = choose_checkpoint(gang, copy if held else job.store.run(name), iteration or None)
     if "algorithm" not in checkpoint.manifest:

@@ -1,4 +1,4 @@
-"""Named numbers that are added up over the ranks in one buffer."""
+"""Named numbers in one buffer, to be summed over the ranks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 
 class Totals:
-    """A float64 vector whose parts have names.
+    """A float64 vector with named parts.
 
     >>> totals = Totals({"episodes": 1, "seconds": 3}, "cpu")
     >>> totals["seconds"][1] = 0.5
@@ -17,10 +17,10 @@ class Totals:
     """
 
     def __init__(self, sizes: Mapping[str, int], device: str, *, pinned: bool = False) -> None:
-        """``pinned``: in host memory that a GPU copies from without the host waiting."""
+        """``pinned``: in pinned host memory, which a GPU copies without a wait of the host."""
         self.layout = dict(sizes)
         self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device, pin_memory=pinned)
-        """All parts, one behind the other, shape (n,)."""
+        """All parts, one after the other, shape (n,)."""
         self._parts = dict(zip(sizes, self.values.split(list(sizes.values())), strict=True))
 
     def __getitem__(self, name: str) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Reading a policy back from a checkpoint, without the job that trained it and without a simulation."""
+"""Load a policy from a checkpoint, without its job and without a simulation."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpoint:
-    """The checkpoint that a user means: an iteration, a name, ``best``, or ``latest`` or None for the newest good one. All ranks call it.
+    """The checkpoint for a user's choice: an iteration, a name, ``best``, or ``latest`` or None for the newest good one. All ranks call it.
 
-    Raises UserError where there is no such checkpoint, or it is damaged; the message says which there are.
+    Raises UserError if it does not exist or is damaged; the message lists the existing ones.
     """
     name, problem = None, ""
     if gang.is_main:
@@ -31,7 +31,7 @@ def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpo
 
 
 def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
-    """See :func:`choose_checkpoint`; for one process. Of two with the same iteration the later epoch's is meant."""
+    """As :func:`choose_checkpoint`, for one process. Of two with the same iteration, the later epoch wins."""
     checkpoints = list_checkpoints(run)
     if wanted == "best":
         if (best := best_checkpoint(run)) is None:
@@ -51,11 +51,11 @@ def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
 
 
 def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
-    """The policy of ``checkpoint``, without anything that learning needs.
+    """The policy of ``checkpoint``, without the training state.
 
     >>> actions = load_policy(checkpoint).act({"policy": observations})  # shape (n, actions) for (n, observations)
 
-    Raises UserError where the checkpoint is of another version, its algorithm can't be found, or refuses the settings that it had then.
+    Raises UserError if the checkpoint is of another version, or its algorithm can't be found or refuses its former settings.
     """
     return load_policies(checkpoint, device, 1)[0]
 
@@ -88,7 +88,7 @@ def load_policies(checkpoint: Checkpoint, device: str, count: int) -> list[Polic
 
 
 def load_learner(checkpoint: Checkpoint, device: str = "cpu") -> dict[str, Any]:
-    """The content of ``learner.pt``. Raises UserError where it holds more than tensors and plain values."""
+    """The content of ``learner.pt``. Raises UserError if it holds more than tensors and plain values."""
     from worker.learning.shards import read_file
 
     return read_file(checkpoint, "learner.pt", device)

@@ -1,4 +1,4 @@
-"""What a job trains: the task, the algorithm and all settings, resolved once, before any world is built."""
+"""The training of a job: task, algorithm and all settings, resolved once, before any world is built."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ class Training:
     config: TaskConfig
     """The task's configuration."""
     algorithm: str
-    """As the job's YAML calls it."""
+    """Name of the algorithm in the job's YAML."""
     algorithm_type: type[Algorithm]
     settings: Any
-    """The algorithm's, of its ``config_type``."""
+    """Settings of the algorithm, of its ``config_type``."""
     iterations: int
-    """At which training ends."""
+    """Iteration at which training ends."""
     seed: int
     save_every: int | str
     """Iterations between two saves, or ``auto``."""
     keep: int
-    """How many checkpoints stay."""
+    """Number of checkpoints to keep."""
 
     @classmethod
     def of(cls, job: Job, task_type: type[Task]) -> Training:
-        """Raises UserError naming the key that is wrong."""
+        """Raises UserError that names the wrong key."""
         config, name = configure(task_type, job.section), job.section.get("algorithm", algorithms.DEFAULT)
         algorithm = algorithms.find_algorithm(name)
         checkpoints = job.spec.get("checkpoint") or {}

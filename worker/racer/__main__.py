@@ -22,28 +22,41 @@ Order = dict[str, Any]
 
 
 def list_tracks(order: Order) -> list[Order]:
-    """All tracks, the presets first; one that is damaged has a ``problem`` instead of measures. ``store``: where they lie."""
-    found = [
-        {**make_preset(name).facts(), "origin": {"preset": name}, "about": PRESETS[name].about} for name in PRESETS
-    ]
-    store = Store(order["store"])
+    """All tracks, the presets first; one that is damaged has a ``problem`` instead of measures.
+
+    ``store``: where they lie; ``rings``: whether each track has its borders, too.
+    """
+    store, found = Store(order["store"]), []
+    for name in PRESETS:
+        track = make_preset(name)
+        found.append({**_told(order, track), "origin": {"preset": name}, "about": PRESETS[name].about})
     for name in stored.names(store):
         try:
-            found.append(stored.StoredTrack(store.tracks / name).facts())
-        except stored.TrackError as error:
+            rings = _rings(resolve(name, store)) if order.get("rings") else {}
+            found.append({**stored.StoredTrack(store.tracks / name).facts(), **rings})
+        except (stored.TrackError, UserError) as error:
             found.append({"name": name, "problem": str(error)})
     return found
 
 
+def _told(order: Order, track: Track) -> Order:
+    return {**track.facts(), **(_rings(track) if order.get("rings") else {})}
+
+
+def _rings(track: Track) -> Order:
+    """The borders in driving order, as pairs [m] rounded to centimetres; for drawings."""
+    return {"rings": {"inner": track.inner.round(2).tolist(), "outer": track.outer.round(2).tolist()}}
+
+
 def show(order: Order) -> Order:
-    """A track's measures; writes it to ``output`` where one is named. ``name``, ``store``."""
+    """A track's measures; writes it to ``output`` where one is named. ``name``, ``store``, ``rings``."""
     store = Store(order["store"])
     track = resolve(order["name"], store)
     _write(order, _content(order, track))
     if track.name not in stored.names(store):
-        return track.facts()
+        return _told(order, track)
     kept = stored.find(store, track.name)
-    return {**kept.facts(), "path": str(kept.path)}
+    return {**_told(order, track), **kept.facts(), "path": str(kept.path)}
 
 
 def make(order: Order) -> Order:

@@ -43,10 +43,21 @@ def remaining(seconds: float, lag: float) -> float:
 
 
 @wp.func
+def turning(speed: float, steering: float, grip: float) -> float:
+    """How fast the heading turns [rad/s]: tyres bear no more than a lateral acceleration of ``grip`` [m/s²]; 0: any."""
+    found = speed * wp.tan(steering) / WHEELBASE
+    if grip > 0.0:
+        most = grip / wp.max(wp.abs(speed), 1.0e-3)
+        found = wp.clamp(found, -most, most)
+    return found
+
+
+@wp.func
 def drive(
     motion: Motion,
     speed: float,
     steering: float,
+    grip: float,
     speed_lag: float,
     steering_lag: float,
     seconds: float,
@@ -61,6 +72,7 @@ def drive(
         motion: As it is.
         speed: What is asked [m/s].
         steering: What is asked [rad].
+        grip: Greatest lateral acceleration [m/s²]; 0: any.
         speed_lag: Time constant; 0: none [s].
         steering_lag: Time constant; 0: none [s].
         seconds: How long.
@@ -78,9 +90,9 @@ def drive(
         last_speed = speed + (middle_speed - speed) * half_speed
         middle_steering = steering + (motion.steering - steering) * half_steering
         last_steering = steering + (middle_steering - steering) * half_steering
-        first_turning = first_speed * wp.tan(motion.steering) / WHEELBASE
-        middle_turning = middle_speed * wp.tan(middle_steering) / WHEELBASE
-        last_turning = last_speed * wp.tan(last_steering) / WHEELBASE
+        first_turning = turning(first_speed, motion.steering, grip)
+        middle_turning = turning(middle_speed, middle_steering, grip)
+        last_turning = turning(last_speed, last_steering, grip)
         first = motion.heading
         sixth = part / 6.0
         middle = first + part / 24.0 * (5.0 * first_turning + 8.0 * middle_turning - last_turning)

@@ -32,7 +32,8 @@ LASTING = (
 """What the next control step reads; the rest follows from it."""
 SHAPED = {
     wp.vec2: ("commands", "fronts"),
-    wp.vec3: ("poses", "factors", "put_poses"),
+    wp.vec3: ("poses", "put_poses"),
+    wp.vec4: ("factors",),
     wp.bool: ("backwards", "left", "crashed", "put"),
 }
 COUNTED = (

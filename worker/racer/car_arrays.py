@@ -61,7 +61,8 @@ class CarArrays:
         poses: x and y of the car's middle [m], heading [rad], shape ``(worlds,)``.
         speeds: [m/s], shape ``(worlds,)``.
         steerings: [rad], shape ``(worlds,)``.
-        factors: By which this episode's speed and steering miss what is asked, and what is added to the steering [rad], ``(worlds,)``.
+        factors: By which this episode's speed and steering miss what is asked, what is added to the steering [rad], and the greatest lateral
+            acceleration [m/s²], 0: any; ``(worlds,)``.
         commands: Steering [rad] and speed [m/s] that reached the car last, shape ``(worlds,)``.
         fronts: x and y of the front [m], shape ``(worlds,)``; what follows is of this point.
         rows: The nearest segment of the centre line, shape ``(worlds,)``.
@@ -101,7 +102,7 @@ class CarArrays:
     poses: wp.array(dtype=wp.vec3)
     speeds: wp.array(dtype=wp.float32)
     steerings: wp.array(dtype=wp.float32)
-    factors: wp.array(dtype=wp.vec3)
+    factors: wp.array(dtype=wp.vec4)
     commands: wp.array(dtype=wp.vec2)
     fronts: wp.array(dtype=wp.vec2)
     rows: wp.array(dtype=wp.int32)
@@ -184,7 +185,14 @@ def move_car(
     motion.speed = car.speeds[world]
     motion.steering = car.steerings[world]
     motion = drive(
-        motion, factors[0] * speed, factors[1] * steering + factors[2], speed_lag, steering_lag, seconds, parts
+        motion,
+        factors[0] * speed,
+        factors[1] * steering + factors[2],
+        factors[3],
+        speed_lag,
+        steering_lag,
+        seconds,
+        parts,
     )
     turned = motion.heading - pose[2]
     middle = ahead_of(wp.vec3(motion.x, motion.y, motion.heading), 0.5 * WHEELBASE, 0.0)

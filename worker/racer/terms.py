@@ -17,6 +17,8 @@ STARTS = ("line", "round_robin", "random")
 """Where an episode begins, by the number that :func:`place_car` is given."""
 ROUND_ROBIN = wp.constant(STARTS.index("round_robin"))
 RANDOM = wp.constant(STARTS.index("random"))
+GRAVITY = wp.constant(9.81)
+"""[m/s²]"""
 UNSEEN = wp.constant(4.0)
 """An obstacle farther ahead than this is not seen [m]."""
 
@@ -163,6 +165,7 @@ def place_car(
     speed_factor: wp.vec2,
     steering_factor: wp.vec2,
     steering_offset: wp.vec2,
+    friction: wp.vec2,
 ):
     """Put the car on the centre line of its track, at rest, and draw how well it obeys in this episode.
 
@@ -176,6 +179,7 @@ def place_car(
         speed_factor: Least and greatest factor on the speed that is asked.
         steering_factor: Least and greatest factor on the steering that is asked.
         steering_offset: Least and greatest angle that is added to it [rad].
+        friction: Least and greatest coefficient of friction between tyres and road; 0: they never slide.
     """
     episode = int(episodes.lasting[world, lasting])
     tracks = car.road.first.shape[0]
@@ -198,9 +202,10 @@ def place_car(
     car.poses[world] = wp.vec3(point[0], point[1], heading)
     car.speeds[world] = 0.0
     car.steerings[world] = 0.0
-    car.factors[world] = wp.vec3(
+    car.factors[world] = wp.vec4(
         wp.randf(stream, speed_factor[0], speed_factor[1]),
         wp.randf(stream, steering_factor[0], steering_factor[1]),
         wp.randf(stream, steering_offset[0], steering_offset[1]),
+        GRAVITY * wp.randf(stream, friction[0], friction[1]),
     )
     put_car(world, worlds, robot, car)

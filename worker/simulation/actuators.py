@@ -1,7 +1,7 @@
-"""Actuators of a robot, declared by pattern of its joints.
+"""Actuators of a robot, declared by joint-name pattern.
 
 All of them take their inputs from one array, ``WorldArrays.controls``, in the order in which they were declared: a joint position,
-a joint velocity or a force, in the joint's own unit. What MuJoCo can do by itself is done by its actuators
+a joint velocity or a force, in the joint's own unit. MuJoCo's own actuators are used where they suffice
 (:class:`PositionActuator`, :class:`VelocityActuator`, :class:`EffortActuator`), whose damping its implicit integrators know; explicit
 motors are computed before each physics step (:mod:`worker.simulation.drives`).
 """
@@ -20,10 +20,10 @@ from newton.solvers import SolverMuJoCo
 from worker.simulation.patterns import find, resolve
 
 FREQUENCY = "mujoco:actuator"
-"""What Newton counts actuators by: one row each, in the order of the controls."""
+"""Newton's frequency of actuators: one row each, in the order of the controls."""
 
 Number = float | Mapping[str, float]
-"""One number for all joints of an actuator, or numbers by pattern of joints; the first pattern that matches counts."""
+"""One number for all joints of an actuator, or numbers by joint pattern; the first matching pattern wins."""
 
 MOTOR_ATTRIBUTES = {
     "explicit": (wp.int32, 0),
@@ -34,21 +34,21 @@ MOTOR_ATTRIBUTES = {
     "velocity_limit": (wp.float32, math.inf),
     "delay": (wp.int32, 0),
 }
-"""What a model carries of its actuators beside MuJoCo's parameters, as ``model.muster.NAME`` (worlds x actuators rows): whether the
+"""Actuator attributes that a model carries beside MuJoCo's parameters, as ``model.muster.NAME`` (worlds x actuators rows): whether the
 force is computed explicitly, its gains and limits, and the delay of the input [physics steps]."""
 
 
 @dataclass(frozen=True)
 class Actuator:
-    """What all actuators have.
+    """Arguments common to all actuators.
 
     Args:
-        joints: Patterns of joints; each joint found gets an actuator of its own.
+        joints: Joint-name patterns; each matching joint gets its own actuator.
         effort_limit: Greatest force on a joint [N, N m]; None: not limited.
-        armature: Inertia of the rotor, seen from the joint [kg, kg m^2]; None: as in the file.
+        armature: Inertia of the rotor, reflected to the joint [kg, kg m^2]; None: as in the file.
         friction_loss: Dry friction of the joint [N, N m]; None: as in the file.
         viscous_damping: Damping of the joint itself [N s/m, N m s/rad]; None: as in the file.
-        delay: Physics steps after which an input is obeyed; the first inputs of an episode are obeyed at once until older ones are there.
+        delay: Physics steps before an input takes effect. At the beginning of an episode the oldest input so far is used.
     """
 
     joints: str | Sequence[str]
@@ -167,7 +167,7 @@ class DCMotorActuator(ExplicitPDActuator):
 
 
 def register(builder: newton.ModelBuilder) -> None:
-    """Let a builder carry :data:`MOTOR_ATTRIBUTES`."""
+    """Register :data:`MOTOR_ATTRIBUTES` with a builder."""
     for name, (dtype, default) in MOTOR_ATTRIBUTES.items():
         builder.add_custom_attribute(
             newton.ModelBuilder.CustomAttribute(
@@ -177,11 +177,11 @@ def register(builder: newton.ModelBuilder) -> None:
 
 
 def clear(builder: newton.ModelBuilder) -> None:
-    """Take all actuators of a file away."""
+    """Remove all actuators that came from a file."""
     for attribute in builder.custom_attributes.values():
         if attribute.frequency == FREQUENCY:
             attribute.values = []
-    # Newton has no call that takes a row away
+    # Newton has no call that removes a row
     builder._custom_frequency_counts[FREQUENCY] = 0
 
 
@@ -193,12 +193,12 @@ def add(
     Args:
         builder: Holds the robot alone; it has no actuators yet.
         names: Its joints of one degree of freedom.
-        dofs: Their columns of ``joint_qd``.
+        dofs: Columns of these joints in ``joint_qd``.
         actuators: Declarations.
         robot: Its name, for errors.
 
     Raises:
-        ValueError: A pattern matches nothing, two actuators drive one joint, or a number is given for some of an actuator's joints only.
+        ValueError: A pattern matches nothing, two actuators drive one joint, or a number is given for only some of an actuator's joints.
     """
     driven: dict[int, Actuator] = {}
     for actuator in actuators:
@@ -226,7 +226,7 @@ def add(
 
 
 def _numbers(actuator: Actuator, names: Sequence[str], robot: str) -> dict[str, list[float]]:
-    """The declaration's numbers for each of its joints; those that are None are left out."""
+    """The declaration's numbers for each of its joints, without those that are None."""
     numbers: dict[str, list[float]] = {}
     for item in fields(actuator):
         value = getattr(actuator, item.name)

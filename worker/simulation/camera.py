@@ -1,4 +1,4 @@
-"""A camera for every world, whose images go straight into the buffer that the policy reads."""
+"""One camera per world, which renders straight into the buffer that the policy reads."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 SKY = 0x00D0B090
-"""What the camera sees where there is nothing: packed as alpha, blue, green, red."""
+"""Background colour of an image, packed as alpha, blue, green, red."""
 _STREAM = wp.constant(-100)
-"""The scene is drawn from this random stream and below, the physics from those above it."""
+"""Random streams from this number down belong to the scene; higher ones belong to the physics."""
 
 
 @wp.func
@@ -143,7 +143,7 @@ def renderer(model: newton.Model, samples: int) -> SensorCamera:
 
 
 def look(position: Sequence[float], target: Sequence[float]) -> wp.transformf:
-    """The pose of a camera at ``position`` that looks at ``target`` along its own -z, with its +y as near to +z as can be [m]."""
+    """Pose of a camera at ``position`` that looks at ``target`` along its own -z, with its +y as close to +z as possible [m]."""
     back = wp.normalize(wp.vec3f(*position) - wp.vec3f(*target))
     upward = wp.vec3f(0.0, 1.0, 0.0) if abs(back[2]) > 0.999 else wp.vec3f(0.0, 0.0, 1.0)
     right = wp.normalize(wp.cross(upward, back))
@@ -152,7 +152,7 @@ def look(position: Sequence[float], target: Sequence[float]) -> wp.transformf:
 
 
 def shapes_of_worlds(model: newton.Model) -> int:
-    """How many shapes each world has; those of the ground come after them and belong to no world."""
+    """Number of shapes of each world. Shapes of the ground come after them and belong to no world."""
     return int((model.shape_world.numpy() >= 0).sum()) // model.world_count
 
 
@@ -172,9 +172,9 @@ class Camera:
     """Renders all worlds into :attr:`images`; launches only, so that it can be captured.
 
     Args:
-        config: Where it stands, how it sees.
-        randomize: How the scenes of the worlds differ; colours are changed here, in the worlds' model.
-        worlds: What it sees.
+        config: Pose, resolution and field of view.
+        randomize: How the scenes of the worlds differ. The constructor changes the colours in the worlds' model.
+        worlds: The worlds to render.
         episodes: The task's buffers; ``random`` holds seed and global indices already.
 
     Attributes:
@@ -208,7 +208,7 @@ class Camera:
         draw_light(randomize.light, episodes, self._light)
 
     def render(self, mode: int) -> None:
-        """After ``observe`` in ``mode``: take a picture of every world, of those that were placed afresh too."""
+        """After ``observe`` in ``mode``: render every world, including those that were just reset."""
         self._worlds.update_bodies()
         self._worlds.update_shapes()
         self._sensor.update(self._worlds.state, self._poses, self._rays, color_image=self._rendered)

@@ -1,4 +1,4 @@
-"""Recording a sequence of Warp launches once and replaying it, on CPU and CUDA."""
+"""Record a sequence of Warp launches once and replay it, on CPU and CUDA."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import warp as wp
 
 @contextlib.contextmanager
 def garbage_collection_paused() -> Iterator[None]:
-    """For recording a graph: a finaliser that frees an array meanwhile would be recorded into it, or would break the recording."""
+    """Pause garbage collection while a graph is recorded: a finaliser that frees an array would be recorded too, or would break the
+    recording."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -24,7 +25,7 @@ def garbage_collection_paused() -> Iterator[None]:
 
 @contextlib.contextmanager
 def on_torch_stream(device: str) -> Iterator[wp.Stream | None]:
-    """Make Warp launch on torch's current stream, so that neither has to wait for the other.
+    """Make Warp launch on torch's current stream, so that no synchronisation between them is needed.
 
     Args:
         device: ``"cpu"`` (nothing to do) or ``"cuda:<n>"``.

@@ -1,6 +1,6 @@
-"""Which geoms of a world touch which, and how: MuJoCo's masks and contact parameters, by pattern of geoms.
+"""Collision masks and contact parameters of MuJoCo, by geom-name pattern.
 
-Two geoms of different bodies touch where ``contype`` of one and ``conaffinity`` of the other have a bit in common. The masks of all
+Two geoms of different bodies collide if ``contype`` of one and ``conaffinity`` of the other share a bit. The masks of all
 robots, objects and the ground of a world mean the same; the ground's are 1 and 1.
 """
 
@@ -16,33 +16,33 @@ import warp as wp
 from worker.simulation.patterns import find, resolve
 
 UNSET = -(2**63)
-"""Newton's value for a shape that has no mask."""
+"""Newton's value for a shape without a mask."""
 FIRST_OWN_BIT = 8
-"""Robots without self-collisions take a bit of their own each, from this one on."""
+"""Each robot without self-collisions takes its own bit, from this one upwards."""
 SOLREF_AS_GIVEN = 1
-"""Newton's mode of a geom whose ``solref`` goes to MuJoCo as it is."""
+"""Newton's mode of a geom whose ``solref`` is passed to MuJoCo unchanged."""
 SOLIMP_DEFAULT = (0.9, 0.95, 0.001, 0.5, 2.0)
-"""MuJoCo's own ``solimp``; numbers that are not given are these."""
+"""MuJoCo's default ``solimp``, which fills in numbers that are not given."""
 
 Friction = float | tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Collision:
-    """How some geoms of a robot collide. It replaces what the file says of them.
+    """How some geoms of a robot collide. It overrides the robot's file.
 
-    Each argument but the patterns is one value for all geoms found, or values by pattern of geoms, of which the first that matches counts.
+    Each argument except the patterns is one value for all matching geoms, or values by geom pattern; the first matching pattern wins.
 
     Args:
-        geoms: Patterns of geoms.
-        contype: Bits that a geom has.
-        conaffinity: Bits of others that it collides with.
+        geoms: Geom-name patterns.
+        contype: MuJoCo's ``contype`` bits of the geom.
+        conaffinity: ``contype`` bits of the geoms that it collides with.
         condim: Directions in which a contact has a force: 1, 3 (sliding friction), 4 (torsional too) or 6 (rolling too).
         priority: The contact takes its parameters from the geom of the higher priority.
         friction: Sliding, torsional [m] and rolling [m] coefficients, or the first of them; None: as in the file.
         solref: Time constant [s] and damping ratio of contacts; None: as in the file.
         solimp: Impedance of contacts, up to five numbers; those left out are MuJoCo's own; None: as in the file.
-        only: Whether all other geoms of the robot collide with nothing.
+        only: Whether collisions are disabled for all other geoms of the robot.
     """
 
     geoms: str | Sequence[str]
@@ -75,13 +75,13 @@ def apply(
     collisions: Iterable[Collision],
     robot: str,
 ) -> None:
-    """Give a builder that holds one robot alone its masks and contact parameters.
+    """Apply masks and contact parameters to a builder that holds only one robot.
 
     Args:
         builder: Of one robot.
         names: Its geoms.
         shapes: The index of each geom among the builder's shapes.
-        collisions: Declarations, the later over the earlier.
+        collisions: Declarations; later ones override earlier ones.
         robot: Its name, for errors.
 
     Raises:
@@ -111,7 +111,7 @@ def apply(
 
 
 def mark(builder: newton.ModelBuilder) -> None:
-    """Give MuJoCo's default masks to the colliding shapes that have none, as those of URDF and USD files and of objects."""
+    """Give MuJoCo's default masks to colliding shapes without masks, such as those of URDF and USD files and of objects."""
     for shape, flags in enumerate(builder.shape_flags):
         if flags & newton.ShapeFlags.COLLIDE_SHAPES and masks(builder, shape) is None:
             _set_masks(builder, shape, 1, 1)
@@ -124,11 +124,11 @@ def masks(builder: newton.ModelBuilder, shape: int) -> tuple[int, int] | None:
 
 
 def without_self(builder: newton.ModelBuilder, world: newton.ModelBuilder) -> None:
-    """Let nothing of a builder's one robot touch itself, and everything else as before.
+    """Disable self-collisions of a builder's one robot; all other collisions stay enabled.
 
     Args:
         builder: Of one robot.
-        world: What there is beside it: its geoms collide with all of that, and with robots added later.
+        world: The rest of the world. The robot still collides with everything in it, and with robots added later.
     """
     taken = {int(mask) for mask in _values(world, "contype").values() if mask != UNSET}
     bit = next(1 << bit for bit in range(FIRST_OWN_BIT, 31) if not any(mask >> bit & 1 for mask in taken))
@@ -139,16 +139,16 @@ def without_self(builder: newton.ModelBuilder, world: newton.ModelBuilder) -> No
 
 
 def share(template: newton.ModelBuilder) -> bool:
-    """Let the masks of all that is in a world mean the same, so that Newton can hand them to MuJoCo as they are.
+    """Give the masks of all shapes in a world one meaning, so that Newton can pass them to MuJoCo unchanged.
 
-    It does so for shapes of one file only, and otherwise makes up masks from its own groups, which can't tell ``contype`` from
+    Newton does that only for shapes of one file. Otherwise it derives masks from its own groups, which can't distinguish ``contype`` from
     ``conaffinity``.
 
     Args:
-        template: Holds one world, and is not replicated yet.
+        template: Builder of one world, before replication.
 
     Returns:
-        Whether all of its colliding shapes have masks; a world some of whose shapes were added without is left as it is.
+        Whether all colliding shapes have masks. If some were added without masks, the world is left unchanged.
     """
     colliding = [shape for shape, flags in enumerate(template.shape_flags) if flags & newton.ShapeFlags.COLLIDE_SHAPES]
     if any(masks(template, shape) is None for shape in colliding):
@@ -158,7 +158,7 @@ def share(template: newton.ModelBuilder) -> bool:
 
 
 def share_ground(scene: newton.ModelBuilder) -> None:
-    """Give the ground that all worlds share masks that mean the same as theirs.
+    """Give the ground shared by all worlds masks with the same meaning as theirs.
 
     Args:
         scene: Replicates of a template for which :func:`share` was true, then the ground.
@@ -214,7 +214,7 @@ def _set_contact(builder: newton.ModelBuilder, shape: int, values: Mapping[str, 
 
 
 def _drop_stale_filters(builder: newton.ModelBuilder, before: Mapping[int, tuple[int, int] | None]) -> None:
-    """An importer turns the file's masks into pairs that don't touch; they end with those masks."""
+    """Remove the pair filters that an importer derived from the file's masks, since new masks replace those."""
     parents = {frozenset(pair) for pair in zip(builder.joint_parent, builder.joint_child, strict=True)}
     kept = []
     for first, second in builder.shape_collision_filter_pairs:

@@ -1,4 +1,4 @@
-"""What happens to a robot's inputs before each physics step: delays, and motors whose force is computed explicitly."""
+"""Processing of a robot's inputs before each physics step: delays, and motors whose force is computed explicitly."""
 
 from __future__ import annotations
 
@@ -61,16 +61,16 @@ class Drives:
 
     Forces come from ``newton.actuators``, which read MuJoCo's own coordinates, those of this physics step, and write the inputs of
     plain motors in MuJoCo. Delays are kept here: Newton's keeps one index for all worlds, so that worlds couldn't change places.
-    Gains, limits and delays are those of ``model.muster``, one a world and actuator: whoever writes them changes them from the next step
-    on, delays up to the greatest of those declared.
+    Gains, limits and delays are read from ``model.muster``, one per world and actuator. Changes there take effect at the next step;
+    delays may grow up to the longest declared one.
 
     Args:
-        model: Whose ``muster`` attributes came from :mod:`worker.simulation.actuators`.
+        model: A model with the ``muster`` attributes of :mod:`worker.simulation.actuators`.
         solver: Of the model; all actuators take their inputs directly.
         world_count: Number of worlds.
 
     Attributes:
-        controls: What a task writes, shape ``(worlds, actuators)``.
+        controls: Inputs written by a task, shape ``(worlds, actuators)``.
     """
 
     def __init__(self, model: newton.Model, solver: SolverMuJoCo, world_count: int) -> None:
@@ -115,7 +115,7 @@ class Drives:
         }
 
     def launch(self) -> None:
-        """Write MuJoCo's inputs for the physics step that comes next."""
+        """Write MuJoCo's inputs for the next physics step."""
         wp.launch(
             _deliver,
             dim=self.controls.shape,
@@ -143,7 +143,7 @@ class Drives:
         self._pushes.zero_()
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """What outlasts a control step: past inputs, shape ``(worlds, actuators, steps)``, and how many there are."""
+        """State kept between control steps: past inputs, shape ``(worlds, actuators, steps)``, and their number."""
         return {"inputs": wp.to_torch(self._history), "input_counts": wp.to_torch(self._pushes)}
 
 

@@ -20,51 +20,51 @@ RESET = wp.constant(1)
 ACTION_LIMIT = wp.constant(1.0)
 """Actions are clipped to plus and minus this."""
 NO_MISHAP = wp.constant(2**31 - 1)
-"""``EpisodeArrays.mishap`` where nothing happened."""
+"""Value of ``EpisodeArrays.mishap`` without a failure."""
 RETURN = wp.constant(0)
 STEPS = wp.constant(1)
 TERMS = wp.constant(2)
-"""Columns of ``EpisodeArrays.sums``: return, steps lived, then one column a reward term."""
+"""Columns of ``EpisodeArrays.sums``: return, steps lived, then one column per reward term."""
 TIME_OUT = wp.constant(0)
 PHYSICS_FAILED = wp.constant(1)
 TERMINATED = wp.constant(2)
-"""What ended an episode, in ``EpisodeArrays.causes``: the clock, physics that failed, or the task; of a declared task its first
-termination that did is ``TERMINATED + 1``, the second ``TERMINATED + 2``, …"""
+"""Cause of an episode's end, in ``EpisodeArrays.causes``: the clock, a physics failure, or the task. In a declared task the first
+termination is ``TERMINATED + 1``, the second ``TERMINATED + 2``, …"""
 WATCHED = 16
-"""Of so many worlds at most, the first ones, each reward term of a step is kept for those who look on."""
+"""Number of worlds, from the first, whose reward terms are kept every step for telemetry."""
 
 
 @wp.struct
 class EpisodeArrays:
-    """The buffers of a task, one row a world.
+    """The buffers of a task, one row per world.
 
     Attributes:
-        actions: What the policy asked for, shape ``(worlds, actions)``.
-        observations: What the policy sees next, shape ``(worlds, observations)``.
+        actions: The policy's actions, shape ``(worlds, actions)``.
+        observations: The policy's next observations, shape ``(worlds, observations)``.
         terminal_observations: The observation before the reset where ``dones``, else stale; same shape.
         rewards: Sum of the reward terms of the last step, shape ``(worlds,)``.
         dones: Whether the episode ended in the last step, shape ``(worlds,)``.
         time_outs: Whether it ended by the clock alone, shape ``(worlds,)``.
-        ages: Steps on the clock of the running episode, shape ``(worlds,)``.
-        sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
+        ages: Clock of the running episode [control steps], shape ``(worlds,)``.
+        sums: Return, steps lived and one sum per reward term of the running episode, shape ``(worlds, 2 + terms)``.
         random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
-        terms: Reward terms of the step, weighted, of the worlds that can be watched (:mod:`worker.telemetry`), which sets them to zero;
-            shape ``(min(WATCHED, worlds), terms)``.
+        terms: Weighted reward terms of the step in the first worlds, which :mod:`worker.telemetry` reads and sets to zero; shape
+            ``(min(WATCHED, worlds), terms)``.
         weights: Weight of each reward term, shape ``(terms,)``.
-        level: How hard the task is to be now, from 0 to 1, as the curriculum says (1 without one), shape ``(1,)``.
-        memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
-        lasting: What a task keeps of a world from episode to episode, shape ``(worlds, lasting_size)``.
+        level: Present difficulty from the curriculum, from 0 to 1 (1 without a curriculum), shape ``(1,)``.
+        memory: The task's own state between steps, zero when an episode begins, shape ``(worlds, memory_size)``.
+        lasting: The task's own state of each world across episodes, shape ``(worlds, lasting_size)``.
         last_actions: The actions of the step before while a declared task rewards, those that led here when it observes, 0 when an
             episode begins; shape ``(worlds, actions)``.
         earlier_actions: Those of one step earlier; shape ``(worlds, actions)``.
-        warm_start: Accelerations from which the constraint solver starts, those of the worlds, shape ``(worlds, dofs)``.
-        activations: State of the actuators that have one, that of the worlds, shape ``(worlds, activations)``.
-        broken: Where the last observation was not finite, one more than the first such column, else 0; shape ``(worlds,)``.
+        warm_start: Accelerations of the worlds from which the constraint solver starts, shape ``(worlds, dofs)``.
+        activations: State of the worlds' stateful actuators, shape ``(worlds, activations)``.
+        broken: First column of the last observation that was not finite, plus 1; 0 where all were finite; shape ``(worlds,)``.
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
         last_sums: The ``sums`` of the world's last episode that ended, shape ``(worlds, 2 + terms)``.
-        causes: By what it ended, see :data:`TERMINATED`; shape ``(worlds,)``.
-        successes: Of a declared task that says what a success is: whether the last step was one, shape ``(worlds,)``.
+        causes: Why that episode ended, see :data:`TERMINATED`; shape ``(worlds,)``.
+        successes: Whether the last step was a success, if a declared task defines success; shape ``(worlds,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
             a reward term and metric, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns, of a
             declared task the ends by each termination and by the clock; shape ``(6 + terms,)`` or more.

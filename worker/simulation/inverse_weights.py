@@ -1,4 +1,4 @@
-"""What MuJoCo derives from masses and armatures, recomputed for some worlds in one launch.
+"""Constants that MuJoCo derives from masses and armatures, recomputed for selected worlds.
 
 MuJoCo scales the softness of contacts, joint limits and dry friction by ``dof_invweight0`` and ``body_invweight0``: mean diagonals of
 ``J M^-1 J^T`` in the model's reference pose. mujoco_warp's ``set_const`` finds them with a solve of the whole mass matrix for each
@@ -6,7 +6,7 @@ degree of freedom and six for each body, in all worlds: about 700 launches for a
 through the tree twice, as in the articulated-body algorithm (R. Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 7), and only
 worlds whose bodies changed do: two launches, whose cost grows with the number of such worlds.
 
-The pose is the same in all worlds, so that joint axes and body frames are constants.
+The pose is the same in all worlds, so joint axes and body frames are constants.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Tree:
 
 @wp.struct
 class Inertials:
-    """The inertial fields of mujoco_warp's model and what is derived from them, each with leading dimension worlds."""
+    """The inertial fields of mujoco_warp's model and the constants derived from them, each with leading dimension worlds."""
 
     masses: wp.array2d(dtype=wp.float32)
     centers: wp.array2d(dtype=wp.vec3)
@@ -66,7 +66,7 @@ class Inertials:
 
 @wp.struct
 class Scratch:
-    """Room for one pass through the tree, leading dimension worlds."""
+    """Scratch memory for one pass through the tree, leading dimension worlds."""
 
     matrices: wp.array2d(dtype=wp.spatial_matrix)
     forces: wp.array2d(dtype=wp.spatial_vector)
@@ -176,13 +176,13 @@ def _weigh(changed: wp.array(dtype=wp.bool), tree: Tree, scratch: Scratch, inert
 
 
 class InverseWeights:
-    """Keeps what is derived from masses and armatures in step with them.
+    """Keeps constants derived from masses and armatures up to date.
 
-    Models with tendons or muscles need constants that are not computed here: for them Newton recomputes everything in all worlds, about
-    three launches for each degree of freedom and eighteen for each body.
+    Models with tendons or muscles need further constants. For them Newton recomputes everything in all worlds, with about three launches
+    per degree of freedom and eighteen per body.
 
     Args:
-        worlds: Their model is changed in place; construct this before a capture.
+        worlds: The worlds, whose model is changed in place. Construct this before a capture.
 
     Attributes:
         whole: Whether Newton recomputes everything.
@@ -192,7 +192,7 @@ class InverseWeights:
         self._worlds = worlds
         model, solver = worlds.solver.mj_model, worlds.solver
         muscles = (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE).any()
-        # a kinematic root weighs as if it were locked, which Newton sees to
+        # Newton treats a kinematic root as locked
         self.whole = bool(model.ntendon or muscles or getattr(solver, "_kinematic_weld_eq", None) is not None)
         if self.whole:
             return

@@ -2,7 +2,7 @@
 
 Quaternions are xyzw and turn a body's frame to the world's. A body has two linear velocities: that of its centre of mass, which
 Newton keeps (``joint_qd`` of a free joint, ``body_qd``), and that of its frame's origin, which MuJoCo, mjlab and Isaac Lab call the
-velocity of the link. They differ by the angular velocity times the way between both points, and every name here says which it is.
+velocity of the link. They differ by the angular velocity times the offset between both points, and every name here says which one it means.
 """
 
 from __future__ import annotations

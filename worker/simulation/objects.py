@@ -16,10 +16,10 @@ from worker.simulation.robot import UPRIGHT, check_name
 
 @dataclass(frozen=True)
 class Object:
-    """What all objects have; each is one body with one geom, both called by its name.
+    """Arguments common to all objects. Each is one body with one geom, and both bear its name.
 
     Args:
-        name: What it is called in its world.
+        name: Its name in the world.
         mass: [kg].
         position: Of its centre at the start [m].
         rotation: At the start (quaternion xyzw).

@@ -1,4 +1,4 @@
-"""Names of joints, bodies, sites and geoms by pattern, as declarations of tasks give them."""
+"""Patterns of joint, body, site and geom names in task declarations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list
     Args:
         names: All names, in the order of the model.
         patterns: One pattern or several, as of file names (``*``, ``?``, ``[ab]``); a whole name matches itself.
-        what: What the names are, and of what, for the error: ``"joint of robot"``.
+        what: Kind and owner of the names, for the error: ``"joint of robot"``.
 
     Returns:
         Indices into ``names``, ascending.
@@ -38,7 +38,7 @@ def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list
 
 
 def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str) -> list[Value | None]:
-    """A value for each name; of the patterns that match a name, the first counts.
+    """A value for each name; the first pattern that matches a name wins.
 
     Args:
         names: All names, in the order of the model.
@@ -46,7 +46,7 @@ def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str
         what: As for :func:`find`.
 
     Returns:
-        One value a name, None where no pattern matches.
+        One value per name, None where no pattern matches.
 
     Raises:
         ValueError: A pattern matches nothing.

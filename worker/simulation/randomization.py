@@ -1,7 +1,7 @@
-"""Domain randomisation: physics that differs from world to world, pushes, noise and late actions, for any task.
+"""Domain randomisation for any task: physics that differs between worlds, pushes, noise and delayed actions.
 
-What a world is like is drawn once, from the seed and the world's global index alone. What happens to it comes from its own
-random stream, so that a run goes on bit for bit and its worlds are the same on any number of ranks.
+Each world's properties are drawn once, from only the seed and the world's global index. Later events come from its own random stream, so
+a run resumes bit for bit and its worlds are the same on any number of ranks.
 """
 
 from __future__ import annotations
@@ -89,21 +89,21 @@ def _add_noise(mode: int, deviations: wp.array(dtype=wp.float32), episodes: Epis
 
 
 class Randomizer:
-    """What makes the worlds of one task differ. Everything that is off costs nothing and draws no random numbers.
+    """Differences between the worlds of one task. Disabled features cost nothing and draw no random numbers.
 
     Args:
-        config: What is on, and how much.
-        worlds: The task's worlds; their model is changed here, so this must come before a capture.
+        config: Enabled features and their magnitudes.
+        worlds: The task's worlds. The constructor changes their model, so it must run before a capture.
         episodes: The task's buffers; ``random`` holds seed and global indices already.
         control_hz: Control steps per simulated second [Hz].
         noise: Standard deviation of the noise on each observation, as the policy sees it.
 
     Raises:
-        ValueError: Pushes are on and the first body of the worlds is not free to move.
+        ValueError: Pushes are enabled and the first body of the worlds has no free joint.
 
     Attributes:
-        factors: Factors on the physics of each world, columns as in :data:`FACTORS`, shape ``(worlds, 5)``, float32; 1
-            where the configuration leaves it.
+        factors: Factors on the physics of each world, columns as in :data:`FACTORS`, shape ``(worlds, 5)``, float32; 1 where not
+            randomised.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Randomizer:
         self._config, self._worlds, self._episodes = config, worlds, episodes
         self._device = worlds.model.device
         if config.push_velocity and worlds.model.joint_type.numpy()[0] != int(newton.JointType.FREE):
-            raise ValueError("randomize.push_velocity: the robot is fixed to the world, so that it can't be pushed")
+            raise ValueError("randomize.push_velocity: the robot is fixed to the world, so it can't be pushed")
         self._push_probability = min(1.0, 1.0 / (config.push_interval * control_hz)) if config.push_interval else 0.0
         count, actuators = worlds.arrays.controls.shape
         self._delays = wp.zeros(count, dtype=wp.int32, device=self._device)
@@ -138,31 +138,31 @@ class Randomizer:
 
     @property
     def has_noise(self) -> bool:
-        """Whether anything that the policy sees is blurred."""
+        """Whether any observation of the policy has noise."""
         return self._noise is not None
 
     def push(self) -> None:
-        """Before a control step: push some worlds."""
+        """Before a control step: apply pushes to some worlds."""
         if self._push_probability:
             inputs = [self._push_probability, self._config.push_velocity, self._worlds.arrays, self._episodes]
             wp.launch(_push, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def delay(self) -> None:
-        """After ``act``: hold the controls back."""
+        """After ``act``: delay the controls."""
         if self._config.action_latency:
             inputs = [self._config.action_latency, self._worlds.arrays, self._episodes, self._delays, self._history]
             wp.launch(_delay, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def add_noise(self, mode: int) -> None:
-        """After ``observe`` in ``mode``: blur what the policy sees."""
+        """After ``observe`` in ``mode``: add noise to the policy's observations."""
         if self._noise is not None:
             inputs = [mode, self._noise, self._episodes]
             wp.launch(_add_noise, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Live views of what outlasts a control step, each with leading dimension ``worlds``.
+        """Live views of the state kept between control steps, each with leading dimension ``worlds``.
 
-        ``world_factors`` is there to be compared: the model was changed already, before it was captured.
+        ``world_factors`` serves for comparison only: the model was changed before it was captured.
         """
         tensors = {"world_factors": self.factors} if self._drawn else {}
         if self._config.action_latency:
@@ -178,7 +178,7 @@ class Randomizer:
             rows.mul_(factor[:, None])
 
         def tell(changed: newton.ModelFlags) -> None:
-            # Torch wrote, the solver reads: on whatever streams they do so, one must be done before the other begins.
+            # Torch wrote, and the solver reads, perhaps on another stream: synchronise.
             wp.synchronize_device(self._device)
             solver.notify_model_changed(changed)
             wp.synchronize_device(self._device)
@@ -193,11 +193,11 @@ class Randomizer:
             scale(model.joint_damping, drawn["damping"])
             tell(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
         if "gravity" in drawn:
-            # the last row is that of what belongs to no world
+            # the last row belongs to no world
             scale(model.gravity[: self._worlds.world_count], drawn["gravity"])
             tell(newton.ModelFlags.MODEL_PROPERTIES)
-        # Newton has one ground for all worlds, the solver one for each. Of two surfaces in contact the greater friction
-        # counts, so that the ground has to be as slippery as the feet.
+        # Newton has one ground for all worlds, the solver one per world. The greater friction of two touching surfaces wins, so the
+        # ground must be as slippery as the feet.
         if "friction" in drawn:
             scale(solver.mjw_model.geom_friction, drawn["friction"])
         # A motor's force is gain x control, a servo's gain x target plus bias x (1, angle, velocity).

@@ -1,4 +1,4 @@
-"""Kernels that draw what differs between worlds, and that write it into the model."""
+"""Kernels that draw the differences between worlds and write them into the model."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ SCALE, ADD, SET = 0, 1, 2
 UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2
 """Distributions, in the order of :data:`worker.tasks.randomize.DISTRIBUTIONS`."""
 STARTUP, RESET, INTERVAL = 0, 1, 2
-"""When an entry is drawn, in the order of :data:`worker.tasks.randomize.MOMENTS`."""
+"""Times at which an entry is drawn, in the order of :data:`worker.tasks.randomize.MOMENTS`."""
 MASS, CENTER, INERTIA, PAYLOAD = 0, 1, 2, 3
-"""What a change of a body changes."""
+"""Properties of a body that a change can affect."""
 
 FIRST_STREAM = wp.constant(-200)
-"""Number of the stream from which a world's first entry is drawn at the beginning; the next has one less."""
+"""Number of the stream from which a world's first entry is drawn at startup; each further entry uses the next lower number."""
 LEAST_MASS = wp.constant(0.01)
-"""A body keeps at least this part of its mass, whatever is drawn."""
+"""Least fraction of its mass that a body keeps, whatever is drawn."""
 
 _SCALE, _ADD = wp.constant(SCALE), wp.constant(ADD)
 _LOG_UNIFORM, _NORMAL = wp.constant(LOG_UNIFORM), wp.constant(NORMAL)
@@ -30,12 +30,12 @@ _MASS, _CENTER, _INERTIA = wp.constant(MASS), wp.constant(CENTER), wp.constant(I
 
 @wp.struct
 class Entries:
-    """What is drawn, one row an entry; the drawn numbers of an entry are neighbouring columns of the draws.
+    """Table of draws, one row per entry. The numbers drawn for an entry are adjacent columns of the draws.
 
     Attributes:
         first_columns: First column of an entry's draws, shape ``(entries,)``.
-        counts: How many there are, shape ``(entries,)``.
-        axes: After how many columns its ranges repeat, shape ``(entries,)``.
+        counts: Number of these columns, shape ``(entries,)``.
+        axes: Number of columns after which its ranges repeat, shape ``(entries,)``.
         first_ranges: Its first row in ``ranges``, shape ``(entries,)``.
         distributions: See :data:`UNIFORM`, shape ``(entries,)``.
         moments: See :data:`STARTUP`, shape ``(entries,)``.
@@ -57,7 +57,7 @@ class Entries:
 
 @wp.struct
 class Changes:
-    """How draws change numbers of the model: those of number ``i`` are the changes ``starts[i]`` to ``starts[i + 1]``, in order.
+    """How draws change numbers of the model. Changes ``starts[i]`` to ``starts[i + 1]`` apply to number ``i``, in order.
 
     Attributes:
         columns: Column of each number in its array, or body, shape ``(numbers,)``.
@@ -66,10 +66,10 @@ class Changes:
         starts: First change of each number, shape ``(numbers + 1,)``.
         operations: See :data:`SCALE`, shape ``(changes,)``.
         draws: Column of the draws, shape ``(changes,)``.
-        factors: Of the draw, where it is added or set, shape ``(changes,)``.
-        kinds: Of a body: see :data:`MASS`, shape ``(changes,)``.
-        axes: Of a body: 0, 1, 2, or -1 for all of it, shape ``(changes,)``.
-        points: Of a body: where a payload is, in its frame [m], shape ``(changes,)``.
+        factors: Factor of the draw, where it is added or set, shape ``(changes,)``.
+        kinds: Property of a body, see :data:`MASS`, shape ``(changes,)``.
+        axes: Axis of a body's property: 0, 1, 2, or -1 for all, shape ``(changes,)``.
+        points: Position of a payload in the body's frame [m], shape ``(changes,)``.
     """
 
     columns: wp.array(dtype=wp.int32)
@@ -95,8 +95,8 @@ class Bodies:
 
 @wp.struct
 class BodyFields:
-    """Where a body's inertial properties are kept: by Newton, shape ``(worlds, bodies)``, and by mujoco_warp, which has the world as
-    body 0 and an order of its own, shape ``(worlds, 1 + bodies)``."""
+    """Arrays of the bodies' inertial properties: Newton's, shape ``(worlds, bodies)``, and mujoco_warp's, with the world as body 0 and in
+    its own order, shape ``(worlds, 1 + bodies)``."""
 
     columns: wp.array(dtype=wp.int32)
     inverse_masses: wp.array2d(dtype=wp.float32)

@@ -1,4 +1,4 @@
-"""Where in the model the randomised quantities are: from names and patterns to columns of arrays."""
+"""Look-up of randomised quantities in the model: from names and patterns to columns of arrays."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ _FIELDS = {
 }
 _BODY_KINDS = {"mass": MASS, "center_of_mass": CENTER, "inertia": INERTIA, "payload": PAYLOAD}
 LEAST_FRICTION = 1e-5
-"""MuJoCo takes no coefficient of friction for less."""
+"""Least coefficient of friction in MuJoCo, which raises smaller ones to this."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What the number ``element`` x ``axis`` that an entry draws changes.
+    """Target of one number, ``element`` x ``axis``, that an entry draws.
 
     Args:
         array: Name of the array: a field of mujoco_warp's model, ``opt.gravity``, Newton's ``gravity``, ``muster.NAME`` of explicit
             motors, ``bias ROBOT``, or ``bodies``.
         column: Column in a world's row of numbers, or body (Newton's).
-        element: Which of the matched parts.
-        axis: Which of the entry's axes.
-        factor: Of the drawn number where it is added or set.
+        element: Index of the matched part.
+        axis: Index of the entry's axis.
+        factor: Factor of the drawn number where it is added or set.
         least: Least value of the number.
         greatest: Greatest value of the number.
-        kind: Of a body, what changes.
-        body_axis: Of a body: 0, 1, 2, or -1 for all of it.
+        kind: Property of a body that changes.
+        body_axis: Axis of that property: 0, 1, 2, or -1 for all.
     """
 
     array: str
@@ -60,14 +60,14 @@ class Change:
 
 @dataclass(frozen=True)
 class Target:
-    """What one entry changes. ``names`` are its parts; ``changes`` are in their order."""
+    """Targets of one entry: ``names`` of its parts, and ``changes`` in the same order."""
 
     names: tuple[str, ...]
     changes: tuple[Change, ...]
 
 
 def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]) -> Target:
-    """Look up what an entry changes.
+    """Look up the targets of an entry.
 
     Args:
         entry: The declaration.
@@ -75,7 +75,7 @@ def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]
         views: Robots and objects by name.
 
     Raises:
-        ValueError: There is no such robot, a pattern matches nothing, or a part has nothing of the kind.
+        ValueError: The robot is unknown, a pattern matches nothing, or a part has no such property.
     """
     if entry.what == "gravity":
         axes = [entry.quantity.axes.index(axis) for axis in entry.drawn_axes]
@@ -110,12 +110,12 @@ def _shapes_of_a_world(worlds: Worlds) -> list[int]:
 
 
 def _columns(newton_indices: np.ndarray, first: int = 0) -> dict[int, int]:
-    """From an index of Newton's in world 0 to the column in mujoco_warp's arrays."""
+    """Map Newton's index in world 0 to the column in mujoco_warp's arrays."""
     return {int(index): column for column, index in enumerate(newton_indices) if index >= first}
 
 
 def body_column(worlds: Worlds, body: int) -> int:
-    """Column in mujoco_warp's arrays of a body of Newton's."""
+    """Column of Newton's body in mujoco_warp's arrays."""
     return _columns(worlds.solver.mjc_body_to_newton.numpy()[0])[body]
 
 
@@ -139,9 +139,7 @@ def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]
     axes = [entry.quantity.axes.index(axis) for axis in entry.drawn_axes]
     there = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
     if not there:
-        raise ValueError(
-            f"geoms {', '.join(names)} touch nothing, so that they have no friction; choose geoms that collide"
-        )
+        raise ValueError(f"geoms {', '.join(names)} touch nothing, so they have no friction; choose geoms that collide")
     changes = (
         Change("geom_friction", 3 * geom + axis, element, number, least=LEAST_FRICTION)
         for element, (_, geom) in enumerate(there)
@@ -186,13 +184,13 @@ def _actuators(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[i
         changes += own
         if (
             not own or entry.what == "effort_limit"
-        ):  # such a motor's force is limited where it is computed and where it acts
+        ):  # the force of such a motor is limited both when it is computed and when it acts
             changes += _of_actuator(entry.what, worlds, columns[source], element, where)
     return Target(names, tuple(changes))
 
 
 def _of_explicit_motor(what: str, worlds: Worlds, source: int, element: int) -> list[Change]:
-    """The numbers of a motor that is computed before each physics step; none: it is one of MuJoCo's, or it has no such number."""
+    """The numbers of an explicit motor; empty for MuJoCo's own actuators, or where the motor has no such number."""
     motors: Any = getattr(worlds.model, "muster", None)
     if motors is None or what == "motor_strength" or not motors.explicit.numpy()[source]:
         return []
@@ -231,7 +229,7 @@ def _of_actuator(what: str, worlds: Worlds, actuator: int, element: int, where: 
 
 
 def _effort_limits(model: mujoco.MjModel, actuator: int, element: int, where: str) -> list[Change]:
-    """Of the actuator, and of the joint on what its actuators do to it, whichever there is."""
+    """Force limits of the actuator and of the joint, whichever exist."""
     changes = []
     if model.actuator_forcelimited[actuator]:
         gear = abs(float(model.actuator_gear[actuator, 0])) or 1.0

@@ -1,6 +1,6 @@
-"""Declared quantities of the model, drawn for each world at the beginning, at resets and at intervals.
+"""Declared quantities of the model, drawn for each world at startup, at resets and at intervals.
 
-What is drawn is state; what the model holds follows from it and from the model's own values, so that nothing compounds and a run goes on
+The draws are state. The model's values are computed from them and from its original values, so changes never compound and a run resumes
 from its state bit for bit.
 """
 
@@ -36,7 +36,7 @@ from worker.tasks.randomize import DISTRIBUTIONS, MOMENTS, OPERATIONS, Randomize
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A change, and where its number is drawn."""
+    """A change and the column of its draw."""
 
     change: Change
     entry: Randomize
@@ -44,10 +44,10 @@ class _Drawn:
 
 
 class Randomizations:
-    """All declared randomisations of a task: launches only, on arrays that stay where they are.
+    """All declared randomisations of a task: launches only, on arrays with fixed addresses.
 
-    Construct it when the model holds its own values (after a ``Randomizer``, whose factors then count as the model's own) and before a
-    capture. It draws and applies every entry at once: what a reset or an interval draws later has a value from the beginning on.
+    Construct it while the model holds its original values (after a ``Randomizer``, whose factors count as original) and before a capture.
+    It draws and applies every entry at once, so entries of resets and intervals have a value from the start.
 
     Of a step, :meth:`settle` costs one launch for the draws, one for each array that entries of resets and intervals change, and
     three where bodies or armatures are among them; threads of worlds in which nothing is due end at once.
@@ -55,17 +55,17 @@ class Randomizations:
     Args:
         entries: Declarations by name. Their order is that in which they are applied, and keys their random numbers: an entry
             added at the end leaves the others' as they were.
-        worlds: The task's worlds; their model is changed here.
+        worlds: The task's worlds, whose model is changed.
         episodes: The task's buffers; ``random`` holds seed and global indices already.
         views: Robots and objects by name.
         robots: Their arrays by name, for the encoders' bias.
         control_hz: Control steps per simulated second [Hz].
 
     Raises:
-        ValueError: An entry names a robot that is not there, a pattern without a match, or a part that has nothing of the kind.
+        ValueError: An entry names an unknown robot, a pattern without a match, or a part without such a property.
 
     Attributes:
-        names: Of what each column of the draws is, as ``entry/part/axis``; of a shared draw ``entry/axis``.
+        names: Name of each column of the draws, as ``entry/part/axis``, or ``entry/axis`` of a shared draw.
         draws: The drawn numbers, shape ``(worlds, len(names))``, float32.
     """
 
@@ -99,7 +99,7 @@ class Randomizations:
         self.restart()
 
     def restart(self) -> None:
-        """Draw everything as at the beginning of the worlds' lives, and apply it; where ``episodes.random`` was seeded afresh."""
+        """Draw every entry as at startup and apply it, after ``episodes.random`` was reseeded."""
         if not self._entries:
             return
         shape = (self._worlds.world_count, len(self._entries))
@@ -108,10 +108,10 @@ class Randomizations:
         self.apply()
 
     def settle(self) -> None:
-        """At the end of every control step, and of a reset, after worlds were placed: draw what is due, and apply it.
+        """Draw and apply all due entries, at the end of every control step and of a reset, after worlds were placed.
 
-        Due are the entries of a reset in worlds with ``episodes.ages[world] == 0``, and the intervals that are over; a new episode begins
-        its intervals afresh.
+        Reset entries are due in worlds with ``episodes.ages[world] == 0``, and interval entries when their interval ends. A new episode
+        restarts the intervals.
         """
         if not self._is_live:
             return
@@ -120,14 +120,14 @@ class Randomizations:
         self._write(self._changed, live=True)
 
     def apply(self) -> None:
-        """Bring the whole model in line with the draws: after :meth:`state_tensors` were filled from a saved state."""
+        """Recompute the whole model from the draws, after :meth:`state_tensors` were filled from a saved state."""
         self._write(self._all, live=False)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Live views of what outlasts a control step, each with leading dimension worlds. Whoever fills them calls :meth:`apply`.
+        """Live views of the state kept between control steps, each with leading dimension worlds. Call :meth:`apply` after filling them.
 
         ``randomization_draws`` are the drawn numbers, float32; ``randomization_countdowns`` the control steps until each interval ends,
-        int32, one column an entry.
+        int32, one column per entry.
         """
         if not self._entries:
             return {}
@@ -137,7 +137,7 @@ class Randomizations:
         }
 
     def numbers(self) -> dict[str, torch.Tensor]:
-        """Live views of the ranges by place, which a curriculum may change; they count from the next draw on, unchecked.
+        """Live views of the ranges by path, which a curriculum may change. They apply, unchecked, from the next draw on.
 
         Returns:
             ``<entry>.range``, shape ``(axes, 2)``, or, of a range declared by axis, ``<entry>.range.<axis>``, shape ``(2,)``; and of an
@@ -204,7 +204,7 @@ class Randomizations:
         ]
 
     def _write(self, changed: wp.array, live: bool) -> None:
-        """Write the model's numbers of the worlds with ``changed``; with ``live``, those that can have changed since the beginning."""
+        """Write the model's numbers in the worlds with ``changed``; with ``live``, only the numbers that can change after startup."""
         if self._bodies and (self._bodies.is_live or not live):
             self._bodies.launch(changed, self._draws)
         written = [array for array in self._arrays if array.is_live or not live]
@@ -271,7 +271,7 @@ class _BodyChanges:
 
 
 def _is_live(entry: Randomize) -> bool:
-    """Whether it is drawn again after the beginning."""
+    """Whether it is drawn again after startup."""
     return MOMENTS.index(entry.when) != STARTUP
 
 
@@ -280,7 +280,7 @@ def _pairs(values: Iterable[tuple[float, float]], device: wp.Device) -> wp.array
 
 
 def _table(drawn: list[_Drawn], device: wp.Device) -> tuple[Changes, list[int]]:
-    """The changes as a kernel reads them, and the columns that they change, ascending."""
+    """The changes in the layout of a kernel, and the changed columns, ascending."""
     columns = sorted({each.change.column for each in drawn})
     of_column: dict[int, list[_Drawn]] = {column: [] for column in columns}
     for each in drawn:
@@ -310,7 +310,7 @@ def _array(name: str, worlds: Worlds, robots: Mapping[str, RobotArrays]) -> wp.a
     if name.startswith("bias "):
         return robots[name.removeprefix("bias ")].encoder_bias
     if name == "gravity":
-        source = worlds.model.gravity[: worlds.world_count]  # the last row is that of what belongs to no world
+        source = worlds.model.gravity[: worlds.world_count]  # the last row belongs to no world
     elif name == "opt.gravity":
         source = model.opt.gravity
     elif name.startswith("muster."):

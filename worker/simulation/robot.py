@@ -1,4 +1,4 @@
-"""A robot of a scene: its file, its pose at the start, what moves it and what it touches."""
+"""A robot of a scene: its file, initial pose, actuators and collisions."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 class Robot:
     """A robot from an MJCF, URDF or USD file.
 
-    Patterns are like those of file names (``*``, ``?``, ``[ab]``); of several that match a name, the first counts. Names are those of
-    the file, with underscores for what USD does not allow in names, such as dashes.
+    Patterns work like those of file names (``*``, ``?``, ``[ab]``); the first pattern that matches a name wins. Names are those in the
+    file, with underscores for characters that USD does not allow, such as dashes.
 
     Args:
         file: A path, ``"package:NAME/path"`` (a file inside an installed Python package), ``"newton:NAME"`` (one of Newton's assets), or
             the text of an MJCF or URDF file.
-        name: What it is called in its world; labels in the model begin with it.
+        name: Its name in the world; labels in the model begin with it.
         position: Of its root at the start [m]; None: as in the file.
         rotation: Of its root at the start (quaternion xyzw); None: as in the file, or upright where a position is given.
-        joint_positions: Positions of its joints at the start [rad, m], by pattern; the others' are as in the file.
-        actuators: What moves it; they replace those of the file, which are kept where none are given.
+        joint_positions: Initial joint positions [rad, m], by pattern; other joints start as in the file.
+        actuators: Actuators that replace those of the file; without any, the file's are kept.
         fixed: Whether its root is fixed to the world; None: as in the file.
         self_collisions: Whether its own geoms may touch each other; None: as in the file and in ``collisions``.
-        collisions: How its geoms collide; geoms that they don't match, and all without them, as in the file.
-        armature: Inertia of rotors, seen from the joint [kg m^2, kg], by pattern or for all joints; None: as in the file.
+        collisions: How its geoms collide; geoms without a match collide as in the file.
+        armature: Inertia of rotors, reflected to the joint [kg m^2, kg], by pattern or for all joints; None: as in the file.
         friction_loss: Dry friction of joints [N m, N]; None: as in the file.
         viscous_damping: Damping of joints [N m s/rad, N s/m]; None: as in the file.
-        ignore: Patterns of bodies and geoms of the file that are left out, such as its own floor (MJCF and USD).
-        passive: Whether it may have joints without any actuator, as a door has.
-        visuals: Whether geoms that are only seen are read, as cameras and pictures need them (they are always read from URDF).
-        file_options: Whether solver options of an MJCF or USD file count where the task says nothing; those of the robot added last win.
+        ignore: Patterns of bodies and geoms to leave out, such as the file's own floor (MJCF and USD).
+        passive: Whether it may have no actuators at all, like a door.
+        visuals: Whether visual-only geoms are read, which cameras and pictures need (from URDF they always are).
+        file_options: Whether solver options of an MJCF or USD file apply where the task sets none; the last robot added wins.
     """
 
     file: str | Path
@@ -162,7 +162,7 @@ class Robot:
             )
 
     def _place(self, own: newton.ModelBuilder, view: RobotView) -> None:
-        """Move the root, and what of the file is fixed to the world beside a fixed root."""
+        """Move the root, and with a fixed root everything in the file that is fixed to the world."""
         if self.position is None and self.rotation is None:
             return
         position = wp.vec3(*(self.position or tuple(view.start.p)))
@@ -187,7 +187,7 @@ def check_word(name: str) -> None:
 
 
 def check_name(builder: newton.ModelBuilder, name: str) -> None:
-    """Refuse a name that something in the world already has, or that can't begin a label."""
+    """Refuse a name that is already taken in the world or can't begin a label."""
     check_word(name)
     if any(label.startswith(f"{name}/") for label in builder.body_label):
         raise ValueError(f"two things in the world are called {name!r}; give one of them another name")

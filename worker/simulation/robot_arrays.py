@@ -1,4 +1,4 @@
-"""What terms of a task read of a robot: where its joints are in the arrays of a world, and the poses of bodies."""
+"""Robot data for terms of a task: columns of its joints in the arrays of a world, and poses of bodies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RobotArrays:
-    """Where a robot is in the rows of a world, and what its model says of it. Joints are those of one degree of freedom.
+    """Columns of a robot in the rows of a world, and constants of its model. Joints are those of one degree of freedom.
 
     Attributes:
         root_coordinate: First column of its free root in ``WorldArrays.joint_q`` (position, quaternion xyzw); -1: it is fixed.
@@ -21,9 +21,9 @@ class RobotArrays:
         defaults: Default position of each joint [m, rad], shape ``(joints,)``.
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none, shape ``(joints,)``.
         efforts: Greatest force or torque of each joint's actuator [N, N m], infinite where it is not limited, shape ``(joints,)``.
-        gains: Force or torque on each joint for one unit of its actuator's input, gear times gain [N, N m], shape ``(joints,)``; 1 where
-            it has no actuator.
-        encoder_bias: What the encoders add to each joint's position [m, rad], shape ``(worlds, joints)``.
+        gains: Force or torque on each joint per unit of its actuator's input, gear times gain [N, N m], shape ``(joints,)``; 1 without an
+            actuator.
+        encoder_bias: Offset of each joint's encoder [m, rad], shape ``(worlds, joints)``.
         start: Pose of the root at the start of an episode, in the world frame.
     """
 

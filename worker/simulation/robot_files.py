@@ -1,4 +1,4 @@
-"""Robot files: where they are, which format they have, and what is missing before an importer reads them."""
+"""Robot files: location, format, and checks for missing parts before an importer reads them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import newton.examples
 from shared_store.wording import nearest
 
 FORMATS = {".xml": "", ".mjcf": "mjcf", ".urdf": "urdf", ".usd": "usd", ".usda": "usd", ".usdc": "usd", ".usdz": "usd"}
-"""Format of a file by its ending; an ``.xml`` says it in its first element."""
+"""Format of a file by its ending, or of an ``.xml`` file by its first element."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class RobotFile:
     Attributes:
         source: Path, or the XML itself.
         format: ``"mjcf"``, ``"urdf"`` or ``"usd"``.
-        hinges: Names of the joints between one body and its parent, where MJCF has several: Newton makes one joint of them.
-            By the name that Newton gives to that joint, in the order of its degrees of freedom.
+        hinges: Names of several MJCF joints between one body and its parent, which Newton merges into one joint: by the name of that
+            joint, in the order of its degrees of freedom.
     """
 
     source: str
@@ -36,7 +36,7 @@ class RobotFile:
 
 
 def read(file: str | Path) -> RobotFile:
-    """Find a robot's file and look into it.
+    """Find and inspect a robot's file.
 
     Args:
         file: A path; ``"package:NAME/path"``, a file inside an installed Python package, which is not imported;
@@ -142,7 +142,7 @@ def _parse_mjcf(source: str, shown: str) -> Any:
 
 
 def _check_mjcf_assets(spec: Any, shown: str) -> None:
-    """Newton leaves out a mesh that it can't find; its robot would be another one."""
+    """Refuse missing meshes: Newton would leave them out and build a different robot."""
     folders = [(spec.meshdir, mesh.file) for mesh in spec.meshes]
     folders += [(spec.meshdir, field.file) for field in spec.hfields]
     for folder, name in folders:
@@ -151,7 +151,7 @@ def _check_mjcf_assets(spec: Any, shown: str) -> None:
 
 
 def _check_urdf_meshes(source: str, shown: str) -> None:
-    """Newton warns of a mesh that it can't find, and goes on without it."""
+    """Refuse missing meshes: Newton would only warn and continue without them."""
     is_text = source.lstrip().startswith("<")
     root = _root(source if is_text else _text_of(Path(source), shown), shown)
     folder = Path(source).resolve().parent if not is_text else Path()
@@ -159,7 +159,7 @@ def _check_urdf_meshes(source: str, shown: str) -> None:
         name = mesh.get("filename", "")
         if is_text:
             raise ValueError(
-                f"{shown}: it names the mesh {name}, whose place is known of a file alone; give the path of the URDF file"
+                f"{shown}: its mesh {name} can only be found relative to a URDF file; give the path of that file"
             )
         scheme, is_uri, inside = name.partition("://")
         place = folder / name.removeprefix("file://")
@@ -182,7 +182,7 @@ def _refuse_mesh(shown: str, name: str, folder: Path) -> None:
 
 
 def _hinges(spec: Any) -> dict[str, list[str]]:
-    """Newton's joint holds slides first, then hinges, and is called by all their names."""
+    """Names of merged joints: Newton's joint has slides first, then hinges, and its name joins all their names."""
     hinges = {}
     one_dof = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
     for body in spec.bodies:

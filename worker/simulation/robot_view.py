@@ -1,4 +1,4 @@
-"""What of a world belongs to one robot or object: its joints, bodies, sites and geoms by name, and their columns."""
+"""The joints, bodies, sites and geoms of one robot or object, by name, and their columns in the arrays of a world."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import Worlds
 
 UNLIMITED_EFFORT = 1e6
-"""From this on an effort limit of Newton's builder means that there is none (its default) [N, N m]."""
+"""Effort limits of Newton's builder from this value on (its default) mean no limit [N, N m]."""
 
 Patterns = str | Iterable[str]
 
@@ -25,11 +25,11 @@ Patterns = str | Iterable[str]
 class RobotView:
     """A robot or object in a builder of one world, before it is replicated.
 
-    Labels of what belongs to it begin with its name and a slash, as ``Robot.add_to`` and the objects' ``add_to`` make them.
+    Labels of its parts begin with its name and a slash, as written by ``Robot.add_to`` and the objects' ``add_to``.
 
     Args:
         template: Builder holding one world.
-        name: Name of the robot or object; "" for all that there is.
+        name: Name of the robot or object; "" for the whole world.
 
     Raises:
         ValueError: Nothing in the world has this name.
@@ -38,23 +38,23 @@ class RobotView:
         joint_names: Joints of one degree of freedom, as in the file; a joint of several counts as so many.
         body_names: Bodies, as in the file.
         site_names: Sites, as in the file.
-        geom_names: Geoms that aren't sites, those that are only seen included. Formats without names of geoms have numbered ones.
+        geom_names: Geoms except sites, including visual-only ones. They are numbered if the format has no geom names.
         coordinates: Column of each joint in ``WorldArrays.joint_q``.
         dofs: Column of each joint in ``WorldArrays.joint_qd`` and ``drives``.
         actuators: Column of each joint's actuator in ``WorldArrays.controls``, -1 where it has none.
-        joint_types: What each joint is a degree of freedom of, one of ``newton.JointType``.
+        joint_types: Type of the Newton joint behind each joint, one of ``newton.JointType``.
         joint_bodies: Column of the body that each joint moves.
-        parents: Column of the body on which each body hangs, by its own column; -1: the world.
+        parents: Column of the parent of each body; -1: the world.
         defaults: Default position of each joint [m, rad].
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none.
         efforts: Greatest force of each joint's actuator [N, N m], infinite where it is not limited.
-        gains: Force on each joint for one unit of its actuator's input, gear times gain [N, N m]; 1 where it has none.
+        gains: Force on each joint per unit of its actuator's input, gear times gain [N, N m]; 1 without an actuator.
         bodies: Column of each body in ``BodyArrays``.
         sites: Index of each site among the shapes of a world.
-        site_bodies: Column of the body that each site is on; -1: it is on the world.
+        site_bodies: Column of the body of each site; -1: the world.
         site_poses: Pose of each site in its body's frame [m, quaternion xyzw].
         geoms: Index of each geom among the shapes of a world.
-        geom_bodies: Column of the body that each geom is on; -1: it is on the world.
+        geom_bodies: Column of the body of each geom; -1: the world.
         root_coordinate: First column of the free root in ``joint_q``; -1: it is fixed.
         root_dof: First column of the free root in ``joint_qd``; -1: it is fixed.
         root_body: Column of its first body.
@@ -144,7 +144,7 @@ class RobotView:
         return find(self.geom_names, patterns, f"geom of {self.name}")
 
     def joints_moving(self, body: int) -> list[int]:
-        """Indices into :attr:`joint_names` of the joints between the root and a body, given by its column; none of the world's, -1."""
+        """Indices into :attr:`joint_names` of the joints between the root and a body, given by its column; none for the world, -1."""
         above: set[int] = set()
         while body >= 0 and body not in above:
             above.add(body)
@@ -165,7 +165,7 @@ class RobotView:
         self._refuse(missing, purpose, "limits of its position", "give it a range in the robot's file, or leave it out")
 
     def need_efforts(self, joints: Iterable[int], purpose: str) -> None:
-        """Refuse joints whose actuator is missing or not limited, as :meth:`need_ranges` those without limits."""
+        """Refuse joints whose actuator is missing or has no force limit."""
         joints = list(joints)
         undriven = [joint for joint in joints if self.actuators[joint] < 0]
         self._refuse(undriven, purpose, "an actuator", "declare one, or leave it out")
@@ -176,7 +176,7 @@ class RobotView:
         if joints:
             having = [name for joint, name in enumerate(self.joint_names) if joint not in joints]
             raise ValueError(
-                f"{purpose} needs {lacking}, which the joint {self.joint_names[joints[0]]} of {self.name} has not; {remedy} "
+                f"{purpose} needs {lacking}, which joint {self.joint_names[joints[0]]} of {self.name} lacks; {remedy} "
                 f"(joints of {self.name} beside {', '.join(self.joint_names[joint] for joint in joints)}: {', '.join(having) or 'none'})"
             )
 
@@ -209,7 +209,7 @@ def body_arrays(worlds: Worlds) -> BodyArrays:
 def dof_names(template: newton.ModelBuilder, joint: int) -> list[str]:
     """A name for each degree of freedom of a joint: Newton makes one joint of all hinges between two bodies.
 
-    ``Robot.add_to`` writes the names of such hinges to MuJoCo's ``joint_dof_label``; where nobody did, they are numbered.
+    ``Robot.add_to`` writes the names of such hinges to MuJoCo's ``joint_dof_label``; hinges without a name there are numbered.
     """
     short, count = _short(template.joint_label[joint]), sum(template.joint_dof_dim[joint])
     if count == 1:
@@ -228,7 +228,7 @@ def actuator_value(template: newton.ModelBuilder, attribute: str, actuator: int)
 
 
 def _actuators_of_dofs(template: newton.ModelBuilder) -> dict[int, int]:
-    """The first actuator on each degree of freedom that a joint transmits to; the others are not reached by its name."""
+    """The first actuator on each degree of freedom with a joint transmission; further ones can't be addressed by joint name."""
     columns: dict[int, int] = {}
     labels: Any = template.custom_attributes["mujoco:joint_dof_label"].values or {}
     dofs_of_labels = {label: dof for dof, label in labels.items()}
@@ -244,7 +244,7 @@ def _actuators_of_dofs(template: newton.ModelBuilder) -> dict[int, int]:
 
 
 def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
-    """The least of what limits an actuator: its own range, the range of a motor's input, and the joint's."""
+    """Effective force limit of an actuator: the least of its own range, the range of a motor's input, and the joint's."""
     joint_limit = float(template.joint_effort_limit[dof])
     limits = [joint_limit if joint_limit < UNLIMITED_EFFORT else math.inf]
     if actuator >= 0:
@@ -258,7 +258,7 @@ def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
 
 
 def _gain(template: newton.ModelBuilder, actuator: int) -> float:
-    """Force on the joint for one unit of input; 1 where nothing acts."""
+    """Force on the joint per unit of input; 1 without an actuator."""
     if actuator < 0:
         return 1.0
     gear = float(actuator_value(template, "actuator_gear", actuator)[0])
@@ -266,7 +266,7 @@ def _gain(template: newton.ModelBuilder, actuator: int) -> float:
 
 
 def _is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:
-    """MuJoCo's rule: yes, no, or (2) yes where a range is given."""
+    """MuJoCo's rule for limits: on, off, or (2) on if a range is given."""
     limited = int(actuator_value(template, f"actuator_{what}limited", actuator))
     return bool(actuator_value(template, f"actuator_has_{what}range", actuator)) if limited == 2 else limited == 1
 

@@ -1,9 +1,9 @@
-"""Ground of many patches, side by side: kinds along y, levels of difficulty along x; all worlds stand on the same one.
+"""Terrain of many patches, side by side: kinds along y, levels of difficulty along x. All worlds share it.
 
-What the patches are like follows from the declaration alone, so that it is the same on every rank. To the physics the ground is a few
-shapes: neighbouring columns of one kind are one height field, level ones and the border are boxes. A field for each patch
-would add pairs of shapes to every step; one field for all would reach as high and as deep as the wildest patch, so that the solver
-looked at every shape of a robot on flat ground too.
+The declaration alone determines the patches, so they are the same on every rank. The physics sees a few shapes: neighbouring columns of
+one kind are one height field, level ones and the border are boxes. A field for each patch would add pairs of shapes to every step; one
+field for all would reach as high and as deep as the roughest patch, so that the solver would also check every shape of a robot on flat
+ground.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
-from pathlib import Path
 
 import newton
 import numpy as np
+import psutil
 import warp as wp
 
 from worker.simulation.terrain_patches import Flat, Patch, PatchGrid, Rough, Slope, Stairs, Waves
 
 DEPTH = 1.0
-"""How far the ground reaches down below its lowest point [m]: what is in it is pushed up again."""
+"""Depth of the ground below its lowest point [m]: shapes that sink into it are pushed up again."""
 PLATFORM_REACH = 0.5
-"""A robot begins at the height of the highest point so far from the middle of its patch, along x and y [m]."""
+"""A robot starts at the height of the highest point within this distance from the middle of its patch, along x and y [m]."""
 BYTES_PER_POINT = 400
-"""What a point of a height field takes while it is built and in a model [bytes]: measured, nearly all of it Newton's mesh for rays."""
+"""Memory per point of a height field, during construction and in a model [bytes]: measured, nearly all of it Newton's mesh for rays."""
 POINT_LIMIT = 80_000_000
-"""Points from which on the indices of Newton's mesh would not fit in 32 bits."""
+"""Number of points from which the indices of Newton's mesh would not fit in 32 bits."""
 LABEL = "terrain"
-"""Labels of its shapes begin with this and a slash."""
+"""Prefix of its shapes' labels, before a slash."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,16 +39,16 @@ class Terrain:
     Attributes:
         kinds: Share of the worlds on each kind of patch; the shares need not add up to 1.
         levels: Patches along x. With a curriculum their difficulty grows from 0 to 1.
-        columns: Patches along y; None: one a kind, 20 without a curriculum. Of several columns of one kind each is drawn afresh.
+        columns: Patches along y; None: one per kind, 20 without a curriculum. Each of several columns of one kind is drawn separately.
         size: Lengths of a patch along x and y [m].
         resolution: Distance between neighbouring heights [m]. Risers are as steep as one cell allows; finer fields cost more in every
             step, since each cell that a shape touches is a collision.
         border: Width of the level strip around all patches [m].
-        curriculum: Whether difficulty grows with the level. Else kind and difficulty of every patch are random.
+        curriculum: Whether difficulty grows with the level. Otherwise kind and difficulty of every patch are random.
         start_level: Highest level at which a world begins (:func:`worker.simulation.terrain_levels.walked_levels` moves it from there);
-            None, or one that there isn't: any.
+            None, or a level beyond the last: any.
         friction: Sliding friction of the ground.
-        seed: Of everything random in the patches.
+        seed: Seed of all randomness in the patches.
 
     Raises:
         ValueError: The patches can't be built: no kinds, a share that is not positive, a size that is no multiple of the
@@ -71,7 +71,7 @@ class Terrain:
             raise ValueError("Terrain.kinds is empty; give at least one, such as {Flat(): 1.0}")
         for patch, share in self.kinds.items():
             if not isinstance(patch, Patch):
-                raise ValueError(f"Terrain.kinds: {patch!r} is no patch; use one such as Flat() or Stairs()")
+                raise ValueError(f"Terrain.kinds: {patch!r} is not a patch; use one such as Flat() or Stairs()")
             if not 0 < share < float("inf"):
                 raise ValueError(f"Terrain.kinds: the share of {type(patch).__name__} is {share}; use a number > 0")
         for name, least in {"levels": 1, "seed": 0, "border": 0, "friction": 0, "start_level": 0}.items():
@@ -91,7 +91,7 @@ class Terrain:
                 )
             if abs(cells - round(cells)) > 1e-6:
                 raise ValueError(
-                    f"Terrain.size of {length:g} m is no multiple of its resolution of {self.resolution:g} m; "
+                    f"Terrain.size of {length:g} m is not a multiple of its resolution of {self.resolution:g} m; "
                     f"use {round(cells) * self.resolution:g} m"
                 )
         for patch in self.kinds:
@@ -114,16 +114,17 @@ class Terrain:
 
     @cached_property
     def column_kinds(self) -> list[int]:
-        """Which of ``kinds`` each column has, in order; with a curriculum. Shares of columns follow those of the kinds, one at least."""
+        """Index into ``kinds`` of each column, in order, with a curriculum. Columns are shared out by the kinds' shares, at least one
+        each."""
         shares = np.array(list(self.kinds.values())) / sum(self.kinds.values())
         counts = np.ones(len(shares), int)
         for _ in range(self.column_count - len(shares)):
-            counts[np.argmax(shares / (counts + 0.5))] += 1  # Sainte-Laguë, as seats are dealt out to parties
+            counts[np.argmax(shares / (counts + 0.5))] += 1  # Sainte-Laguë, as for seats in a parliament
         return [kind for kind, count in enumerate(counts) for _ in range(count)]
 
     @property
     def column_names(self) -> list[str]:
-        """What the patches of each column are called, for tables and statistics."""
+        """Name of each column's patches, for tables and statistics."""
         if not self.curriculum:
             return ["mixed"] * self.column_count
         names = [patch.name for patch in self.kinds]
@@ -171,7 +172,7 @@ class Terrain:
 
     @cached_property
     def origins(self) -> np.ndarray:
-        """Where robots begin: the middle of each patch, at the height of its platform [m], shape ``(levels, columns, 3)``, float32."""
+        """Start of the robots: the middle of each patch, at the height of its platform [m], shape ``(levels, columns, 3)``, float32."""
         along_x, along_y = self.cells
         reach = round(min(PLATFORM_REACH, *(length / 2 for length in self.size)) / self.resolution)
         origins = np.zeros((self.levels, self.column_count, 3), np.float32)
@@ -185,10 +186,10 @@ class Terrain:
         return origins
 
     def check_memory(self, device: str) -> None:
-        """Refuse a field that would not fit into what is free, before anything is built.
+        """Refuse a field that would not fit into free memory, before anything is built.
 
         Args:
-            device: Where the model is to be; heights are on the host too.
+            device: Device of the model; heights are on the host too.
 
         Raises:
             ValueError: It would not fit.
@@ -201,7 +202,7 @@ class Terrain:
             side = self.resolution * (points / min(free / BYTES_PER_POINT, POINT_LIMIT)) ** 0.5
             raise ValueError(
                 f"the terrain's {self.levels} x {self.column_count} patches at {self.resolution:g} m have {points:,} heights, which "
-                f"take about {needed / 2**30:,.1f} GiB of {free / 2**30:,.1f} GiB that are free; use a resolution from {side:.2g} m on, "
+                f"take about {needed / 2**30:,.1f} GiB of {free / 2**30:,.1f} GiB that are free; use a resolution of at least {side:.2g} m, "
                 "or fewer levels and columns"
             )
 
@@ -231,7 +232,7 @@ class Terrain:
         return shapes
 
     def _runs(self) -> Iterator[tuple[int, int, str, bool]]:
-        """First and last but one column, name and flatness of the ground that becomes one shape."""
+        """First column, end column, name and flatness of the ground that becomes one shape."""
         if not self.curriculum:
             yield 0, self.column_count, "mixed", False
             return
@@ -281,8 +282,7 @@ class Terrain:
 
 def _free_memory(device: str) -> float:
     """Bytes that are free on the host, or on the device where it has less."""
-    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    free = int(fields["MemAvailable"].split()[0]) * 1024
+    free = psutil.virtual_memory().available
     target = wp.get_device(device)
     return min(free, target.free_memory) if target.is_cuda else free
 

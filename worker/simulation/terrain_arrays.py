@@ -1,4 +1,4 @@
-"""The ground as kernels see it: how high it is at a point, and on which patch each world is."""
+"""The terrain in kernels: the height at a point, and the patch of each world."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ GOLDEN = 0.6180339887498949
 
 @wp.struct
 class TerrainArrays:
-    """What terms read of the ground, and where each world is on it.
+    """The terrain as terms read it, and each world's patch.
 
     Attributes:
         levels: Level of each world's patch, shape ``(worlds,)``.
-        kinds: Column of each world's patch, which says its kind (``Terrain.column_names``), shape ``(worlds,)``.
-        origins: Where robots begin on each patch [m], shape ``(levels, columns)``.
+        kinds: Column of each world's patch, which determines its kind (``Terrain.column_names``), shape ``(worlds,)``.
+        origins: Start of the robots on each patch [m], shape ``(levels, columns)``.
         heights: Height of each point [m], first along y and then along x, shape as ``Terrain.heights``.
         ends: Sum of the columns' shares up to and with each, shape ``(columns,)``.
         corner: Coordinates x and y of the first point [m].
@@ -93,7 +93,7 @@ def _deal(episodes: EpisodeArrays, golden: wp.float64, terrain: TerrainArrays):
 
 
 def flat_ground(device: str) -> TerrainArrays:
-    """What is everywhere at height 0, for code that reads the ground of worlds without a terrain; it has no levels and no origins."""
+    """A terrain at height 0 everywhere, for worlds without a terrain; it has no levels and no origins."""
     arrays = TerrainArrays()
     arrays.levels = wp.zeros(0, dtype=wp.int32, device=device)
     arrays.kinds = wp.zeros(0, dtype=wp.int32, device=device)
@@ -105,7 +105,7 @@ def flat_ground(device: str) -> TerrainArrays:
 
 
 class Ground:
-    """A terrain on a device, and the place of every world on it.
+    """A terrain on a device, and the patch of every world.
 
     Args:
         terrain: The declaration.
@@ -114,7 +114,7 @@ class Ground:
 
     Attributes:
         terrain: The declaration.
-        arrays: What kernels read.
+        arrays: The struct that kernels read.
     """
 
     def __init__(self, terrain: Terrain, world_count: int, device: str) -> None:

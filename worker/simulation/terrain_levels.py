@@ -1,4 +1,4 @@
-"""Curriculum of levels: a world whose robot walks far goes on to a harder patch, one that stays behind to an easier one."""
+"""Curriculum of levels: a world moves to a harder patch if its robot walked far, to an easier one if it fell short."""
 
 from __future__ import annotations
 

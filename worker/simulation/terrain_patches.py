@@ -1,8 +1,8 @@
 """Kinds of terrain patches: heights on a grid of points that grow harder with a number from 0 to 1.
 
 The kinds and the meaning of their numbers are those of Isaac Lab's terrain configurations (``isaaclab.terrains.height_field`` and
-``isaaclab.terrains.trimesh``), which mjlab took over, so that their terrains can be declared here. Every kind is heights alone:
-what is upright there, such as the riser of a step, here is a ramp over one cell of the grid.
+``isaaclab.terrains.trimesh``), which mjlab took over, so that their terrains can be declared here. Every kind is a field of heights:
+vertical faces, such as the riser of a step, become ramps over one cell of the grid.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ class PatchGrid:
 
 
 def between(ends: Range, difficulty: float) -> float:
-    """The number at ``difficulty`` on the way from the first to the second end."""
+    """Linear interpolation between both ends by ``difficulty``."""
     return ends[0] + difficulty * (ends[1] - ends[0])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Patch:
-    """One kind of ground. A kind of your own is a frozen dataclass that overrides :meth:`heights`.
+    """One kind of ground. To write your own, subclass it as a frozen dataclass and override :meth:`heights`.
 
     Attributes:
         platform: Side of the flat square in the middle on which robots begin [m].
@@ -70,22 +70,20 @@ class Patch:
     border: float = 0.25
 
     FEATURES: ClassVar[tuple[str, ...]] = ()
-    """Fields that are lengths on the ground, of which the resolution must show at least one cell."""
+    """Fields that are lengths on the ground; each must span at least one cell of the resolution."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
             place = f"{type(self).__name__}.{item.name}"
             if isinstance(value, tuple) and not (len(value) == 2 and 0 <= value[0] <= value[1]):
-                raise ValueError(
-                    f"{place} is {value}; use a pair of numbers >= 0 of which the second is not the smaller"
-                )
+                raise ValueError(f"{place} is {value}; use two numbers >= 0, the smaller one first")
             if isinstance(value, float | int) and not value >= 0:
                 raise ValueError(f"{place} is {value}; use a number >= 0")
 
     @property
     def name(self) -> str:
-        """What the kind is called in labels and tables."""
+        """Name of the kind in labels and tables."""
         return ("inverted " if getattr(self, "inverted", False) else "") + type(self).__name__.lower()
 
     def heights(self, grid: PatchGrid, difficulty: float, random: np.random.Generator) -> np.ndarray:
@@ -94,12 +92,12 @@ class Patch:
         Args:
             grid: The points.
             difficulty: From 0 (easiest) to 1.
-            random: Where every random number is from.
+            random: Source of all random numbers.
         """
         raise NotImplementedError
 
     def check(self, size: tuple[float, float], resolution: float) -> None:
-        """Refuse what patches of this size and resolution can't show.
+        """Refuse features that patches of this size and resolution can't represent.
 
         Raises:
             ValueError: Border and platform leave nothing between them, or a part of the ground is smaller than a cell.
@@ -122,7 +120,7 @@ class Patch:
 
 @dataclass(frozen=True, kw_only=True)
 class Flat(Patch):
-    """Level ground at height 0; to the collisions it is a box, as cheap as a plane."""
+    """Level ground at height 0. It collides as a box, which is as cheap as a plane."""
 
     def heights(self, grid: PatchGrid, difficulty: float, random: np.random.Generator) -> np.ndarray:
         return np.zeros(grid.shape)
@@ -182,7 +180,7 @@ class Grid(Patch):
     """Squares side by side, each at a random height, around a platform at their greatest height.
 
     Attributes:
-        bounds: Heights are from minus to plus this, from the easiest to the hardest [m].
+        bounds: Greatest height above and below 0, from the easiest to the hardest [m].
         width: Side of a square [m].
     """
 
@@ -209,7 +207,7 @@ class Steps(Patch):
     """Blocks and pits at random places on level ground, the later over the earlier.
 
     Attributes:
-        step_heights: Height of the highest, from the easiest to the hardest [m]: each is at plus or minus this, or half of it.
+        step_heights: Height of the highest blocks, from the easiest to the hardest [m]: each block is at plus or minus this, or half of it.
         sides: Least and greatest side of a block [m].
         count: Number of blocks.
     """
@@ -241,7 +239,7 @@ class Rough(Patch):
     Attributes:
         bounds: Lowest and highest [m].
         step: Difference between neighbouring heights that can be drawn [m].
-        grows: Whether both bounds grow from 0 with the difficulty; else it is as rough at every level.
+        grows: Whether both bounds grow from 0 with the difficulty; otherwise every level is equally rough.
         spacing: Distance between random points, straight ground between them [m]; None: the terrain's resolution.
     """
 
@@ -275,7 +273,7 @@ class Rough(Patch):
 def _between_points(drawn: np.ndarray, grid: PatchGrid, spacing: float) -> np.ndarray:
     """Bilinear interpolation of heights that were drawn ``spacing`` apart from the first corner on."""
     (rows, down), (columns, right) = (
-        np.divmod(np.round((points + size / 2) / spacing, 6), 1.0)  # a point on a drawn one has its height
+        np.divmod(np.round((points + size / 2) / spacing, 6), 1.0)  # a point at a drawn one takes its height
         for points, size in ((grid.y[:, 0], grid.size[1]), (grid.x[0], grid.size[0]))
     )
     row, column = rows.astype(int), columns.astype(int)
@@ -315,7 +313,7 @@ class Gaps(Patch):
         widths: Opening of a trench, from the easiest to the hardest, each rounded up to whole cells of the grid [m].
         ground: Width of the ground between two trenches [m].
         count: Greatest number of trenches; as many as fit inside the border.
-        depth: Of a trench [m]. MuJoCo-Warp now and then throws up what is wedged at so steep a wall, the deeper the more.
+        depth: Depth of a trench [m]. MuJoCo-Warp occasionally ejects shapes wedged at such a steep wall, more often in deeper trenches.
     """
 
     widths: Range = (0.2, 0.6)
@@ -351,11 +349,11 @@ class Stones(Patch):
 
     Attributes:
         sides: Least and greatest side of a stone [m]; the easiest are the greatest.
-        gap: Distance between the greatest stones [m]. The middles of the stones are where they are at every difficulty.
-        height_variation: How far the hardest stones are above or below 0 [m].
-        side_variation: How much the sides of the hardest differ [m].
-        displacement: How far the hardest are from their places, along x and y [m].
-        depth: Of the pit [m]; others have 2 m, of which see :class:`Gaps`.
+        gap: Distance between the greatest stones [m]. The centres of the stones are the same at every difficulty.
+        height_variation: Greatest height of the hardest stones above or below 0 [m].
+        side_variation: Variation of the hardest stones' sides [m].
+        displacement: Greatest displacement of the hardest stones, along x and y [m].
+        depth: Depth of the pit [m]; other frameworks use 2 m, but see :class:`Gaps`.
     """
 
     sides: Range = (0.4, 0.8)

@@ -1,4 +1,4 @@
-"""N copies of one Newton model, one copy a world, stepped by MuJoCo-Warp."""
+"""N copies of one Newton model, one per world, stepped by MuJoCo-Warp."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class WorldArrays:
-    """What a task's kernels read and write of the physics, one row a world.
+    """State of the physics that a task's kernels read and write, one row per world.
 
     Attributes:
         joint_q: Joint coordinates [m, rad, quaternion xyzw], shape ``(worlds, coordinates)``.
@@ -33,11 +33,11 @@ class WorldArrays:
         controls: Actuator inputs in the order of the model file [actuator's own unit], shape ``(worlds, actuators)``.
         drives: Forces of the actuators on the joints in the last physics step [N, N m], shape ``(worlds, dofs)``.
         warm_start: Accelerations [m/s^2, rad/s^2] from which the constraint solver starts, shape ``(worlds, dofs)``.
-        activations: State of the actuators that have one, such as filters and muscles, shape ``(worlds, activations)``.
+        activations: State of stateful actuators, such as filters and muscles, shape ``(worlds, activations)``.
         start_q: The model's own joint coordinates, as ``joint_q``.
         start_qd: The model's own joint velocities, as ``joint_qd``.
         overflow: Bits of every solver capacity exceeded since the last observation, shape ``(worlds,)``.
-        fastest: Velocity from which on the physics can't be believed [m/s, rad/s].
+        fastest: Velocity above which the physics counts as failed [m/s, rad/s].
     """
 
     joint_q: wp.array2d(dtype=wp.float32)
@@ -53,9 +53,9 @@ class WorldArrays:
 
 
 FIRST_COORDINATE = wp.constant(7)
-"""Joint coordinates of a free root joint: position, quaternion xyzw; those of the hinges follow."""
+"""Number of joint coordinates of a free root joint: position, quaternion xyzw. The hinges follow."""
 FIRST_DOF = wp.constant(6)
-"""Joint velocities of a free root joint: linear, angular; those of the hinges follow."""
+"""Number of joint velocities of a free root joint: linear, angular. The hinges follow."""
 
 
 @wp.func
@@ -101,7 +101,7 @@ def restore_start(worlds: WorldArrays, world: int):
 
 
 FEW_ITERATIONS = 8
-"""Up to so many iterations of the solver are recorded one after the other, not as a loop that ends when all worlds are done."""
+"""Up to this many solver iterations are recorded one after the other, not as a loop that ends when all worlds are done."""
 
 # Reaching the solver's own iteration limits is a chosen trade of accuracy for time; the other bits mean that contacts or
 # constraints were dropped.
@@ -118,11 +118,11 @@ def _gather_overflow(solver_overflow: wp.array(dtype=wp.int32), overflow: wp.arr
 
 
 _SET_HERE = {"disable_sensors": True, "kinematic_switchable_roots": False, "separate_worlds": True}
-"""Options of the solver that are not a task's to choose: neither sensors nor such roots are used, and both cost time in every step."""
+"""Solver options that a task can't set: neither MuJoCo's sensors nor kinematic roots are used, and both cost time in every step."""
 
 
 class _Solver(SolverMuJoCo):
-    """Takes all substeps between one push of Newton's state to MuJoCo and one pull of it: none of them needs the other's coordinates."""
+    """Takes all substeps between one push of Newton's state to MuJoCo and one pull back: substeps don't need Newton's coordinates."""
 
     substeps = 1
     before_substep: Sequence[Callable[[], None]] = ()
@@ -140,9 +140,10 @@ class _Solver(SolverMuJoCo):
     def _preserved_masks_cover_collision_filters(
         model: newton.Model, selected_shapes: Any, collision_type: Any, collision_affinity: Any, body_filters: Any
     ) -> bool:
-        """Newton asks whether masks alone keep those apart that must not touch, and makes up masks of its own where they don't.
+        """Newton checks whether masks alone exclude all filtered pairs, and replaces the masks if they don't.
 
-        What is fixed to the world never touches the world in MuJoCo, whatever the masks: the base of an arm and the ground are no reason.
+        In MuJoCo shapes fixed to the world never collide with the world, whatever their masks, so such pairs (the base of an arm and the
+        ground) are no reason to replace masks.
         """
         of_shapes = {int(body) for body in model.shape_body.numpy()[selected_shapes]}
         fixed = sorted(of_shapes & _fixed_bodies(model))
@@ -166,16 +167,16 @@ class Worlds:
         solver_options: Keyword arguments of ``SolverMuJoCo`` (``njmax`` and ``nconmax`` are per world).
 
     Attributes:
-        ground: The terrain on the device and the place of every world on it; None without a terrain.
-        drives: The delays and explicit motors of the actuators; None where there is neither. A task calls ``drives.settle`` after it
-            placed worlds afresh and keeps ``drives.state_tensors``.
+        ground: The terrain on the device and the patch of every world; None without a terrain.
+        drives: The delays and explicit motors of the actuators; None without either. A task calls ``drives.settle`` after resets and
+            saves ``drives.state_tensors``.
         after_substep: Called after each physics step of :meth:`simulate`, in this order: launches only. The contacts and forces of that
             step are in ``solver.mjw_data``; Newton's own state (``arrays.joint_q``, ``state``) is still that before :meth:`simulate`.
-        pushed: Bodies of a world on which something acts from outside, ``state.body_f``, which the solver reads.
+        pushed: Bodies of a world with external forces, ``state.body_f``, which the solver reads.
 
     Raises:
-        ValueError: An option of the solver is unknown or set here, the robot has actuators that would ignore the controls, or the
-            terrain would not fit into memory.
+        ValueError: A solver option is unknown or reserved, the robot has actuators that would ignore the controls, or the terrain would
+            not fit into memory.
     """
 
     def __init__(
@@ -207,7 +208,7 @@ class Worlds:
         scene.shape_gap = [0.0 if gap == scene.rigid_gap else gap for gap in scene.shape_gap]
         self.ground = Ground(ground, world_count, device) if isinstance(ground, Terrain) else None
         with warnings.catch_warnings():
-            # of height fields that can't collide with each other; none of a terrain's does
+            # of height fields that can't collide with each other; those of a terrain don't
             warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")
             self.model = scene.finalize(device=device)
         self.solver = _Solver(self.model, **_SET_HERE, **solver_options)
@@ -251,8 +252,8 @@ class Worlds:
     def simulate(self) -> None:
         """Advance all worlds by ``substeps`` physics steps; launches only, so that it can be captured.
 
-        Joint coordinates follow; body poses don't (:meth:`update_bodies`): they would cost 2 to 3 % of a training, and no kernel of a
-        task that reads joints alone needs them.
+        This updates joint coordinates but not body poses (:meth:`update_bodies`), which cost 2 to 3 % of a training and which tasks that
+        read only joints don't need.
         """
         with self._joints_alone():
             self.solver.step(self.state, self.state, self.control, None, self.timestep)
@@ -285,16 +286,16 @@ class Worlds:
         self.arrays.overflow.zero_()
 
     def update_bodies(self) -> None:
-        """Compute body poses and velocities (``state.body_q``, ``state.body_qd``) from joint coordinates, which alone are kept up to date."""
+        """Compute body poses and velocities (``state.body_q``, ``state.body_qd``) from joint coordinates."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
     def update_shapes(self) -> None:
-        """Bring what cameras see to where :meth:`update_bodies` found the bodies."""
+        """Move the shapes that cameras see to the poses computed by :meth:`update_bodies`."""
         self.model.bvh_refit_shapes(self.state)
 
 
 def _fixed_bodies(model: newton.Model) -> set[int]:
-    """Bodies that fixed joints alone connect to the world."""
+    """Bodies connected to the world only by fixed joints."""
     fixed = {-1}
     joints = zip(model.joint_type.numpy(), model.joint_parent.numpy(), model.joint_child.numpy(), strict=True)
     for kind, parent, child in joints:  # parents come first
@@ -313,20 +314,20 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 
 def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.Control) -> None:
-    """Refuse actuators that would ignore ``worlds.controls``: such a robot would hold its pose, whatever a policy does."""
+    """Refuse actuators that would ignore ``worlds.controls``: the robot would hold its pose, whatever the policy does."""
     controls = getattr(getattr(control, "mujoco", None), "ctrl", None)
     sources = solver.mjc_actuator_ctrl_source
     direct = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
     if controls is None or not controls.size:
         if sources is None:
             raise ValueError(
-                "the robot has no actuators, so that no action could move it; give worker.simulation.robot.Robot its actuators, or its MJCF "
+                "the robot has no actuators, so no action could move it; give worker.simulation.robot.Robot its actuators, or its MJCF "
                 "file an <actuator> section"
             )
         joints = model.joint_target_mode.numpy()[: solver.mj_model.nv].nonzero()[0]
         raise ValueError(
             f"nothing would drive the robot: {_joints(model, joints)} follow joint targets, as joints of URDF and USD files do, and a "
-            "task writes the inputs of actuators alone; give worker.simulation.robot.Robot its actuators, or describe the robot in MJCF, "
+            "task only writes inputs of actuators; give worker.simulation.robot.Robot its actuators, or describe the robot in MJCF, "
             "with an <actuator> section, and add it with builder.add_mjcf(file, ctrl_direct=True)"
         )
     attributes: Any = model.mujoco
@@ -336,7 +337,7 @@ def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.C
         joints = attributes.actuator_trnid.numpy()[unread, 0]
         raise ValueError(
             f"the <position> and <velocity> actuators of {_joints(model, joints)} would ignore a task's controls, since they follow joint "
-            "targets; add the robot with builder.add_mjcf(file, ctrl_direct=True), and their controls are their targets"
+            "targets; add the robot with builder.add_mjcf(file, ctrl_direct=True), which makes their controls their targets"
         )
 
 

@@ -201,6 +201,8 @@ class TaskConfig(_Common):
     if a declaration makes it an image. Submission checks jobs against these names."""
     races: ClassVar[bool] = False
     """Whether an episode is a lap of a race, as a job with ``race`` runs it."""
+    hyperparameters: ClassVar[tuple[str, ...]] = ()
+    """Further names for settings that ``train.hyperparameters`` accepts (:meth:`plain_settings`)."""
     other_rewards: ClassVar[Mapping[str, float]] = MappingProxyType({})
     """Reward terms and weights that replace the default ones if :attr:`has_other_rewards`."""
 
@@ -242,6 +244,18 @@ class TaskConfig(_Common):
     def observation_groups(self) -> Mapping[str, bool]:
         """The task's observation groups, and whether each holds images."""
         return {"policy": getattr(self, "camera", None) is not None, "critic": False, **self.further_groups}
+
+    @property
+    def chooses(self) -> bool:
+        """Whether the policy chooses one of several actions, instead of giving numbers; False where only the task knows."""
+        return False
+
+    @property
+    def policy_sizes(self) -> Mapping[str, str]:
+        """What decides the sizes of the policy's inputs and outputs, by key of the configuration, in words; a clone can't change it.
+        Empty where only the task knows.
+        """
+        return {}
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:

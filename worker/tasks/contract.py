@@ -41,7 +41,10 @@ def contract(plan: Plan, model: Any, motors: Explicit | None = None) -> Interfac
     ]
     if plan.choice:
         assert isinstance(plan.choice.term, Choice)
-        actions = [Action(name, "choice", "1", scale=1.0, default_position=0.0) for name in plan.choice.term.names]
+        actions = [
+            Action(name, "choice", "1", scale=1.0, default_position=0.0, targets=targets)
+            for name, targets in zip(plan.choice.term.names, plan.choice.term.targets, strict=True)
+        ]
     else:
         actions = [action for driven in plan.driven for action in _actions(plan, driven, model, motors)]
     return Interface(tuple(observations), tuple(actions))

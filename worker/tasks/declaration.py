@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from shared_store.policy_contract import Target
 from worker.tasks.randomize import Randomize
 
 Pattern = str | Sequence[str]
@@ -312,12 +313,16 @@ class Choice(Term):
     Args:
         function: Has the parameter ``choice``, and writes ``worlds.controls``.
         names: Of the choices.
+        targets: What each choice asks of the robot's joints, in the order of the names; the policy contract tells a robot of them.
         **options: As for :class:`Term`.
     """
 
-    def __init__(self, function: Any, *, names: Sequence[str], **options: Any) -> None:
+    def __init__(
+        self, function: Any, *, names: Sequence[str], targets: Sequence[Sequence[Target]] = (), **options: Any
+    ) -> None:
         super().__init__(function, **options)
         self.names = tuple(names)
+        self.targets = tuple(map(tuple, targets)) or ((),) * len(self.names)
 
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")

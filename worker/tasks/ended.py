@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import warp as wp
 
+from shared_store.evaluations import BY_CLOCK
 from worker.simulation.episodes import PHYSICS_FAILED, STEPS, TERMS
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class Ended:
     def meaning(self) -> str:
         """The criterion of success, in words."""
         if self.success is None:
-            return "the clock ended the episode" if self.says_success else "the task does not say"
+            return BY_CLOCK if self.says_success else "the task does not say"
         metric = f"metric_{self.success}" in self.columns
         return f"{self.success} above 0 in the last step" if metric else f"{self.success} ended the episode"
 

@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 CHANNELS = ("red", "green", "blue")
-"""Of the camera that every task may have by its configuration."""
+"""Name of the camera that the configuration adds to any task."""
 
 
 def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = None) -> Contract:
-    """What a policy of ``task`` sees, does and remembers.
+    """The contract of a policy of ``task``: inputs, outputs and recurrent state.
 
     Args:
-        task: With its worlds.
-        name: Of the task, as a job's YAML has it.
-        exported: The policy as a function of tensors: which groups are its inputs, and its recurrent state. Without it all groups of the
-            task are described, and no state.
+        task: The task, with its worlds.
+        name: Name of the task in a job's YAML.
+        exported: The policy as a function of tensors, with its input groups and its recurrent state. Without it, the contract has all
+            groups of the task and no state.
     """
     groups = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items()}
     inputs = {group: group for group in groups}
@@ -68,12 +68,12 @@ def _image(task: Task, group: str) -> Image | None:
     frames, channels = int(camera.pop("frames", 1)), camera.pop("channels", CHANNELS)
     shown = tuple(
         channels if channels is CHANNELS else channels[: len(channels) // frames]
-    )  # a sensor names those of all frames
+    )  # a sensor names the channels of all frames
     return Image(shown, frames, _texts(camera))
 
 
 def _texts(value: Any) -> Any:
-    """Settings as plain values: JSON has no tuples, and knows no classes."""
+    """Settings as plain values, since JSON has neither tuples nor classes."""
     if isinstance(value, Mapping):
         return {str(key): _texts(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -82,11 +82,11 @@ def _texts(value: Any) -> Any:
 
 
 def _terms(task: Task, group: str) -> tuple[Term, ...]:
-    """The terms of a group of numbers; none where it is not known what they are."""
+    """The terms of a group of numbers; none if unknown."""
     plan: Plan | None = getattr(task, "plan", None)
     if plan is None:
         return _columns(task) if group in ("policy", "critic") else ()
-    # where the policy sees an image alone, the plan has the critic's terms in its place
+    # if the policy sees only an image, the plan has the critic's terms in its place
     there = "policy" if group == "critic" and (group not in plan.groups or "policy" in plan.images) else group
     first, found = 0, []
     for seen in plan.groups.get(there, ()):
@@ -96,7 +96,7 @@ def _terms(task: Task, group: str) -> tuple[Term, ...]:
 
 
 def _columns(task: Task) -> tuple[Term, ...]:
-    """The observations of a task of kernels by hand, each a term: what its interface declares of them, else their names."""
+    """The observations of a task with hand-written kernels, each as a term: from its interface, or else with their names only."""
     interface = task.interface()
     if interface is None:
         names = tuple(task.observation_names)
@@ -151,7 +151,7 @@ def _term(plan: Plan, seen: Seen, first: int) -> Term:
 
 
 def _sensor(declared: Any) -> str:
-    """A sensor in a line, such as ``ImuSensor, site imu``; in its own words where it has a ``meaning``."""
+    """A sensor in one line, such as ``ImuSensor, site imu``, or its ``meaning`` if it has one."""
     if meaning := getattr(declared, "meaning", ""):
         return str(meaning)
     return ", ".join(filter(None, (type(declared).__name__, settings(declared))))
@@ -171,9 +171,9 @@ def _commands(plan: Plan | None) -> tuple[Command, ...]:
 
 
 def same_policy(contract: Contract, of: Contract) -> Contract:
-    """``contract``, with what the algorithm adds to a contract (inputs and recurrent state) as ``of`` has it.
+    """``contract`` with the algorithm's parts (inputs and recurrent state) of ``of``.
 
-    A task alone does not know it, and it can't differ: it follows from the settings with which a policy is read back.
+    A task alone doesn't know these parts. They can't differ, since they follow from the settings with which a policy is loaded.
     """
     groups = []
     for told in of.groups:

@@ -111,7 +111,7 @@ class Quadruped(DeclaredTask):
                 "ang_vel_xy": rate(terms.tipping_rate_squared),
                 "orientation": rate(terms.tilt_squared),
                 "torques": rate(terms.joint_effort_squared),
-                # of what the policy asked for: beyond the limits nothing else would hold it back from drifting away
+                # of the unclipped action: beyond the limits nothing else would keep it from drifting away
                 "action_rate": rate(terms.action_rate_squared),
                 "pose": rate(terms.joint_deviation_squared),
                 "limits": rate(terms.joint_limit_excess, soft_factor=0.9),

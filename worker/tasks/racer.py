@@ -1,4 +1,4 @@
-"""Racing: a car of 1:18 that drives laps on a track, from what it is told of the road or from its camera."""
+"""Racing: a 1:18 car drives laps on a track, from numbers about the road or from its camera."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from shared_store.layout import Store
+from shared_store.policy_contract import Target
 from worker.racer import resets
 from worker.racer import terms as racing
 from worker.racer.actions import CAMERA, ActionSpace
@@ -54,7 +55,7 @@ class Racer(DeclaredTask):
         super().__init__(*arguments, **options)
         if self.race:
             with on_torch_stream(self.device):
-                self.sensors["race"].reward.forget_failures()  # of the step that was tried out
+                self.sensors["race"].reward.forget_failures()  # of the trial step
 
     def robot(self, config: RacerConfig) -> Robot:
         """The car."""
@@ -64,7 +65,7 @@ class Racer(DeclaredTask):
         """As :meth:`DeclaredTask.build`, with the tracks around the car.
 
         Raises:
-            ValueError: A track, an action space or an obstacle can't be.
+            ValueError: A track, an action space or an obstacle is invalid.
         """
         config: Any = self.config
         try:
@@ -80,7 +81,7 @@ class Racer(DeclaredTask):
         add_scenery(builder, self.circuit)
 
     def race_of(self, config: RacerConfig) -> RewardInputs | None:
-        """What a learner's reward function is told, where there is one. Raises ValueError where the guard refuses it."""
+        """The parameters of a learner's reward function, if any. Raises ValueError if the guard refuses it."""
         if config.reward_function is None:
             return None
         try:
@@ -99,7 +100,7 @@ class Racer(DeclaredTask):
             self.sensors["race"].follow(self.sensors["car"].arrays)
 
     def notes(self) -> list[str]:
-        """Where a learner's reward function runs, and why."""
+        """Where a learner's reward function runs (device or host), and the reason."""
         if self.race is None:
             return []
         if not self.race.reason:
@@ -108,7 +109,7 @@ class Racer(DeclaredTask):
         return [f"{self.race.reason}{graph}"]
 
     def failures(self) -> dict[str, tuple[int, int]]:
-        """The calls of a learner's reward function that gave no reward."""
+        """The calls of a learner's reward function that returned no reward."""
         if self.race is None:
             return {}
         with on_torch_stream(self.device):
@@ -116,7 +117,7 @@ class Racer(DeclaredTask):
         return {told: (each.count, self.first_world + each.car) for told, each in found.items()}
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
-        """As :meth:`Task.read_mishap`, with what the reward function says of it."""
+        """As :meth:`Task.read_mishap`, with the error of the reward function."""
         found = super().read_mishap(code)
         if found is None or "reward" not in found[1]:
             return found
@@ -151,6 +152,7 @@ class Racer(DeclaredTask):
                     speed_factor=config.speed_factor,
                     steering_factor=config.steering_factor,
                     steering_offset=config.steering_offset,
+                    friction=config.friction,
                 ),
                 **resetting(config),
             },
@@ -164,20 +166,20 @@ class Racer(DeclaredTask):
         )
 
     def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
-        """``model_metadata.json``, as DeepRacer has it."""
+        """``model_metadata.json`` in DeepRacer's format."""
         sensors = [CAMERA] if hasattr(self.config, "front") else []
         if self.lidar is not None:
             sensors.append(("LIDAR", "SECTOR_LIDAR", "DISCRETIZED_SECTOR_LIDAR")[min(self.lidar.levels, 2)])
         return {"model_metadata.json": self.actions_of_car.metadata(sensors, algorithm)}
 
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
-        """What the policy sees."""
+        """The policy's observations."""
         return {**self.road_terms(config), **self.lidar_term()}
 
     def rewards_of(self, config: RacerConfig) -> Mapping[str, Reward]:
-        """What the car earns, by the names of ``config.rewards``: what a learner's reward function gives, where there is one.
+        """The rewards, by the names of ``config.rewards``, or the result of a learner's reward function.
 
-        A term of one's own has the parameters ``world`` and ``car: CarArrays``, which has all that DeepRacer's reward functions are told.
+        Your own term has the parameters ``world`` and ``car: CarArrays``, which has all parameters of DeepRacer's reward functions.
         """
         if self.race:
             return {"reward": Reward(self.race.function or from_workers)}
@@ -220,7 +222,7 @@ class Racer(DeclaredTask):
         return seen
 
     def lidar_term(self) -> Mapping[str, Observation]:
-        """What the lidar sees, where the car has one."""
+        """The lidar's observations, if the car has one."""
         if (lidar := self.lidar) is None:
             return {}
         seen = Observation(
@@ -237,7 +239,7 @@ class Racer(DeclaredTask):
         return {"lidar": seen}
 
     def own_terms(self) -> Mapping[str, Observation]:
-        """What a car knows of itself."""
+        """The car's observations of itself."""
         return {
             "speed": Observation(racing.car_speed, unit="m/s"),
             "steering": Observation(racing.car_steering, unit="rad"),
@@ -245,7 +247,7 @@ class Racer(DeclaredTask):
 
 
 class RacerPixels(Racer):
-    """A car that sees through its camera alone: an image of 160 x 120 in grey, 2 actions, 15 control steps a second, episodes of 60 s."""
+    """A car that sees only through its camera: a grey image of 160 x 120, 2 actions, 15 control steps a second, episodes of 60 s."""
 
     config_type = RacerPixelsConfig
 
@@ -272,12 +274,12 @@ class RacerPixels(Racer):
 
 
 class RacerPixelsAndState(RacerPixels):
-    """A car that sees through its camera, and knows its speed and steering: an image and 2 numbers, 2 actions."""
+    """A car that sees through its camera and observes its speed and steering: an image and 2 numbers, 2 actions."""
 
     config_type = RacerPixelsAndStateConfig
 
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
-        """Numbers and image in groups of their own; the critic sees the road."""
+        """Numbers and image in separate groups; the critic sees the road."""
         return {
             "policy": {**self.own_terms(), **self.lidar_term()},
             "front": Image("front"),
@@ -286,7 +288,7 @@ class RacerPixelsAndState(RacerPixels):
 
 
 def from_workers(task: Racer) -> torch.Tensor:
-    """What a reward function gives that is not compiled, NaN where it failed, shape ``(worlds,)``; waits for the device.
+    """Rewards of a reward function that is not compiled, NaN where it failed, shape ``(worlds,)``; waits for the device.
 
     Raises:
         RewardFailed: A call does not return, floods its output or ends its process.
@@ -297,9 +299,13 @@ def from_workers(task: Racer) -> torch.Tensor:
 
 
 def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
-    """What the policy's output does: one of the choices, or steering and speed between their ends."""
+    """The actions: one of the choices, or steering and speed between their limits."""
     if space.choices:
-        return Choice(racing.choose, names=space.names)
+        targets = [
+            (Target("steering", "position", "rad", angle), Target("speed", "velocity", "m/s", speed))
+            for angle, speed in space.radians
+        ]
+        return Choice(racing.choose, names=space.names, targets=targets)
     low, high = (math.radians(end) for end in space.steering)
     slow, fast = space.speed
     steering = {"scale": (high - low) / 2, "offset": (high + low) / 2, "kind": "position", "unit": "rad"}
@@ -311,13 +317,13 @@ def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
 
 
 def resetting(config: RacerConfig) -> Mapping[str, Event]:
-    """What puts cars back, in each control step, where they are."""
+    """The event that puts cars back, in each control step, if enabled."""
     step = 1.0 / config.control_hz
     return {"put_back": Event(resets.put_back, when="interval", seconds=(step, step))} if config.continuous else {}
 
 
 def mishap_metrics(config: RacerConfig) -> Mapping[str, Metric]:
-    """How often an episode's car was put back and why, and its penalties [s], where cars are put back."""
+    """Metrics if cars are put back: how often and why, and the penalties [s]."""
     if not config.continuous:
         return {}
     penalties = {"off_track": config.off_track_penalty, "crash": config.crash_penalty}
@@ -326,6 +332,6 @@ def mishap_metrics(config: RacerConfig) -> Mapping[str, Metric]:
 
 
 def tracks_of(config: RacerConfig) -> list[Track]:
-    """The tracks that a configuration names; those of the store, where this process has one. Raises BadTrack."""
+    """The tracks that a configuration names, also from the store if this process has one. Raises BadTrack."""
     store = Store(os.environ["MUSTER_STORE"]) if os.environ.get("MUSTER_STORE") else None
     return [resolve(name, store) for name in config.tracks]

@@ -1,4 +1,4 @@
-"""Physics that differs from world to world, declared by pattern: what, of which parts, how much, and when it is drawn.
+"""Physics that differs between worlds, declared by pattern: quantity, parts, range, and time of the draws.
 
 >>> Randomize("friction", geoms="*_foot", range=(0.3, 1.2), operation="set")
 >>> Randomize("center_of_mass", bodies="trunk", range={"x": (-0.025, 0.025), "z": (-0.03, 0.03)}, operation="add")
@@ -31,16 +31,16 @@ PARTS = ("bodies", "geoms", "joints", "actuators")
 
 @dataclass(frozen=True)
 class Quantity:
-    """What can be randomised.
+    """A quantity that can be randomised.
 
     Args:
-        parts: What a pattern selects: one of :data:`PARTS`, or empty: it belongs to the whole world.
-        unit: Of its values, for ``add`` and ``set``.
+        parts: Kind of parts that a pattern selects, one of :data:`PARTS`; empty: the quantity belongs to the whole world.
+        unit: Unit of its values, for ``add`` and ``set``.
         meaning: One line for a table.
-        axes: Names of its components, empty for one number.
-        default_axes: Those that are drawn where the declaration names none; empty: one number for all of them.
-        operations: Those that make sense.
-        signed: Whether its values can be negative; the others are held at 0 and above.
+        axes: Names of its components; empty for a single number.
+        default_axes: Components drawn if the declaration names none; empty: one number for all of them.
+        operations: Supported operations.
+        signed: Whether its values can be negative; others are kept at 0 or above.
     """
 
     parts: str
@@ -89,7 +89,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "motor_strength": Quantity("actuators", "1", "all that an actuator's force is made of", operations=("scale",)),
     "gravity": Quantity("", "m/s^2", "acceleration of free fall, in the world frame", _XYZ, ("z",), signed=True),
 }
-"""By name: what :class:`Randomize` takes."""
+"""The quantities of :class:`Randomize`, by name."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ class Randomize:
         what: A name of :data:`QUANTITIES`.
 
     Raises:
-        ValueError: An argument can't be used: there is no such quantity, it belongs to other parts, or the range is empty or would
-            make a value impossible.
+        ValueError: An argument is invalid: the quantity is unknown or belongs to other parts, or the range is empty or would make a value
+            impossible.
     """
 
     what: str
@@ -117,23 +117,23 @@ class Randomize:
     actuators: Pattern | None = None
     """Actuators, by the names of the joints that they drive."""
     range: Ends | Mapping[str, Ends]
-    """Least and greatest value drawn, of ``normal`` mean and standard deviation; or one pair for each axis by its name."""
+    """Least and greatest drawn value, or for ``normal`` mean and standard deviation; or one pair per axis, by its name."""
     operation: Operation = "scale"
-    """What the drawn number does to the model's own value. It never compounds: each draw begins from the model's own."""
+    """How the drawn number changes the model's own value. Changes never compound: each draw applies to the model's original value."""
     distribution: Distribution = "uniform"
-    """``log_uniform`` is uniform in the logarithm: half and double are as likely."""
+    """``log_uniform`` is uniform in the logarithm: half and double are equally likely."""
     when: When = "startup"
-    """Once in a world's life, at the beginning of each episode, or now and then (and once at the beginning)."""
+    """Drawn once when a world is built, at the beginning of each episode, or at intervals (and once at the beginning)."""
     seconds: Ends | None = None
-    """Of an interval: least and greatest time between two draws [s]."""
+    """For an interval: least and greatest time between two draws [s]."""
     shared: bool = False
     """One draw for all matched parts of a world, not one for each."""
     axes: tuple[str, ...] = ()
-    """Components that are drawn, one draw each, such as ``("slide", "torsion")``; by default those that the quantity says."""
+    """Drawn components, one draw each, such as ``("slide", "torsion")``; by default those of the quantity."""
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of a payload: where, in the body's frame [m]."""
+    """Position of a payload in the body's frame [m]."""
     robot: str | None = "robot"
-    """Robot or object that the parts belong to; None, of geoms: any geom of a world, the ground among them."""
+    """Robot or object with these parts; None, only for geoms: any geom of a world, including the ground."""
 
     def __post_init__(self) -> None:
         if self.what not in QUANTITIES:
@@ -165,12 +165,12 @@ class Randomize:
 
     @property
     def pattern(self) -> Pattern | None:
-        """What selects the parts; None: it belongs to the whole world."""
+        """The pattern of the parts; None: the quantity belongs to the whole world."""
         return getattr(self, self.quantity.parts) if self.quantity.parts else None
 
     @property
     def drawn_axes(self) -> tuple[str, ...]:
-        """The components that are drawn, in their order; empty: one number for the whole."""
+        """The drawn components, in order; empty: one number for the whole."""
         named = self.range if isinstance(self.range, Mapping) else self.axes or self.quantity.default_axes
         return tuple(axis for axis in self.quantity.axes if axis in named)
 
@@ -183,7 +183,7 @@ class Randomize:
 
     @property
     def places(self) -> dict[str, int]:
-        """Places of its numbers, such as ``range``, ``range.x`` and ``seconds``, and how many each has."""
+        """Places of its numbers, such as ``range``, ``range.x`` and ``seconds``, and the count of each."""
         if isinstance(self.range, Mapping):
             found = {f"range.{axis}": 2 for axis in self.drawn_axes}
         else:
@@ -191,7 +191,7 @@ class Randomize:
         return found | ({"seconds": 2} if self.when == "interval" else {})
 
     def check_numbers(self, place: str, values: Sequence[float]) -> None:
-        """Refuse numbers that a job gives one of :attr:`places`, as if they were declared. Raises ValueError."""
+        """Check numbers that a job sets at one of :attr:`places`, as if they were declared. Raises ValueError."""
         for pair in zip(values[::2], values[1::2], strict=True):
             if place == "seconds":
                 dataclasses.replace(self, seconds=pair)

@@ -1,4 +1,4 @@
-"""Tasks as environments of rsl_rl, for runner scripts of one's own::
+"""Tasks as environments of rsl_rl, for your own runner scripts::
 
     from rsl_rl.runners import OnPolicyRunner
     from worker.tasks.rsl_rl_env import make
@@ -6,8 +6,8 @@
     runner = OnPolicyRunner(make("Cartpole", 64, seed=1), config, "logs", "cpu")
     runner.learn(100, init_at_random_ep_len=True)
 
-Observation groups are ``policy``, ``critic`` and those of the task's own, such as a camera's. Images become float32 from -0.5 to 0.5, shape (worlds, channels, height, width):
-rsl_rl's convolutions take numbers, and a task gives bytes.
+Observation groups are ``policy``, ``critic`` and the task's own, such as a camera's. Images become float32 from -0.5 to 0.5, shape
+(worlds, channels, height, width), since rsl_rl's convolutions take floats and a task returns bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TaskVecEnv(VecEnv):
     """A task as rsl_rl's ``VecEnv``; its control step stays a CUDA graph.
 
     Args:
-        task: Its buffers stay its own: all that is handed out is a copy.
+        task: The task; the environment returns copies of its buffers.
 
     Attributes:
         cfg: The task's configuration, as plain values.
@@ -48,7 +48,7 @@ class TaskVecEnv(VecEnv):
 
     @property
     def unwrapped(self) -> TaskVecEnv:
-        """This environment: rsl_rl looks for :attr:`step_dt` behind wrappers."""
+        """This environment, since rsl_rl looks for :attr:`step_dt` behind wrappers."""
         return self
 
     @property
@@ -72,8 +72,8 @@ class TaskVecEnv(VecEnv):
 
         Returns:
             Observations as :meth:`get_observations` gives them, rewards, shape (worlds,), float32, whether episodes ended, shape
-            (worlds,), int64, and ``time_outs``, shape (worlds,), float32. Where episodes ended, ``log`` has the sum of each reward
-            term over an episode, as a mean of those episodes, once for each: shape (episodes,), float32.
+            (worlds,), int64, and ``time_outs``, shape (worlds,), float32. If episodes ended, ``log`` has each reward term's sum over an
+            episode, averaged over the ended episodes and repeated once for each of them: shape (episodes,), float32.
         """
         before = self.task.statistics.clone()
         self.task.step(actions)
@@ -92,12 +92,12 @@ def make(task: str, num_envs: int = 1, *, seed: int = 0, device: str = "cpu", **
     Args:
         task: Name or ``module:Class``, as :func:`worker.tasks.find_task` takes it.
         num_envs: Number of worlds.
-        seed: Of the worlds.
+        seed: Seed of the worlds.
         device: ``"cpu"`` or ``"cuda:<n>"``.
         **config: Fields of the task's configuration, by name.
 
     Raises:
-        ValueError: No such task, no such field of its configuration, or a value out of range.
+        ValueError: The task or a field of its configuration does not exist, or a value is out of range.
     """
     task_type = find_task(task)
     known = {item.name for item in dataclasses.fields(task_type.config_type)}
@@ -109,12 +109,12 @@ def make(task: str, num_envs: int = 1, *, seed: int = 0, device: str = "cpu", **
 
 
 def as_floats(observations: Mapping[str, torch.Tensor] | TensorDict, groups: Iterable[str]) -> TensorDict:
-    """Copies of ``groups`` as rsl_rl takes them.
+    """Copies of ``groups`` in the form that rsl_rl expects.
 
     Args:
-        observations: As a task has them: shape (worlds, ...), float32, images uint8. Its buffers change with the next step, while
-            rsl_rl keeps what it was given until after that.
-        groups: Which of them.
+        observations: Observations of a task: shape (worlds, ...), float32, images uint8. The task overwrites its buffers in the next
+            step, while rsl_rl keeps observations for longer.
+        groups: Names of the groups to copy.
 
     Returns:
         float32, images from -0.5 to 0.5; batch size (worlds,).

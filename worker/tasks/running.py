@@ -94,7 +94,7 @@ class Running(DeclaredTask):
     def robot(self, config: RunningConfig) -> Robot:
         """The robot without the file's floor; its own parts do not collide with each other.
 
-        It stands clear of the ground: half under it, as some files have it, the solver would ask for more capacity than it ever needs.
+        It starts clear of the ground. Some files place it half below, where the solver would need more capacity than it ever does later.
         """
         return Robot(
             f"newton:{self.asset}",
@@ -105,7 +105,7 @@ class Running(DeclaredTask):
         )
 
     def declare(self, config: RunningConfig) -> Declaration:
-        """The terms; in the step of a fall there is no reward but its own."""
+        """The terms; the step of a fall has no reward except the fall's own."""
         view = self.views["robot"]
         ranges, strongest = view.ranges, max(view.efforts)
         speed = config.velocity_scale
@@ -136,7 +136,7 @@ class Running(DeclaredTask):
                 "heading": Reward(heading, unless_terminated=True),
                 "up": Reward(terms.is_upright, threshold=0.93, unless_terminated=True),
                 "alive": Reward(terms.alive),
-                # of what the policy asked for: beyond the motors' limits nothing else would hold it back from drifting away
+                # of the unclipped action: beyond the motors' limits nothing else would keep it from drifting away
                 "action": Reward(terms.action_squared, unless_terminated=True),
                 "energy": Reward(energy, scale=speed, strongest=strongest, unless_terminated=True),
                 "limits": Reward(limits, strongest=strongest, unless_terminated=True),

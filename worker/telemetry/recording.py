@@ -212,14 +212,13 @@ class Recording:
         self._just_ended[world] = done
         self._sums[world] += fields["reward"], 1
         if done:
-            self._end_episode(world, fields)
+            self._end_episode(world, fields, rows.cause(step, world))
 
-    def _end_episode(self, world: int, fields: Mapping[str, Any]) -> None:
+    def _end_episode(self, world: int, fields: Mapping[str, Any], cause: str) -> None:
         total, steps = self._sums[world]
         self._sums[world] = 0.0
         self.episodes += 1
         self._ended[world] += 1
-        cause = "time_out" if fields["time_out"] else "termination"
         known = {
             **self._facts,
             "world": str(world),

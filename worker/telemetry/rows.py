@@ -11,9 +11,10 @@ import numpy as np
 if TYPE_CHECKING:
     from worker.tasks.task import Task
 
-MARKS = ("episode", "age", "done", "time_out")
+MARKS = ("episode", "age", "done", "time_out", "cause")
 """Whole numbers of a row: how many episodes of the world have ended before this step since the tap began, steps on the clock after the
-step (0 where the next episode has begun), whether the step ended an episode, whether by the clock alone."""
+step (0 where the next episode has begun), whether the step ended an episode, whether by the clock alone, and of the episode that ended
+last the cause, an index into ``Layout.causes``."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Layout:
         terms: Names of the reward terms.
         control_hz: Control steps of a simulated second.
         images: The observation groups of images that are kept: name, channels (3: red, green and blue; 1), height and width [px].
+        causes: Names of what can end an episode, see :class:`worker.tasks.ended.Ended`.
     """
 
     worlds: int
@@ -44,6 +46,7 @@ class Layout:
     terms: tuple[str, ...]
     control_hz: float
     images: tuple[tuple[str, int, int, int], ...] = ()
+    causes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, task: Task, worlds: int, rows: int, images: bool = True) -> Layout:
@@ -57,12 +60,12 @@ class Layout:
         seen = (
             tuple((name, 3 if shape[0] % 3 == 0 else 1, *shape[1:]) for name, shape in shapes.items()) if images else ()
         )
-        return cls(*numbers, *names, task.config.control_hz, seen)
+        return cls(*numbers, *names, task.config.control_hz, seen, tuple(task.ended.names))
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Layout:
         """Reads the text of :meth:`to_json`."""
-        names = {name: tuple(value[name]) for name in ("observations", "actions", "terms")}
+        names = {name: tuple(value[name]) for name in ("observations", "actions", "terms", "causes")}
         return cls(**{**value, **names, "images": tuple(map(tuple, value["images"]))})
 
     def to_json(self) -> dict[str, Any]:
@@ -149,6 +152,10 @@ class Rows:
     def mark(self, name: str) -> np.ndarray:
         """One of :data:`MARKS`, shape ``(steps, worlds)``."""
         return self.marks[:, :, MARKS.index(name)]
+
+    def cause(self, step: int, world: int) -> str:
+        """What ended the episode that ended in this step; of another step, the world's last episode."""
+        return self.layout.causes[int(self.mark("cause")[step, world])]
 
     def pictures(self, step: int) -> dict[str, np.ndarray]:
         """The image of each camera after a step, by its group: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""

@@ -65,6 +65,7 @@ def _fill(
         marks[row, world, 1] = episodes.ages[world]
         marks[row, world, 2] = wp.where(episodes.dones[world], 1, 0)
         marks[row, world, 3] = wp.where(episodes.time_outs[world], 1, 0)
+        marks[row, world, 4] = episodes.causes[world]
     values[row, world, column] = value
 
 

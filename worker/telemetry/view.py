@@ -230,8 +230,7 @@ class Policy:
         now = time.time_ns()
         for world in np.flatnonzero(rows.mark("done")[-1]):
             total, steps = self._sums[world]
-            cause = "time_out" if rows.mark("time_out")[-1, world] else "termination"
-            text = f"world {world}: episode {self._ended[world]} ended by {cause} after {counted(int(steps), 'step')}, return {total:.4g}"
+            text = f"world {world}: episode {self._ended[world]} ended by {rows.cause(-1, world)} after {counted(int(steps), 'step')}, return {total:.4g}"
             screen.say([(now, "muster", text)])
             screen.curve("episodes", [total], np.array([now]), [])
             self._sums[world], self._ended[world] = 0.0, self._ended[world] + 1

@@ -1,1 +1,1 @@
-"""What runs inside each peer's own environment: it imports nothing of Muster where that is not installed."""
+"""Programs for each peer's own environment; in those without Muster they import nothing of it."""

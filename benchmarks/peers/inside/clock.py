@@ -1,6 +1,6 @@
-"""When each iteration of rsl_rl's runner ended, by the clock, with all that it logs and saves; nothing of the runner is replaced.
+"""Wall-clock end of each iteration of rsl_rl's runner, including its logging and saving; nothing of the runner is replaced.
 
-It imports rsl_rl alone, so that it works in every environment that has that.
+It imports only rsl_rl, so it works in every environment with that.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 
 
 class Clock:
-    """Notes what rsl_rl's runner does: install it before the runner is built.
+    """Records the work of rsl_rl's runner; install it before building the runner.
 
     Args:
-        began: When the process was started [s since 1970].
-        worlds: How many worlds the runner trains on.
+        began: Start of the process [s since 1970].
+        worlds: Number of worlds.
         steps: Control steps of every world in one iteration.
-        wait: Waits until the device is done.
+        wait: Function that waits for the device.
     """
 
     def __init__(self, began: float, worlds: int, steps: int, wait: Callable[[], None]) -> None:
@@ -31,13 +31,13 @@ class Clock:
         self.startup = 0.0
         """Seconds from the start of the process to the first iteration."""
         self.curve: list[dict[str, Any]] = []
-        """A point an iteration: ``seconds`` since training began, ``env_steps``, ``reward``, ``episode_length``, ``collect_s``,
+        """One point per iteration: ``seconds`` since training began, ``env_steps``, ``reward``, ``episode_length``, ``collect_s``,
         ``learn_s``."""
         self.checkpoints: list[dict[str, Any]] = []
-        """``path``, ``iteration`` and ``seconds`` of each file that was saved."""
+        """``path``, ``iteration`` and ``seconds`` of each saved file."""
 
     def install(self) -> None:
-        """Have rsl_rl's runners and loggers tell this clock."""
+        """Make rsl_rl's runners and loggers report to this clock."""
         from rsl_rl.runners import OnPolicyRunner
         from rsl_rl.utils.logger import Logger
 
@@ -74,7 +74,7 @@ class Clock:
         self.checkpoints.append({**point, "seconds": time.perf_counter() - self._started})
 
     def write(self, path: str, **facts: Any) -> None:
-        """Everything noted, and ``facts``, as JSON into ``path``."""
+        """Write all records, and ``facts``, as JSON to ``path``."""
         found = {"startup_s": self.startup, "curve": self.curve, "checkpoints": self.checkpoints, **facts}
         Path(path).write_text(json.dumps(found, default=str))
 
@@ -90,7 +90,7 @@ def _note_saves(runner: Any, note: Callable[[str], None]) -> None:
 
 
 def versions(*names: str) -> dict[str, str]:
-    """Versions of the packages that are installed."""
+    """Versions of the installed packages."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = {}
@@ -103,7 +103,7 @@ def versions(*names: str) -> dict[str, str]:
 
 
 def device_facts() -> tuple[str, Callable[[], None]]:
-    """What the device is called, and a function that waits for it."""
+    """Name of the device, and a function that waits for it."""
     import torch
 
     if torch.cuda.is_available():

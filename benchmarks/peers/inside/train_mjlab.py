@@ -1,7 +1,7 @@
 """One training of mjlab by its own script, in its own environment: ``python train_mjlab.py JSON``; ``benchmarks.peers.mjlab`` calls it.
 
 The JSON has ``task``, ``worlds``, ``iterations``, ``steps``, ``hidden_sizes``, ``limits``, ``save_every``, ``seed``, ``logs``, ``out``
-and ``began``. Changed are those numbers and the logger, which is TensorBoard instead of a service on the network.
+and ``began``. Only those numbers and the logger are changed; the logger is TensorBoard instead of a network service.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from clock import Clock, device_facts, versions
 
 
 def contract(environment: Any) -> dict[str, Any]:
-    """What the numbers of the policy mean: its observations, and of each action the joint, scale [rad] and offset [rad]."""
+    """Meaning of the policy's numbers: its observations, and each action's joint, scale [rad] and offset [rad]."""
     from mjlab.rl.exporter_utils import get_base_metadata
 
     known = get_base_metadata(environment, "-")
@@ -35,7 +35,7 @@ def contract(environment: Any) -> dict[str, Any]:
 
 
 def probe(runner: Any, least: int = 8) -> dict[str, Any]:
-    """What mjlab's own policy makes of some observations, after the last iteration, to compare with converted weights."""
+    """Actions of mjlab's own policy for some observations after the last iteration, to compare with converted weights."""
     import torch
 
     seen = runner.env.get_observations().to(runner.device)[:least]

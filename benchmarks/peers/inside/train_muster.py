@@ -16,7 +16,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.metrics import read_metrics
 
 CURVE = {"collect_s": "collect_seconds", "learn_s": "learn_seconds", "seconds": "total_seconds"}
-"""What a point of the curve calls these metrics."""
+"""Names of these metrics in a point of the curve."""
 SHARED = ("env_steps", "reward", "episode_length")
 
 

@@ -21,7 +21,7 @@ def main() -> None:
     clock = Clock(asked["began"], asked["worlds"], asked["steps"], wait)
     clock.install()
     with tempfile.TemporaryDirectory() as store:
-        # one world says how the job is configured; the worlds that are trained on are the runner's own
+        # one world gives the job's configuration; the runner builds its own worlds for training
         loop = build_loop({**asked, "worlds": 1}, Path(store))
         share = type(loop.share).of(0, 1, asked["worlds"])
         task = build_task(type(loop.task), loop.config, share, loop.gang, asked["seed"])

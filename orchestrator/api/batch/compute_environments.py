@@ -241,9 +241,9 @@ def _describe(context: Context, environment: ComputeEnvironment) -> dict[str, An
 
 def _own_resources(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
     """``computeResources`` of a built-in environment: the hosts that its engine has now."""
-    engine = context.controller.engine
+    engine = context.reconciler.engine
     served = [environment.name] if environment.name in engine.names else []
-    cpus = int(sum(host.cpus for host in engine.capacity(served, FRESH)))
+    cpus = int(sum(host.cpus for each in engine.capacity(served, FRESH).values() for host in each.places))
     return {
         "type": "EC2",
         "allocationStrategy": "BEST_FIT_PROGRESSIVE",

@@ -23,7 +23,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
 from orchestrator.api.permissions import Operation
 from orchestrator.api.sources import with_teacher
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from shared_store.parent import TeacherCopy
 
 OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
@@ -86,8 +86,8 @@ def validate(operation: str, request: object) -> dict[str, Any]:
     return request
 
 
-def call(controller: Controller, operation: str, request: object, idempotency_key: str | None = None) -> dict[str, Any]:
-    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Controller.check_writable`)."""
+def call(reconciler: Reconciler, operation: str, request: object, idempotency_key: str | None = None) -> dict[str, Any]:
+    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Reconciler.check_writable`)."""
     handler = OPERATIONS.get(operation)
     if handler is None:
         instead = next((use for part, use in _INSTEAD.items() if part in operation), None)
@@ -100,23 +100,23 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
     permitted = Operation(operation)
     permissions.check(permitted)
     if permitted.reads:
-        with controller.database.session() as session:
-            answer: dict[str, Any] = permissions.shown(handler(Context(session, controller), checked))
+        with reconciler.database.session() as session:
+            answer: dict[str, Any] = permissions.shown(handler(Context(session, reconciler), checked))
             return answer
 
     def carry_out(session: Session, teacher: TeacherCopy | None = None) -> dict[str, Any]:
-        return handler(Context(session, controller, idempotency_key, teacher=teacher), checked)
+        return handler(Context(session, reconciler, idempotency_key, teacher=teacher), checked)
 
-    controller.check_writable(adds=operation.startswith(_ADDING))
+    reconciler.check_writable(adds=operation.startswith(_ADDING))
     try:
         if operation == "SubmitJob":
             response = with_teacher(
-                controller, lambda teacher: controller.submissions.call(lambda session: carry_out(session, teacher))
+                reconciler, lambda teacher: reconciler.submissions.call(lambda session: carry_out(session, teacher))
             )
         else:
-            with controller.writing, controller.database.session() as session:
+            with reconciler.writing, reconciler.database.session() as session:
                 response = carry_out(session)
     except IntegrityError as error:  # two calls at the same instant
         raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
-    controller.wake()
+    reconciler.wake()
     return response

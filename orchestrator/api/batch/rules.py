@@ -24,8 +24,8 @@ _SHORTEST_TIMEOUT = 60
 _DEEPEST_SPEC = 100
 """Levels of MUSTER_SPEC; what is nested much deeper can be stored, but no answer could show it."""
 _MALFORMED = (
-    "MUSTER_SPEC, MUSTER_STALL_TIMEOUT or MUSTER_LOG_LIMIT (bytes, at least 1048576) is malformed; they are written by "
-    "`muster submit`"
+    "MUSTER_SPEC, MUSTER_STALL_TIMEOUT, MUSTER_LOG_LIMIT (bytes, at least 1048576) or MUSTER_RANKS_PER_NODE (at least 1) is malformed; "
+    "they are written by `muster submit`"
 )
 
 

@@ -164,9 +164,9 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
 def _check_secrets(context: Context, queue: JobQueue, gang: GangSpec) -> None:
     containers = [node.container for node in gang.nodes if node.container.get("secrets")]
     if containers:
-        engines = queue_engines(context.session, queue.name, context.controller.engine.names[0])
+        engines = queue_engines(context.session, queue.name, context.reconciler.engine.names[0])
         try:
-            context.controller.engine.check_secrets(engines, containers, queue.name)
+            context.reconciler.engine.check_secrets(engines, containers, queue.name)
         except SecretsError as error:
             raise ClientError(str(error)) from None
 
@@ -204,7 +204,7 @@ def _check_run(context: Context, run: str, named: bool) -> None:
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
         )
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
-        if named and (writer := context.controller.peers.writer(context.controller.store.run(run))):
+        if named and (writer := context.reconciler.peers.writer(context.reconciler.store.run(run))):
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
 
 
@@ -229,7 +229,7 @@ def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> Non
     context.session.flush()
     free = size if not waits else 1 if all(each.kind == "SEQUENTIAL" for each in waits) else 0
     # as the controller would set it at its first look, which then has nothing to write
-    since = {"queued_since": parent.created_at - context.controller.clock.drift}
+    since = {"queued_since": parent.created_at - context.reconciler.clock.drift}
     ready = {**since, "status": Status.RUNNABLE, "status_reason": WAITING, "runnable_at": parent.created_at}
     _insert_children(context.session, parent, range(free), ready)
     _insert_children(context.session, parent, range(free, size), {**since, "status": Status.SUBMITTED})

@@ -25,7 +25,7 @@ from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
 from orchestrator.control import monitoring
 from orchestrator.control.deliveries import Deliveries
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
@@ -40,14 +40,14 @@ BROWSER_HEADERS = [
 
 
 def create_app(
-    controller: Controller,
+    reconciler: Reconciler,
     access: Access | None = None,
     limit: RateLimit | None = None,
     deliveries: Deliveries | None = None,
 ) -> FastAPI:
     """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
     app = FastAPI(title="Muster", version=__version__, docs_url=None, openapi_url="/api/openapi.json", redoc_url=None)
-    app.state.controller = controller
+    app.state.reconciler = reconciler
     app.state.deliveries = deliveries
     app.state.closing = threading.Event()
     app.include_router(native.router)
@@ -64,8 +64,8 @@ def create_app(
     def healthz() -> JSONResponse:
         """Alive, and which version; 503 with the reason while the database can't be used."""
         try:
-            controller.database.check()
-            trouble = controller.trouble
+            reconciler.database.check()
+            trouble = reconciler.trouble
         except DatabaseError as error:
             trouble = str(error)
         if trouble is not None:
@@ -76,7 +76,7 @@ def create_app(
     def metrics() -> Response:
         """Metrics for Prometheus: jobs, waits, restarts, GPU-seconds used and lost, steps a second, hosts; for keys with all queues."""
         permissions.check_all_queues(permissions.Operation.READ_MONITORING)
-        return Response(monitoring.exposition(controller), media_type=monitoring.CONTENT_TYPE)
+        return Response(monitoring.exposition(reconciler), media_type=monitoring.CONTENT_TYPE)
 
     @app.post("/v1/{operation}", include_in_schema=False)
     async def aws_batch(operation: str, request: Request) -> JSONResponse:
@@ -84,7 +84,7 @@ def create_app(
         body = await _body(request)
         name = batch.operation_names().get(operation, operation)
         key = request.headers.get(IDEMPOTENCY_HEADER)
-        return JSONResponse(await run_in_threadpool(batch.call, controller, name, body, key))
+        return JSONResponse(await run_in_threadpool(batch.call, reconciler, name, body, key))
 
     @app.api_route("/v1/tags/{arn:path}", methods=["GET", "POST", "DELETE"], include_in_schema=False)
     async def aws_tags(arn: str, request: Request) -> JSONResponse:
@@ -95,7 +95,7 @@ def create_app(
             raise ClientError(f"{name}: expected a JSON object")
         if request.method == "DELETE":
             body = {"tagKeys": request.query_params.getlist("tagKeys")}
-        return JSONResponse(await run_in_threadpool(batch.call, controller, name, {**body, "resourceArn": arn}))
+        return JSONResponse(await run_in_threadpool(batch.call, reconciler, name, {**body, "resourceArn": arn}))
 
     @app.get("/api/docs", include_in_schema=False)
     def describe() -> HTMLResponse:
@@ -107,7 +107,7 @@ def create_app(
     async def cloudwatch_logs(request: Request) -> Response:
         """CloudWatch Logs: the operation in a header (JSON 1.1)."""
         target = request.headers.get("x-amz-target", "")
-        return await logs.answer(controller, app.state.closing, target, lambda: _body(request))
+        return await logs.answer(reconciler, app.state.closing, target, lambda: _body(request))
 
     return app
 

@@ -18,7 +18,7 @@ from orchestrator.api.logs import eventstream
 from orchestrator.api.logs.events import Event, LogFile
 from orchestrator.api.logs.filter import Matcher
 from orchestrator.api.logs.streams import newest_streams
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import now
 
 LONGEST_SESSION = 3 * 3600.0
@@ -42,13 +42,13 @@ log = logging.getLogger("muster.api")
 class LiveTail:
     """Follows streams from the moment of its construction. Not for more than one thread at a time."""
 
-    def __init__(self, controller: Controller, wanted: Callable[[str], bool], matches: Matcher) -> None:
+    def __init__(self, reconciler: Reconciler, wanted: Callable[[str], bool], matches: Matcher) -> None:
         """Args:
         controller: Whose jobs' logs are followed.
         wanted: Whether a stream is asked for, by its name.
         matches: Whether a line is asked for.
         """
-        self._controller, self._wanted, self._matches = controller, wanted, matches
+        self._reconciler, self._wanted, self._matches = reconciler, wanted, matches
         self._started = self._asked = now()
         self._next_refresh = 0.0
         self._read: dict[str, int] = {}
@@ -91,9 +91,9 @@ class LiveTail:
     def _refresh(self) -> list[str]:
         """Take up streams that began; returns the names of those that ended before this call: the next look is their last."""
         asked = now()
-        with self._controller.database.session() as session:
+        with self._reconciler.database.session() as session:
             since = max(self._started, self._asked - _OVERLAP)
-            streams = newest_streams(session, self._controller.store, since=since)
+            streams = newest_streams(session, self._reconciler.store, since=since)
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
         found = [stream for stream in streams if stream.name not in self._over and self._wanted(stream.name)]
         self._open.update({stream.name: stream.file for stream in found})

@@ -31,7 +31,7 @@ from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
 from orchestrator.api.permissions import Operation, Refusal, check
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import Job, now
 from orchestrator.persistence.session import DatabaseError
 
@@ -73,7 +73,7 @@ def invalid(message: str) -> LogsError:
 
 
 async def answer(
-    controller: Controller, closing: threading.Event, target: str, body: Callable[[], Awaitable[Any]]
+    reconciler: Reconciler, closing: threading.Event, target: str, body: Callable[[], Awaitable[Any]]
 ) -> Response:
     """Answer one request; a refusal is an answer, too.
 
@@ -91,9 +91,9 @@ async def answer(
         check(Operation(operation))
         request = validate(operation, await body())
         if operation == "StartLiveTail":
-            return await run_in_threadpool(start_live_tail, controller, closing, request)
+            return await run_in_threadpool(start_live_tail, reconciler, closing, request)
         return await run_in_threadpool(
-            lambda: JSONResponse(OPERATIONS[operation](controller, request), media_type=_JSON)
+            lambda: JSONResponse(OPERATIONS[operation](reconciler, request), media_type=_JSON)
         )
     except LogsError as error:
         return error.response()
@@ -133,11 +133,11 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 # -- operations -------------------------------------------------------------------------------------------------------
 
 
-def get_log_events(controller: Controller, request: dict[str, Any]) -> dict[str, Any]:
+def get_log_events(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
     """GetLogEvents: a page of one stream, from either end or from a token. Tokens are positions: they never expire."""
     _check_group(request)
-    with controller.database.session() as session:
-        stream = _named(controller, session, request["logStreamName"], Operation.GET_LOG_EVENTS)
+    with reconciler.database.session() as session:
+        stream = _named(reconciler, session, request["logStreamName"], Operation.GET_LOG_EVENTS)
     view = stream.file.look()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
@@ -161,7 +161,7 @@ def get_log_events(controller: Controller, request: dict[str, Any]) -> dict[str,
     }
 
 
-def filter_log_events(controller: Controller, request: dict[str, Any]) -> dict[str, Any]:
+def filter_log_events(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
     """FilterLogEvents: the matching events of many streams, merged by time; the newest first with startFromHead false.
 
     A page ends after ``limit`` events, 1 MiB, or two seconds of search. Its token is the id of the last event that was looked at.
@@ -174,7 +174,7 @@ def filter_log_events(controller: Controller, request: dict[str, Any]) -> dict[s
         raise invalid("The specified nextToken is invalid.")
     ascending = token[1] == "f" if token else request.get("startFromHead", True)
     since, before = request.get("startTime", 0), request.get("endTime", 10**14) + 1  # inclusive here, as AWS has it
-    streams = _searched(controller, request, since)
+    streams = _searched(reconciler, request, since)
     if len(request.get("logStreamNames", ())) != 1 and any(stream.live for stream in streams):
         before = min(before, newest)
     reached = (int(token[2]), int(token[3]), int(token[4])) if token else None
@@ -209,7 +209,7 @@ def filter_log_events(controller: Controller, request: dict[str, Any]) -> dict[s
     return response
 
 
-def describe_log_streams(controller: Controller, request: dict[str, Any]) -> dict[str, Any]:
+def describe_log_streams(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeLogStreams: by name or by the time of the last event, of the newest 1,000 streams that fit."""
     _check_group(request)
     by_time = request.get("orderBy", "LogStreamName") == "LastEventTime"
@@ -221,8 +221,8 @@ def describe_log_streams(controller: Controller, request: dict[str, Any]) -> dic
     token = _LIST_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
     if given and not token:
         raise invalid("The specified nextToken is invalid.")
-    with controller.database.session() as session:
-        streams = newest_streams(session, controller.store, prefix)
+    with reconciler.database.session() as session:
+        streams = newest_streams(session, reconciler.store, prefix)
     times = {stream.name: first_and_last(stream.path) for stream in streams} if by_time else {}
     keyed = [((known[1] if (known := times.get(s.name)) else 0, s.name), s) for s in streams]
     descending = request.get("descending", False)
@@ -238,7 +238,7 @@ def describe_log_streams(controller: Controller, request: dict[str, Any]) -> dic
     return response
 
 
-def describe_log_groups(controller: Controller, request: dict[str, Any]) -> dict[str, Any]:
+def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeLogGroups: the one group, where it fits what is asked for."""
     prefix, pattern = request.get("logGroupNamePrefix"), request.get("logGroupNamePattern")
     if prefix is not None and pattern is not None:
@@ -250,7 +250,7 @@ def describe_log_groups(controller: Controller, request: dict[str, Any]) -> dict
         wanted = wanted and any(_is_group(identifier) for identifier in identifiers)
     if not wanted or request.get("logGroupClass", "STANDARD") != "STANDARD":
         return {"logGroups": []}
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         created = session.scalar(select(func.min(Job.created_at))) or 0
     group: dict[str, Any] = {"logGroupName": LOG_GROUP, "creationTime": created, "arn": f"{GROUP_ARN}:*"}
     if pattern is None:
@@ -258,7 +258,7 @@ def describe_log_groups(controller: Controller, request: dict[str, Any]) -> dict
     return {"logGroups": [group]}
 
 
-OPERATIONS: dict[str, Callable[[Controller, dict[str, Any]], dict[str, Any]]] = {
+OPERATIONS: dict[str, Callable[[Reconciler, dict[str, Any]], dict[str, Any]]] = {
     "GetLogEvents": get_log_events,
     "FilterLogEvents": filter_log_events,
     "DescribeLogStreams": describe_log_streams,
@@ -266,7 +266,7 @@ OPERATIONS: dict[str, Callable[[Controller, dict[str, Any]], dict[str, Any]]] = 
 }
 
 
-def start_live_tail(controller: Controller, closing: threading.Event, request: dict[str, Any]) -> Response:
+def start_live_tail(reconciler: Reconciler, closing: threading.Event, request: dict[str, Any]) -> Response:
     """StartLiveTail: an event stream of the lines that are written from now on. Streams need not exist yet."""
     for identifier in request["logGroupIdentifiers"]:
         if not _is_group(identifier):
@@ -282,7 +282,7 @@ def start_live_tail(controller: Controller, closing: threading.Event, request: d
 
     start = {"logGroupIdentifiers": [GROUP_ARN], "logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
-    tail = LiveTail(controller, asked_for, matches)
+    tail = LiveTail(reconciler, asked_for, matches)
     stream = messages(tail, start, f"{ACCOUNT}:{LOG_GROUP}", closing)
     return StreamingResponse(stream, media_type="application/vnd.amazon.eventstream")
 
@@ -308,22 +308,22 @@ def _check_group(request: dict[str, Any]) -> None:
         raise _no_group(given[0])
 
 
-def _named(controller: Controller, session: Any, name: str, operation: Operation) -> Stream:
-    stream = find_stream(session, controller.store, name, operation)
+def _named(reconciler: Reconciler, session: Any, name: str, operation: Operation) -> Stream:
+    stream = find_stream(session, reconciler.store, name, operation)
     if stream is None:
         raise LogsError("ResourceNotFoundException", f"The specified log stream does not exist: {name}")
     return stream
 
 
-def _searched(controller: Controller, request: dict[str, Any], since: int) -> list[Stream]:
+def _searched(reconciler: Reconciler, request: dict[str, Any], since: int) -> list[Stream]:
     """The streams that a search is about; those named must exist."""
     names, prefix = request.get("logStreamNames"), request.get("logStreamNamePrefix")
     if names and prefix:
         raise invalid("Only one of logStreamNames and logStreamNamePrefix can be used.")
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         if names:
-            return [_named(controller, session, name, Operation.FILTER_LOG_EVENTS) for name in dict.fromkeys(names)]
-        return newest_streams(session, controller.store, prefix or "", since - _LATE)
+            return [_named(reconciler, session, name, Operation.FILTER_LOG_EVENTS) for name in dict.fromkeys(names)]
+        return newest_streams(session, reconciler.store, prefix or "", since - _LATE)
 
 
 def _pattern(text: str) -> log_filter.Matcher:

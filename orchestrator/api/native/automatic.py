@@ -21,7 +21,7 @@ from orchestrator.api import permissions
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import submit
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
@@ -67,9 +67,9 @@ class _Training:
 class AutomaticEvaluations:
     """The thread that sees new checkpoints and submits their evaluations."""
 
-    def __init__(self, controller: Controller, interval: float = LOOK) -> None:
+    def __init__(self, reconciler: Reconciler, interval: float = LOOK) -> None:
         """``interval``: seconds between two looks."""
-        self._controller, self._interval = controller, interval
+        self._reconciler, self._interval = reconciler, interval
         self._known: dict[str, _Training | None] = {}
         """By job, of those that run; None of one without a section ``evaluation``."""
         self._backoff = Backoff(log)
@@ -88,14 +88,14 @@ class AutomaticEvaluations:
     def _loop(self) -> None:
         self._isolated("checkpoints kept for nobody", self._let_go)
         while not self._ending.wait(self._interval):
-            if self._controller.trouble is None:
+            if self._reconciler.trouble is None:
                 self.look()
 
     def look(self) -> None:
         """One look at the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
         self._backoff.tidy()
         self._isolated("open evaluations", self._close_ended)
-        active = self._controller.work_queue.active()
+        active = self._reconciler.work_queue.active()
         self._known = {job: self._known[job] for job in active if job in self._known}
         for job in active:
             self._isolated(f"job {job}", partial(self._look_at, job))
@@ -117,25 +117,25 @@ class AutomaticEvaluations:
 
     def _let_go(self) -> None:
         """Give up the claims of a controller that was killed before it submitted their evaluations."""
-        with self._controller.database.session() as session:
+        with self._reconciler.database.session() as session:
             rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open.is_(False))).all()
             names = [row.run for row in rows]
         for name in names:
-            run = self._controller.store.run(name)
+            run = self._reconciler.store.run(name)
             for checkpoint in wanted_checkpoints(run):
                 evaluation_is_over(run, checkpoint)
 
     def _close_ended(self) -> None:
         """Give up the claim on checkpoints whose evaluation has ended, well or not."""
-        with self._controller.database.session() as session:
+        with self._reconciler.database.session() as session:
             rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open)).all()
             ended = [(row.run, row.checkpoint or "") for row in rows if not _is_open(session, row)]
         for name, checkpoint in ended:
             self._isolated(f"run {name}", partial(self._close, name, checkpoint))
 
     def _close(self, name: str, checkpoint: str) -> None:
-        evaluation_is_over(self._controller.store.run(name), checkpoint)
-        with self._controller.writing, self._controller.database.session() as session:
+        evaluation_is_over(self._reconciler.store.run(name), checkpoint)
+        with self._reconciler.writing, self._reconciler.database.session() as session:
             row = session.get_one(AutomaticEvaluation, name)
             row.open = False
             job = session.get(Job, row.job)
@@ -149,8 +149,8 @@ class AutomaticEvaluations:
         if training is None:
             return
         run, iterations = training.run, int(training.spec["train"]["iterations"])
-        checkpoints = list_checkpoints(run)
-        with self._controller.database.session() as session:
+        checkpoints = [each for each in list_checkpoints(run) if each.is_scheduled]
+        with self._reconciler.database.session() as session:
             job, row = session.get(Job, job_id), session.get(AutomaticEvaluation, run.name)
             if job is None or job.is_terminal or job.stop_reason is not None:
                 return
@@ -164,7 +164,7 @@ class AutomaticEvaluations:
 
     def _training(self, job_id: str) -> _Training | None:
         if job_id not in self._known:
-            with self._controller.database.session() as session:
+            with self._reconciler.database.session() as session:
                 job = session.get(Job, job_id)
                 if job is None or job.first_epoch is None:
                     return None
@@ -180,7 +180,7 @@ class AutomaticEvaluations:
         if wanted is None or job.first_epoch is None:
             return None
         owner, directory = job.owner or permissions.THIS_PROCESS.name, gang.options.directory
-        run, place = self._controller.store.run(job.run), place_of(job.queue, job.share, wanted)
+        run, place = self._reconciler.store.run(job.run), place_of(job.queue, job.share, wanted)
         return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, place, directory, wanted)
 
     @staticmethod
@@ -192,20 +192,20 @@ class AutomaticEvaluations:
         return chosen.path.is_dir() and bool(chosen.manifest)
 
     def _note(self, training: _Training, counted: Counted, problem: str | None = None) -> None:
-        with self._controller.writing, self._controller.database.session() as session:
+        with self._reconciler.writing, self._reconciler.database.session() as session:
             row = _row(session, training, counted)
             row.problem = problem or row.problem  # it stands until an evaluation is submitted
 
     def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
         """Submit the evaluation, as the training's owner, in one transaction with what is known of the training's checkpoints."""
-        controller, run = self._controller, training.run
-        controller.check_writable(adds=True)
-        controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+        reconciler, run = self._reconciler, training.run
+        reconciler.check_writable(adds=True)
+        reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
         token = permissions.current_identity.set(permissions.Identity(training.owner))
         try:
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
-            with controller.writing, controller.database.session() as session:
-                context = Context(session, controller)
+            with reconciler.writing, reconciler.database.session() as session:
+                context = Context(session, reconciler)
                 tags = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}
                 answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
                 row = _row(session, training, counted)
@@ -218,7 +218,7 @@ class AutomaticEvaluations:
             return
         finally:
             permissions.current_identity.reset(token)
-        controller.wake()
+        reconciler.wake()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
         log.info("job %s evaluates %s@%d%s", answer["jobId"][:8], run.name, chosen.iteration, passed)
 

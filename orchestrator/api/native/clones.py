@@ -7,6 +7,7 @@ the source does no harm.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import select
@@ -19,22 +20,24 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import Changes, answered, check, submit
 from orchestrator.api.native.runs import spec_of
 from orchestrator.api.sources import with_teacher
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import shown
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import first_description, forget_gone_run
 from orchestrator.spec.changes import override
-from orchestrator.spec.model import ALGORITHMS, Spec, validate
+from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
+from orchestrator.spec.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
 from shared_store.parent import NewRun, RunExists, TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.wording import Refused
 
 
 def clone(
-    controller: Controller, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
+    reconciler: Reconciler, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
 ) -> dict[str, Any]:
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; what can be refused is refused before a job exists.
 
@@ -49,33 +52,43 @@ def clone(
         ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
-    return with_teacher(controller, lambda teacher: _clone(controller, source, name, changes, idempotency_key, teacher))
+    return with_teacher(reconciler, lambda teacher: _clone(reconciler, source, name, changes, idempotency_key, teacher))
+
+
+def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> dict[str, Any]:
+    """The definition that :func:`clone` would register, its queue and whose weights it would begin with; nothing is submitted.
+
+    Raises ClientError as :func:`clone`.
+    """
+    with reconciler.database.session() as session:
+        spec, chosen = _checked(Context(session, reconciler), source, name, changes)
+    definition = _check_submission(reconciler, spec, changes, name)
+    return {
+        "definition": definition,
+        "queue": spec.queue,
+        "parent": {"run": source.name, "iteration": chosen.iteration},
+    }
 
 
 def _clone(
-    controller: Controller,
+    reconciler: Reconciler,
     source: Run,
     name: str,
     changes: Changes,
     idempotency_key: str | None,
     teacher: TeacherCopy | None,
 ) -> dict[str, Any]:
-    with controller.database.session() as session:
-        context = Context(session, controller, idempotency_key)
+    with reconciler.database.session() as session:
+        context = Context(session, reconciler, idempotency_key)
         if earlier := _answered(context, name):
             return earlier
-        spec = _changed(session, source, name, changes)
+        spec, chosen = _checked(context, source, name, changes)
         new = context.run(name)
-        _check_free(session, new)
-        chosen = _choose(source, changes)
-        _check_weights(source, chosen, spec)
-    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    with controller.database.session() as session:  # before the copy: not for who may not submit it
-        check(Context(session, controller), spec, changes.directory, f"clone {name}")
-    controller.check_writable(adds=True)
-    if shortage := controller.disk.shortage("store"):
+    _check_submission(reconciler, spec, changes, name)  # before the copy: not for who may not submit it
+    reconciler.check_writable(adds=True)
+    if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
-    making = NewRun(controller.store, controller.peers.id, source.name, chosen)
+    making = NewRun(reconciler.store, reconciler.peers.id, source.name, chosen)
     environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
     try:
         with making:
@@ -83,8 +96,8 @@ def _clone(
                 making.copy()
             except DamagedCheckpoint as error:
                 raise refusal(source, chosen, error) from None
-            with controller.writing, controller.database.session() as session:
-                context = Context(session, controller, idempotency_key, making, teacher)
+            with reconciler.writing, reconciler.database.session() as session:
+                context = Context(session, reconciler, idempotency_key, making, teacher)
                 if earlier := _answered(context, name):
                     return earlier
                 _check_free(session, new)
@@ -96,8 +109,24 @@ def _clone(
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
-    controller.wake()
+    reconciler.wake()
     return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
+
+
+def _checked(context: Context, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
+    """The spec of the new run, and the checkpoint with its weights. Raises ClientError."""
+    spec = _changed(context.session, source, name, changes)
+    _check_free(context.session, context.run(name))
+    chosen = _choose(source, changes)
+    _check_weights(source, chosen, spec)
+    return spec, chosen
+
+
+def _check_submission(reconciler: Reconciler, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
+    """The definition of the job, which may be submitted. Raises ClientError."""
+    reconciler.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
+    with reconciler.database.session() as session:
+        return check(Context(session, reconciler), spec, changes.directory, f"clone {name}")
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:
@@ -165,6 +194,24 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
         raise ClientError(
             f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
         )
+    if name in ALGORITHMS and (misfit := _of_other_size(manifest, spec.train)):
+        key, there, here = misfit
+        raise ClientError(
+            f"{where} was learnt with train.config.{key}: {there}, and the clone would have {here}, for which its network has another "
+            "size; leave the setting as it is, or submit a new training"
+        )
+
+
+def _of_other_size(manifest: Mapping[str, Any], train: Train) -> tuple[str, str, str] | None:
+    """The first setting of an installed task for which the policy has another size than in a checkpoint: its key, there, here."""
+    kind, learnt = task_config(train.task), manifest.get("train")
+    if kind is None or not isinstance(learnt, dict) or manifest.get("task") != train.task:
+        return None
+    try:
+        there, here = (kind.configured(config or {}).policy_sizes for config in (learnt.get("config"), train.config))
+    except Refused:  # of what another version has written
+        return None
+    return next(((key, there[key], here[key]) for key in there if key in here and there[key] != here[key]), None)
 
 
 _EXISTS = "run {} exists already: give the clone another --name"

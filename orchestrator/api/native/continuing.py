@@ -13,9 +13,12 @@ from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
+from orchestrator.api.racing_tracks import check_tracks
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import gang_needs
+from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import Spec
@@ -61,8 +64,9 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
     definition = compile_definition(spec, directory)
     queue = context.queue(spec.queue)
     permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(queue.name))
+    check_tracks(context.reconciler.store, spec.model_dump(mode="json", exclude_none=True))
     shape = gang_needs(definition["nodeProperties"]).shape
-    if problem := fit_in_queue(context.session, context.controller.engine, queue, shape).problem:
+    if problem := fit_in_queue(context.session, context.reconciler.engine, queue, shape).problem:
         raise ClientError(f"{what}: {problem}")
     limits.check_document("RegisterJobDefinition", definition)
     return definition
@@ -94,3 +98,13 @@ def submit(
     job = context.session.get(Job, answer["jobId"])
     assert job is not None
     return answer, job
+
+
+def submit_alone(reconciler: Reconciler, spec: Spec, directory: str, what: str) -> dict[str, Any]:
+    """:func:`submit` of a job that neither continues nor begins a run, and its commit. Raises ClientError."""
+    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    reconciler.check_writable(adds=True)
+    with reconciler.writing, reconciler.database.session() as session:
+        answer, _ = submit(Context(session, reconciler), spec, directory, what, {})
+    reconciler.wake()
+    return answer

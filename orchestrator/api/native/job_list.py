@@ -14,9 +14,9 @@ from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.api import permissions
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.damaged import DAMAGED, DamagedRow, reading
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
@@ -72,20 +72,20 @@ def find_jobs(
 ) -> dict[str, Any]:
     """The jobs that the caller may see, the newest first, with the progress of trainings; ``total`` of them, and how many in each state."""
     wanted = Wanted(tuple(status), queue, search)
-    return page_of_jobs(controller_of(request), wanted, offset, most)
+    return page_of_jobs(reconciler_of(request), wanted, offset, most)
 
 
-def page_of_jobs(controller: Controller, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE) -> dict[str, Any]:
+def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE) -> dict[str, Any]:
     """``jobs``, ``total`` and ``counts`` (by state, of all states) of what is wanted."""
     conditions = wanted.conditions()
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         grouped = select(Job.status, func.count()).where(*conditions).group_by(Job.status)
         counts = {str(status): int(count) for status, count in session.execute(grouped)}
         query = select(Job).where(*conditions, *wanted.in_states).order_by(Job.created_at.desc(), Job.id.desc())
         query = query.options(selectinload(Job.attempts)).offset(offset).limit(most)
         jobs = session.scalars(query).all()
-        hidden = _runs_of_others(session, controller, jobs)
-        found = [_row(controller, job, job.run not in hidden) for job in jobs]
+        hidden = _runs_of_others(session, reconciler, jobs)
+        found = [_row(reconciler, job, job.run not in hidden) for job in jobs]
     states = wanted.statuses or tuple(Status)
     return {"jobs": found, "total": sum(counts.get(each, 0) for each in states), "counts": counts}
 
@@ -102,22 +102,22 @@ def kind_of(spec: Mapping[str, Any] | None) -> str:
     return next((kind for kind in KINDS if (spec or {}).get(kind)), "command")
 
 
-def _runs_of_others(session: Session, controller: Controller, jobs: Sequence[Job]) -> set[str]:
+def _runs_of_others(session: Session, reconciler: Reconciler, jobs: Sequence[Job]) -> set[str]:
     """Runs of these jobs that belong to queues that the caller may not see: a job may continue a run of another queue."""
     if permissions.visible_queues() is None:
         return set()
     names = {job.run for job in jobs}
     _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(names))).all()  # one query instead of many
-    owners = {name: owner_of(session, controller.store.run(name)) for name in names}
+    owners = {name: owner_of(session, reconciler.store.run(name)) for name in names}
     return {name for name, owner in owners.items() if owner is None or not permissions.is_visible(owner)}
 
 
-def _row(controller: Controller, job: Job, is_visible: bool) -> dict[str, Any]:
+def _row(reconciler: Reconciler, job: Job, is_visible: bool) -> dict[str, Any]:
     row = {
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "statusReason": controller.reason(job) or job.status_reason,
+        "statusReason": reconciler.reason(job) or job.status_reason,
         "queue": job.queue,
         "owner": job.owner,
         "run": job.run,
@@ -136,17 +136,17 @@ def _row(controller: Controller, job: Job, is_visible: bool) -> dict[str, Any]:
         return {**row, "kind": "command", "nodes": 0, "statusReason": DAMAGED, "progress": None}
     training = spec.get("train")
     iterations = training.get("iterations") if isinstance(training, Mapping) else None
-    told = _told(controller, job, gang.main) if is_visible and iterations else None
+    told = _told(reconciler, job, gang.main) if is_visible and iterations else None
     progress = {**told, "iterations": iterations} if told else None
     return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes), "progress": progress}
 
 
-def _told(controller: Controller, job: Job, main: int) -> dict[str, Any] | None:
+def _told(reconciler: Reconciler, job: Job, main: int) -> dict[str, Any] | None:
     """How far a training is: what its main node said last, and its curve; None before its first iteration."""
     if not job.attempts:
         return None
-    curve = curves.of(controller.store.run(job.run), job)
-    live = controller.bus.progress(job.id, job.attempts[-1].number, main) or {}
+    curve = curves.of(reconciler.store.run(job.run), job)
+    live = reconciler.bus.progress(job.id, job.attempts[-1].number, main) or {}
     last = curve[-1] if curve else {}
     iteration = max(live.get("iteration") or 0, last.get("iteration") or 0)
     if not iteration:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import time
@@ -14,13 +15,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from orchestrator.api import permissions
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, controller_of
+from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.callers import user_name
 from orchestrator.api.native.continuing import submit
 from orchestrator.api.native.model_routes import find_model, owner_of_model
 from orchestrator.api.permissions import LeagueOf, Operation
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
@@ -39,6 +40,8 @@ from shared_store.wording import shown
 
 router = APIRouter()
 
+LEAGUE_TAG, MODEL_TAG = "muster:league", "muster:model"
+"""Tags of a race's job: the league, and the model as ``NAME@VERSION``."""
 _RACER = re.compile(r"\w[\w .'-]{0,63}")
 _Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 _Moment = Annotated[float, Field(ge=0, lt=1e11, allow_inf_nan=False)]
@@ -98,7 +101,7 @@ class DisqualifyRequest(_Strict):
 @router.get("/leagues")
 def list_leagues(request: Request) -> list[dict[str, Any]]:
     """All leagues by name, with their rules; ``problem`` says of one what is altered."""
-    store = controller_of(request).store
+    store = reconciler_of(request).store
     try:
         return [_described(leagues.find(store, name)) for name in leagues.names(store)]
     except LeagueError as error:
@@ -108,15 +111,19 @@ def list_leagues(request: Request) -> list[dict[str, Any]]:
 @router.post("/leagues")
 def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
     """Create a league; its rules are never changed."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     permissions.check(Operation.CREATE_LEAGUE)
-    controller.check_writable(adds=True)
+    reconciler.check_writable(adds=True)
     if body.opens is not None and body.closes is not None and body.opens >= body.closes:
         raise ClientError("opens: the league would close before it opens")
+    if body.closes is not None and body.closes <= time.time():
+        raise ClientError(
+            f"closes: {leagues.moment(body.closes)} is past: no race could ever start; name a later time, or none"
+        )
     given = body.model_dump()
     rules = Rules(**{key: given[key] for key in asdict(Rules())})
     try:
-        digests = {name: leagues.digest_of_track(controller.store, name) for name in body.track}
+        digests = {name: leagues.digest_of_track(reconciler.store, name) for name in body.track}
         league = League(
             name=body.name,
             track=tuple(body.track),
@@ -129,7 +136,7 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
             most_entries=body.most_entries,
             track_digests={name: digest for name, digest in digests.items() if digest is not None},
         )
-        return _described(leagues.create(controller.store, league))
+        return _described(leagues.create(reconciler.store, league))
     except LeagueError as error:
         raise ClientError(str(error)) from None
     except OSError as error:
@@ -139,7 +146,7 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
 @router.get("/leagues/{name}")
 def read_league(request: Request, name: str) -> dict[str, Any]:
     """The rules of a league, and how many entries it has."""
-    return _described(_find(controller_of(request), name)[0])
+    return _described(_find(reconciler_of(request), name)[0])
 
 
 @router.get("/leagues/{name}/entries")
@@ -147,7 +154,7 @@ def league_table(
     request: Request, name: str, every: bool = Query(default=False, description="all entries of each racer")
 ) -> list[dict[str, Any]]:
     """The table, the first one ahead: of each racer the best entry, then those that are not ranked and why."""
-    stored, league = _find(controller_of(request), name)
+    stored, league = _find(reconciler_of(request), name)
     try:
         return [row.document() for row in table(stored.contenders(), league.rules.ranking, every=every)]
     except LeagueError as error:
@@ -157,17 +164,19 @@ def league_table(
 @router.get("/leagues/{name}/entries/{number}")
 def read_entry(request: Request, name: str, number: int) -> Any:
     """An entry with its race and, where it is disqualified, the ruling; ``problem`` says what is altered of it or of its model."""
-    controller = controller_of(request)
-    stored, _ = _find(controller, name)
+    reconciler = reconciler_of(request)
+    stored, _ = _find(reconciler, name)
     found: dict[str, Any] = {"entry": number}
     try:
         found = stored.entry(number)
-        model = find_model(controller, found["model"]["name"], found["model"]["version"])
+        model = find_model(reconciler, found["model"]["name"], found["model"]["version"])
         _verify(model)
         _check_digest(model, found)
     except UnknownLeague as error:
         raise _refused(error) from None
-    except (LeagueError, ClientError) as error:
+    except LeagueError as error:
+        found["problem"] = stored.problem(number, error)
+    except ClientError as error:  # of its model
         found["problem"] = str(error)
     return permissions.shown({**found, "ruling": stored.ruling(number)})
 
@@ -180,9 +189,9 @@ def race(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key answers what the first one did."""
-    controller = controller_of(request)
-    stored, league = _find(controller, name)
-    model = find_model(controller, body.model, body.version)
+    reconciler = reconciler_of(request)
+    stored, league = _find(reconciler, name)
+    model = find_model(reconciler, body.model, body.version)
     permissions.check(Operation.RACE, owner_of_model(model))
     try:
         if closed := league.closed(time.time()):
@@ -190,7 +199,7 @@ def race(
         stored.admit(_caller(), _racer(body))
     except LeagueError as error:
         raise _refused(error) from None
-    return _submit(controller, league, model, body.directory, idempotency_key)
+    return _submit(reconciler, league, model, body.directory, idempotency_key)
 
 
 @router.post("/leagues/{name}/entries/{number}/races")
@@ -202,29 +211,29 @@ def rerun(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit the race of an entry once more, whether the league is open or not; on a CPU its laps are the same."""
-    controller = controller_of(request)
-    stored, league = _find(controller, name)
+    reconciler = reconciler_of(request)
+    stored, league = _find(reconciler, name)
     try:
         entry = stored.entry(number)
     except LeagueError as error:
         raise _refused(error) from None
-    model = find_model(controller, entry["model"]["name"], entry["model"]["version"])
+    model = find_model(reconciler, entry["model"]["name"], entry["model"]["version"])
     permissions.check(Operation.RERUN_ENTRY, owner_of_model(model))
     _check_digest(model, entry)
-    return _submit(controller, league, model, body.directory, idempotency_key)
+    return _submit(reconciler, league, model, body.directory, idempotency_key)
 
 
 @router.post("/leagues/{name}/entries")
 def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     """Make an entry of a race that has ended: the model's digest, the evaluation and its laps, for good."""
-    controller = controller_of(request)
-    stored, league = _find(controller, name)
-    model = find_model(controller, body.model, body.version)
+    reconciler = reconciler_of(request)
+    stored, league = _find(reconciler, name)
+    model = find_model(reconciler, body.model, body.version)
     permissions.check(Operation.ENTER_LEAGUE, owner_of_model(model))
-    controller.check_writable(adds=True)
-    checkpoint = _checked(controller, league, model)
-    job = _race_of(controller, league, body.job)
-    summary = _summary(controller, league, model, checkpoint, job)
+    reconciler.check_writable(adds=True)
+    checkpoint = _checked(reconciler, league, model)
+    job = _race_of(reconciler, league, body.job)
+    summary = _summary(reconciler, league, model, checkpoint, job)
     entry = {
         "racer": _racer(body),
         "owner": _caller(),
@@ -244,10 +253,10 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
 @router.post("/leagues/{name}/entries/{number}/disqualify")
 def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest) -> dict[str, Any]:
     """Disqualify an entry for good, with the reason; the entry itself stays as it is. For the league's owner."""
-    controller = controller_of(request)
-    stored, league = _find(controller, name)
+    reconciler = reconciler_of(request)
+    stored, league = _find(reconciler, name)
     permissions.check(Operation.DISQUALIFY, LeagueOf(league.name, league.owner))
-    controller.check_writable(adds=True)
+    reconciler.check_writable(adds=True)
     try:
         stored.disqualify(number, body.reason, _caller())
     except LeagueError as error:
@@ -257,10 +266,20 @@ def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest
     return {"entry": number, "ruling": stored.ruling(number)}
 
 
-def _find(controller: Controller, name: str) -> tuple[StoredLeague, League]:
+def entered_jobs(request: Request, name: str) -> set[str]:
+    """The jobs whose races are entries of a league; of an altered entry nothing is known."""
+    stored, _ = _find(reconciler_of(request), name)
+    found = set()
+    for number in stored.numbers():
+        with contextlib.suppress(LeagueError):
+            found.add(str(stored.entry(number)["evaluation"]["job"]))
+    return found
+
+
+def _find(reconciler: Reconciler, name: str) -> tuple[StoredLeague, League]:
     """Raises ClientError: there is no such league, or its rules were altered."""
     try:
-        stored = leagues.find(controller.store, name)
+        stored = leagues.find(reconciler.store, name)
         return stored, stored.definition()
     except LeagueError as error:
         raise _refused(error) from None
@@ -304,15 +323,15 @@ def _suffix() -> str:
 
 
 def _submit(
-    controller: Controller, league: League, model: Model, directory: str, idempotency_key: str | None
+    reconciler: Reconciler, league: League, model: Model, directory: str, idempotency_key: str | None
 ) -> dict[str, Any]:
     """Submit the race of a model. Raises ClientError."""
-    _checked(controller, league, model)
+    _checked(reconciler, league, model)
     facts = model.facts()
-    controller.check_writable(adds=True)
-    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    with controller.writing, controller.database.session() as session:
-        context = Context(session, controller, idempotency_key)
+    reconciler.check_writable(adds=True)
+    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    with reconciler.writing, reconciler.database.session() as session:
+        context = Context(session, reconciler, idempotency_key)
         earlier = submission.answered(context)
         if earlier is not None:
             answer = submission.answer(earlier)
@@ -322,17 +341,18 @@ def _submit(
                 spec = race_job(league, model.reference, facts, queue, _suffix())
             except SpecError as error:
                 raise ClientError(str(error)) from None
-            answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {})
-    controller.wake()
+            tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
+            answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {}, tags)
+    reconciler.wake()
     return {**answer, "model": model.name, "version": model.version, "run": facts["run"]}
 
 
-def _checked(controller: Controller, league: League, model: Model) -> Checkpoint:
+def _checked(reconciler: Reconciler, league: League, model: Model) -> Checkpoint:
     """The checkpoint that a sound model was made of, which a race loads. Raises ClientError."""
     _verify(model)
     facts = model.facts()
     try:
-        league.check_tracks(controller.store)
+        league.check_tracks(reconciler.store)
     except LeagueError as error:
         raise _refused(error) from None
     kind = task_config(str(facts.get("task")))
@@ -340,7 +360,7 @@ def _checked(controller: Controller, league: League, model: Model) -> Checkpoint
         raise ClientError(
             f"model {model.reference} is of task {facts.get('task')}; a league takes models of the racer's installed tasks"
         )
-    name, run = str(facts.get("checkpoint")), controller.store.run(str(facts.get("run")))
+    name, run = str(facts.get("checkpoint")), reconciler.store.run(str(facts.get("run")))
     found = checkpoint_called(run.checkpoints, name)
     gone = ClientError(
         f"model {model.reference}: checkpoint {name} of run {run.name}, which a race loads, is gone; register one that is there",
@@ -357,9 +377,9 @@ def _checked(controller: Controller, league: League, model: Model) -> Checkpoint
     return found
 
 
-def _race_of(controller: Controller, league: League, reference: str) -> str:
+def _race_of(reconciler: Reconciler, league: League, reference: str) -> str:
     """Id of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         job = find_job(session, reference, permissions.visible_queues())
         if job is None:
             raise ClientError(f"job {reference} does not exist; `muster list` shows the jobs", 404)
@@ -373,9 +393,9 @@ def _race_of(controller: Controller, league: League, reference: str) -> str:
         return job.id
 
 
-def _summary(controller: Controller, league: League, model: Model, checkpoint: Checkpoint, job: str) -> dict[str, Any]:
+def _summary(reconciler: Reconciler, league: League, model: Model, checkpoint: Checkpoint, job: str) -> dict[str, Any]:
     """The evaluation that a job made of the model's checkpoint, which is a race of this league. Raises ClientError."""
-    run = controller.store.run(model.facts()["run"])
+    run = reconciler.store.run(model.facts()["run"])
     found = next((each for each in list_evaluations(run) if each.get("job") == job), None)
     if found is None:
         raise ClientError(
@@ -400,7 +420,7 @@ def _verify(model: Model) -> None:
     try:
         model.verify()
     except DamagedBundle as error:
-        raise ClientError(f"model {model.reference} was altered: {error}", CONFLICT) from None
+        raise ClientError(f"model {model.reference}: {bundles.reason(error, model.path)}", CONFLICT) from None
 
 
 def _digest(model: Model) -> str:
@@ -408,7 +428,7 @@ def _digest(model: Model) -> str:
     try:
         return str(bundles.read_manifest(model.path)["digest"])
     except (DamagedBundle, DamagedFile) as error:
-        raise ClientError(f"model {model.reference} was altered: {error}", CONFLICT) from None
+        raise ClientError(f"model {model.reference}: {bundles.reason(error, model.path)}", CONFLICT) from None
 
 
 def _check_digest(model: Model, entry: dict[str, Any]) -> None:

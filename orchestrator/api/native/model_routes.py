@@ -9,10 +9,10 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.ownership import owner_of
 from shared_store import bundles, models
@@ -36,7 +36,7 @@ class RegisterRequest(BaseModel):
 @router.get("/models")
 def list_models(request: Request) -> Any:
     """The newest version of each model that the caller may see, by name."""
-    store = controller_of(request).store
+    store = reconciler_of(request).store
     newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
     return permissions.shown([_described(model) for model in newest if permissions.is_visible(owner_of_model(model))])
 
@@ -49,8 +49,8 @@ def read_model(
     verify: bool = Query(default=False, description="read every file and check its digest"),
 ) -> Any:
     """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
-    controller = controller_of(request)
-    model = find_model(controller, name, version)
+    reconciler = reconciler_of(request)
+    model = find_model(reconciler, name, version)
     permissions.check(Operation.READ_MODEL, owner_of_model(model))
     found = _described(model, verify)
     try:
@@ -58,30 +58,30 @@ def read_model(
         found["weights"] = bundles.read_manifest(model.bundle)["files"].get(bundles.POLICY, {}).get("sha256")
     except DamagedBundle as error:
         found["problem"] = found.get("problem") or str(error)
-    return permissions.shown({**found, "versions": [each.version for each in models.versions(controller.store, name)]})
+    return permissions.shown({**found, "versions": [each.version for each in models.versions(reconciler.store, name)]})
 
 
 @router.post("/runs/{name}/models")
 def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     """Keep the exported bundle of a checkpoint as the next version of a model, permanently."""
-    controller = controller_of(request)
-    run = permitted_run(controller, name, Operation.REGISTER_MODEL)
-    controller.check_writable(adds=True)
-    if shortage := controller.disk.shortage("store"):
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.REGISTER_MODEL)
+    reconciler.check_writable(adds=True)
+    if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
     checkpoint = choose(run, body.checkpoint)
     if checkpoint is None:
         raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         record = owner_of(session, run)
         queue, owner = (record.queue, record.owner) if record else ("", None)
     try:
-        there = models.versions(controller.store, body.name)
+        there = models.versions(reconciler.store, body.name)
         if there:
             permissions.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
         facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
         model = models.register(
-            controller.store, body.name, run, checkpoint, facts, controller.peers.id, again=body.again
+            reconciler.store, body.name, run, checkpoint, facts, reconciler.peers.id, again=body.again
         )
     except AlreadyRegistered as error:
         raise ClientError(str(error), CONFLICT) from None
@@ -94,10 +94,10 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     return permissions.shown(_described(model))
 
 
-def find_model(controller: Controller, name: str, version: int | None) -> Model:
+def find_model(reconciler: Reconciler, name: str, version: int | None) -> Model:
     """A version of a model, the newest where none is named. Raises ClientError."""
     try:
-        return models.find(controller.store, name, version)
+        return models.find(reconciler.store, name, version)
     except UnknownModel as error:
         raise ClientError(str(error), 404) from None
     except (ModelError, DamagedFile) as error:

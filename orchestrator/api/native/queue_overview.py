@@ -11,14 +11,14 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, is_visible
 from orchestrator.control.compute_environments import own_queues
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
 from orchestrator.control.usage import held_by, placements_of, usage_at
-from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.hosts import Capacity, Queued, engine_of
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.resources import Resources
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
@@ -44,13 +44,14 @@ def queues(
 
     How full a host is counts the jobs of all queues.
     """
-    return overview(controller_of(request), queue)
+    return overview(reconciler_of(request), queue)
 
 
-def overview(controller: Controller, only: str = "") -> dict[str, Any]:
+def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
     """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises ClientError."""
-    engine = controller.engine
-    with controller.database.session() as session:
+    engine = reconciler.engine
+    capacities = engine.capacity()
+    with reconciler.database.session() as session:
         policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
         rows = [
             row for row in session.scalars(select(JobQueue).order_by(JobQueue.name)) if is_visible(JobsOf(row.name))
@@ -60,9 +61,9 @@ def overview(controller: Controller, only: str = "") -> dict[str, Any]:
             raise ClientError(f"there is no queue {only[:100]!r}; there is {there}", 404)
         rows = sorted((row for row in rows if only in ("", row.name)), key=lambda row: -row.priority)
         read = {row.name: read_queue(row, policies) for row in rows}
-        held = open_attempts(session, controller.work_queue.active())
+        held = open_attempts(session, reconciler.work_queue.active())
         decays = {name: queue.policy.decay_seconds for name, queue in read.items() if queue.policy}
-        used = usage_at(session, controller.clock.now(), decays, held)
+        used = usage_at(session, reconciler.clock.now(), decays, held)
         counts = _counts(session)
         found = [
             {
@@ -74,7 +75,7 @@ def overview(controller: Controller, only: str = "") -> dict[str, Any]:
                 "counts": counts.get(row.name, {}),
                 "inUse": _amounts(attempt for job, attempt in held if job.queue == row.name),
                 "shares": _shares(read[row.name], used, held),
-                "front": _front(controller, session, row.name, MOST if only else FIRST),
+                "front": _front(reconciler, session, row.name, MOST if only else FIRST),
             }
             for row in rows
         ]
@@ -83,7 +84,7 @@ def overview(controller: Controller, only: str = "") -> dict[str, Any]:
     return {
         "queues": found,
         "computeEnvironments": environments,
-        "engines": _engines(controller),
+        "engines": _engines(reconciler, capacities),
         "hosts": [
             {
                 **{key: value for key, value in asdict(host).items() if key in ("name", "cpus", "memory", "away")},
@@ -91,7 +92,8 @@ def overview(controller: Controller, only: str = "") -> dict[str, Any]:
                 "gpus": len(host.gpus),
                 "inUse": asdict(taken.get(host.name, Resources())),
             }
-            for host in engine.capacity()
+            for capacity in capacities.values()
+            for host in capacity.machines
         ],
     }
 
@@ -105,9 +107,9 @@ def _counts(session: Session) -> dict[str, dict[str, int]]:
     return found
 
 
-def _front(controller: Controller, session: Session, queue: str, most: int) -> list[dict[str, Any]]:
+def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> list[dict[str, Any]]:
     """The jobs of a queue that start next, in their order, with why each waits and since when [Unix ms]."""
-    order, times = controller.front(queue, most)
+    order, times = reconciler.front(queue, most)
     jobs = {job.id: job for job in session.scalars(select(Job).where(Job.id.in_(order)))}
     waiting = [jobs[each] for each in order if each in jobs and jobs[each].status == Status.RUNNABLE]
     return [
@@ -116,7 +118,7 @@ def _front(controller: Controller, session: Session, queue: str, most: int) -> l
             "name": job.name,
             "owner": job.owner,
             "share": job.share,
-            "reason": controller.reason(job) or job.status_reason,
+            "reason": reconciler.reason(job) or job.status_reason,
             "since": times.get(job.id),
         }
         for job in waiting
@@ -164,15 +166,15 @@ def _environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
     return {"name": read.name, "engine": read.engine, "state": row.state, "hosts": read.hosts, "cpus": read.max_cpus}
 
 
-def _engines(controller: Controller) -> list[dict[str, Any]]:
-    engine = controller.engine
+def _engines(reconciler: Reconciler, capacities: Mapping[str, Capacity]) -> list[dict[str, Any]]:
+    engine = reconciler.engine
     own = own_queues(engine.names)
     return [
         {
             "name": name,
             "queue": own[name],
             "elastic": engine.is_elastic([name]),
-            "queuesByItself": name in engine.queueing,
+            "queuesByItself": isinstance(capacities[name], Queued),
             "toldAt": health.told_at,
             "problem": health.problem,
             "failing": health.failing,

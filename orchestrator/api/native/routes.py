@@ -21,7 +21,7 @@ from orchestrator.api import permissions
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.operations import validate
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import controller_of, permitted_run, queue_names
+from orchestrator.api.context import permitted_run, queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
@@ -33,18 +33,20 @@ from orchestrator.api.native import (
     queue_overview,
     run_routes,
     runs,
+    track_routes,
     webhook_routes,
 )
 from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue, new_nodes
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.hosts import Limit, Queued, engine_of
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
@@ -63,6 +65,7 @@ router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
+router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)
 
@@ -106,41 +109,51 @@ def _jobs_of_run(session: Session, reference: str) -> str:
 def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone.
 
+    ``queued``: the engines that queue and place gangs by themselves, each with the most that a gang may have there, or null where its
+    hosts tell that.
     ``queues``: those whose jobs the caller may see.
     """
-    controller = controller_of(request)
-    names = controller.engine.names
-    with controller.database.session() as session:
+    reconciler = reconciler_of(request)
+    names = reconciler.engine.names
+    with reconciler.database.session() as session:
         if queue is not None:
             names = queue_engines(session, queue, names[0])
         queues = queue_names(session)
+    capacities = reconciler.engine.capacity(names, FRESH)
     return {
-        "engines": own_queues(controller.engine.names),
-        "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
-        "elastic": controller.engine.is_elastic(names),
-        "store": str(controller.store.path),
+        "engines": own_queues(reconciler.engine.names),
+        "hosts": [asdict(host) for capacity in capacities.values() for host in capacity.machines],
+        "queued": {name: _limit(each) for name, each in capacities.items() if isinstance(each, Queued)},
+        "elastic": reconciler.engine.is_elastic(names),
+        "store": str(reconciler.store.path),
         "queues": queues,
     }
+
+
+def _limit(capacity: Queued) -> dict[str, Any] | None:
+    limits = capacity.limits
+    return {"queue": limits.queue, **asdict(limits.resources)} if isinstance(limits, Limit) else None
 
 
 @router.post("/plan")
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     wanted, definition = _gang_of(body), body.definition
+    check_tracks(reconciler.store, wanted.spec)
     for source in sources_of(wanted):
-        run = permitted_run(controller, source.run, Operation.READ_RUN)
+        run = permitted_run(reconciler, source.run, Operation.READ_RUN)
         if source.key in ("evaluate", "race"):
-            check_evaluation(run, wanted.spec or {}, source.key)
-    with controller.database.session() as session:
+            check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
+    with reconciler.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_in_queue(session, controller.engine, queue, wanted.shape, FRESH)
+        found = fit_in_queue(session, reconciler.engine, queue, wanted.shape, FRESH)
         if found.allocation is None:
             raise ClientError(
                 found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
             )
-        if problem := _problem_of_evaluations(session, controller, queue, wanted):
+        if problem := _problem_of_evaluations(session, reconciler, queue, wanted):
             raise ClientError(problem)
         compute_environment, placements = found.allocation
         job = Job(
@@ -153,8 +166,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             priority=definition.get("schedulingPriority", 0),
         )
         attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
-        gang = controller.attempts.gang(session, job, attempt, wanted)  # neither of them is stored
-    planned = _planned(controller, replace(gang, bus_token="…") if gang.bus_token else gang)
+        gang = reconciler.attempts.gang(session, job, attempt, wanted)  # neither of them is stored
+    planned = _planned(reconciler, replace(gang, bus_token="…") if gang.bus_token else gang)
     nodes = [
         {
             "index": node.contract.node_index,
@@ -174,7 +187,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             "plan the job with fewer nodes"
         )
     name = engine_of(placements[0].host)
-    images = controller.engine.engines[name].images
+    images = reconciler.engine.engines[name].images
     return {
         "engine": name,
         "computeEnvironment": compute_environment,
@@ -187,16 +200,17 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
 @router.post("/fit")
 def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     wanted = _gang_of(body)
-    with controller.database.session() as session:
+    check_tracks(reconciler.store, wanted.spec)
+    with reconciler.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.FIT, JobsOf(queue.name))
-        problem = fit_in_queue(session, controller.engine, queue, wanted.shape, FRESH).problem
-        return {"problem": problem or _problem_of_evaluations(session, controller, queue, wanted)}
+        problem = fit_in_queue(session, reconciler.engine, queue, wanted.shape, FRESH).problem
+        return {"problem": problem or _problem_of_evaluations(session, reconciler, queue, wanted)}
 
 
-def _problem_of_evaluations(session: Session, controller: Controller, queue: JobQueue, gang: GangSpec) -> str | None:
+def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> str | None:
     """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
     try:
         wanted = wanted_of(gang.spec)
@@ -206,7 +220,7 @@ def _problem_of_evaluations(session: Session, controller: Controller, queue: Job
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
         shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
-        problem = fit_in_queue(session, controller.engine, _queue(session, place["queue"]), shape, FRESH).problem
+        problem = fit_in_queue(session, reconciler.engine, _queue(session, place["queue"]), shape, FRESH).problem
     except (ClientError, SpecError) as error:
         problem = str(error)
     return problem and f"evaluation: {problem}"
@@ -229,9 +243,9 @@ def _queue(session: Session, name: str) -> JobQueue:
     return queue
 
 
-def _planned(controller: Controller, gang: Gang) -> Plan[Any]:
+def _planned(reconciler: Reconciler, gang: Gang) -> Plan[Any]:
     try:
-        return controller.engine.plan(gang)
+        return reconciler.engine.plan(gang)
     except EngineError as error:
         raise ClientError(str(error)) from None
 
@@ -239,17 +253,17 @@ def _planned(controller: Controller, gang: Gang) -> Plan[Any]:
 @router.get("/jobs/{reference}")
 def job_detail(request: Request, reference: str) -> Any:
     """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
-    controller = controller_of(request)
-    with controller.database.session() as session:
+    reconciler = reconciler_of(request)
+    with reconciler.database.session() as session:
         job = permitted_job(session, reference, Operation.READ_JOB)
-        run = controller.store.run(job.run)
+        run = reconciler.store.run(job.run)
         owner = owner_of(session, run)
         is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
         is_replaced = is_of_earlier_run(job, run)
         is_visible = is_visible and not is_replaced
-        described = runs.results_of(controller, session, run) if is_visible else None
+        described = runs.results_of(reconciler, session, run) if is_visible else None
         with reading(job):
-            attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
+            attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
             gang = job.gang
             detail = {
                 "id": job.id,
@@ -259,7 +273,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 "runIsReplaced": is_replaced,
                 "kind": job_list.kind_of(gang.spec),
                 "status": job.status,
-                "statusReason": controller.reason(job) or job.status_reason,
+                "statusReason": reconciler.reason(job) or job.status_reason,
                 "queue": job.queue,
                 "share": job.share,
                 "createdAt": job.created_at,
@@ -289,8 +303,8 @@ def job_logs(
 
     ``positions``: a JSON object of ``attempt/node`` and the ``position`` of its last line that the caller has.
     """
-    controller = controller_of(request)
-    with controller.database.session() as session:
+    reconciler = reconciler_of(request)
+    with reconciler.database.session() as session:
         job = permitted_job(session, reference, Operation.READ_JOB_LOGS)
         with reading(job):
             count = len(job.gang.nodes)
@@ -298,10 +312,10 @@ def job_logs(
             raise ClientError(
                 f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
-        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt, positions_of(positions))
+        follower = LogFollower(reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions))
         job_id = job.id
     lines: AsyncIterator[str] | Iterator[str]
-    lines = _follow(controller, job_id, follower, request.app.state.closing) if follow else _stored(follower)
+    lines = _follow(reconciler, job_id, follower, request.app.state.closing) if follow else _stored(follower)
     return StreamingResponse(lines, media_type="application/x-ndjson")
 
 
@@ -319,22 +333,22 @@ def positions_of(text: str) -> dict[str, int]:
 @router.post("/jobs/{reference}/checkpoint")
 def save_now(request: Request, reference: str) -> dict[str, str]:
     """Have a training job save now; answers when the checkpoint is durable."""
-    controller = controller_of(request)
-    job, attempt, nodes = _running(controller, reference, Operation.CHECKPOINT_JOB)
-    return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
+    reconciler = reconciler_of(request)
+    job, attempt, nodes = _running(reconciler, reference, Operation.CHECKPOINT_JOB)
+    return {"answer": _command(reconciler, job, attempt, nodes[0], "checkpoint", 150.0)}
 
 
 @router.get("/jobs/{reference}/stacks")
 def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
     """The Python and native stacks of every rank, node by node."""
-    controller = controller_of(request)
-    job, attempt, nodes = _running(controller, reference, Operation.READ_JOB_STACKS)
-    return [{"node": node, "stacks": _command(controller, job, attempt, node, "stacks", 60.0)} for node in nodes]
+    reconciler = reconciler_of(request)
+    job, attempt, nodes = _running(reconciler, reference, Operation.READ_JOB_STACKS)
+    return [{"node": node, "stacks": _command(reconciler, job, attempt, node, "stacks", 60.0)} for node in nodes]
 
 
-def _running(controller: Controller, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
+def _running(reconciler: Reconciler, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
     """Id, attempt and nodes of a running job. Raises ClientError."""
-    with controller.database.session() as session:
+    with reconciler.database.session() as session:
         job = permitted_job(session, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
@@ -345,20 +359,20 @@ def _running(controller: Controller, reference: str, operation: Operation) -> tu
         return job.id, attempt.number, nodes
 
 
-def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
+def _command(reconciler: Reconciler, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
     try:
-        return controller.bus.command(job, attempt, node, name, seconds)
+        return reconciler.bus.command(job, attempt, node, name, seconds)
     except BusError as error:
         raise ClientError(str(error), 503) from None
 
 
-def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
+def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
     attempt = job.attempts[number - 1]
-    run = controller.store.run(job.run)
+    run = reconciler.store.run(job.run)
     nodes = [
         {
             **node.shown(),
-            "progress": controller.bus.progress(job.id, number, node.index),
+            "progress": reconciler.bus.progress(job.id, number, node.index),
             "running": attempt.stopped_at is None and node.exit_code is None,
             "log": str(run.log(job.id, number, node.index)),
         }
@@ -373,7 +387,7 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
         "exitCode": attempt.exit_code,
         "statusReason": attempt.status_reason,
         "spent": attempt.spent,
-        "pool": attempt.compute_environment,
+        "computeEnvironment": attempt.compute_environment,
         "gpuSeconds": attempt.gpu_seconds,
         "cpuSeconds": attempt.cpu_seconds,
         "wastedGpuSeconds": attempt.wasted_gpu_seconds,
@@ -401,12 +415,12 @@ def _json_lines(lines: Sequence[LogLine]) -> str:
 
 
 async def _follow(
-    controller: Controller, job_id: str, follower: LogFollower, closing: threading.Event
+    reconciler: Reconciler, job_id: str, follower: LogFollower, closing: threading.Event
 ) -> AsyncIterator[str]:
     """Lines as they come; a thread is taken only for each look, since any number of people may follow."""
 
     def look() -> tuple[str, bool]:
-        with controller.database.session() as session:
+        with reconciler.database.session() as session:
             job = session.get(Job, job_id)
             over = job is None or Status(job.status).is_terminal  # asked before the poll: nothing is written afterwards
         return _json_lines(follower.poll()), over

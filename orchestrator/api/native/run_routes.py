@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
-from orchestrator.api.context import IDEMPOTENCY_HEADER, controller_of, permitted_run
+from orchestrator.api.context import IDEMPOTENCY_HEADER, permitted_run, reconciler_of
 from orchestrator.api.native import clones, lineage, runs
 from orchestrator.api.native.continuing import Changes
 from orchestrator.api.permissions import Operation
@@ -46,6 +46,7 @@ class CloneRequest(_ChangesRequest):
     checkpoint: int | Literal["best", "latest"] | None = Field(
         default=None, description="iteration; best: by evaluations, else by score; latest, or absent: the newest"
     )
+    dry_run: bool = Field(default=False, description="check it, and answer the definition that would be registered")
 
 
 @router.get("/runs")
@@ -57,9 +58,9 @@ def list_runs(
     search: str = Query(default="", max_length=128, description="part of a name"),
 ) -> Any:
     """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    controller = controller_of(request)
-    with controller.database.session() as session:
-        found = runs.list_runs(controller, session, after, most, search)
+    reconciler = reconciler_of(request)
+    with reconciler.database.session() as session:
+        found = runs.list_runs(reconciler, session, after, most, search)
     if len(found) == most:
         query = urlencode({"max": most, "after": found[-1]["run"], **({"search": search} if search else {})})
         response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
@@ -69,17 +70,17 @@ def list_runs(
 @router.get("/runs/{name}")
 def run_detail(request: Request, name: str) -> Any:
     """One run; ``parent`` is where its weights come from, ``clones`` are the runs that began with its own."""
-    controller = controller_of(request)
-    run = permitted_run(controller, name, Operation.READ_RUN)
-    with controller.database.session() as session:
-        described = runs.describe_run(controller, session, run)
-        return permissions.shown({**described, "clones": lineage.clones_of(controller, session, run)})
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.READ_RUN)
+    with reconciler.database.session() as session:
+        described = runs.describe_run(reconciler, session, run)
+        return permissions.shown({**described, "clones": lineage.clones_of(reconciler, session, run)})
 
 
 @router.get("/runs/{name}/checkpoints")
 def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
     """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
-    run = permitted_run(controller_of(request), name, Operation.READ_CHECKPOINTS)
+    run = permitted_run(reconciler_of(request), name, Operation.READ_CHECKPOINTS)
     evaluated, best = by_checkpoint(run), best_checkpoint(run)
     return [
         {
@@ -104,7 +105,7 @@ def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
 @router.get("/runs/{name}/evaluations")
 def run_evaluations(request: Request, name: str) -> list[dict[str, Any]]:
     """The summaries of the run's evaluations, the newest last; ``table`` names the Parquet file beside each in ``evaluations/``."""
-    return list_evaluations(permitted_run(controller_of(request), name, Operation.READ_EVALUATIONS))
+    return list_evaluations(permitted_run(reconciler_of(request), name, Operation.READ_EVALUATIONS))
 
 
 @router.get("/runs/{name}/metrics")
@@ -116,7 +117,7 @@ def run_metrics(
     most: int = Query(default=METRICS_A_PAGE, ge=1, le=METRICS_A_PAGE, alias="max"),
 ) -> list[dict[str, Any]]:
     """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    history = history_of(permitted_run(controller_of(request), name, Operation.READ_METRICS))
+    history = history_of(permitted_run(reconciler_of(request), name, Operation.READ_METRICS))
     found = history.after(after, most)
     if len(found) == most or history.behind:
         last = found[-1]["iteration"] if found else after
@@ -132,9 +133,9 @@ def resume_run(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
-    controller = controller_of(request)
-    run = permitted_run(controller, name, Operation.RESUME_RUN)
-    return runs.resume(controller, run, body.changes(), idempotency_key)
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.RESUME_RUN)
+    return runs.resume(reconciler, run, body.changes(), idempotency_key)
 
 
 @router.post("/runs/{name}/clone")
@@ -145,6 +146,8 @@ def clone_run(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key answers what the first one did."""
-    controller = controller_of(request)
-    run = permitted_run(controller, name, Operation.CLONE_RUN)
-    return clones.clone(controller, run, body.name, body.changes(), idempotency_key)
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.CLONE_RUN)
+    if body.dry_run:
+        return clones.check_clone(reconciler, run, body.name, body.changes())
+    return clones.clone(reconciler, run, body.name, body.changes(), idempotency_key)

@@ -17,7 +17,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import Changes, answered, submit
 from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.domain.job import Status
@@ -30,41 +30,41 @@ from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat,
 from shared_store.evaluations import by_checkpoint
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
-from shared_store.metrics import history_of
+from shared_store.metrics import sampled
 from shared_store.parent import TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 from shared_store.wording import counted
 
 
 def list_runs(
-    controller: Controller, session: Session, after: str, most: int, search: str = ""
+    reconciler: Reconciler, session: Session, after: str, most: int, search: str = ""
 ) -> list[dict[str, Any]]:
     """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see.
 
     One that can't be read has a ``problem`` instead of its facts.
     """
     found = []
-    page = visible_runs(session, controller.store, after, most, search.strip())
+    page = visible_runs(session, reconciler.store, after, most, search.strip())
     recorded = select(RunRecord).where(RunRecord.name.in_([run.name for run in page]))
     _known = session.scalars(recorded).all()  # one query instead of one a run: the session looks here first
     for run in page:
         try:
-            found.append(describe_run(controller, session, run))
+            found.append(describe_run(reconciler, session, run))
         except (DamagedFile, OSError) as error:
             problem = excerpt(" ".join(str(error).split()), LONGEST_REASON)
             found.append({"run": run.name, "path": str(run.path), "problem": problem})
     return found
 
 
-def results_of(controller: Controller, session: Session, run: Run) -> dict[str, Any] | None:
+def results_of(reconciler: Reconciler, session: Session, run: Run) -> dict[str, Any] | None:
     """:func:`describe_run` for the page of a job, which a damaged run must not take away; None where nothing can be read."""
     try:
-        return describe_run(controller, session, run) if run.description() else None
+        return describe_run(reconciler, session, run) if run.description() else None
     except (DamagedFile, OSError):
         return None
 
 
-def describe_run(controller: Controller, session: Session, run: Run) -> dict[str, Any]:
+def describe_run(reconciler: Reconciler, session: Session, run: Run) -> dict[str, Any]:
     """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
     description = run.description() or {}
     owner = owner_of(session, run)
@@ -133,7 +133,7 @@ def _shown_spec(session: Session, run: Run, created: Any) -> Any:
         return created
 
 
-def resume(controller: Controller, run: Run, changes: Changes, idempotency_key: str | None = None) -> dict[str, Any]:
+def resume(reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: str | None = None) -> dict[str, Any]:
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
     Args:
@@ -145,14 +145,14 @@ def resume(controller: Controller, run: Run, changes: Changes, idempotency_key: 
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
-    return with_teacher(controller, lambda teacher: _resume(controller, run, changes, idempotency_key, teacher))
+    return with_teacher(reconciler, lambda teacher: _resume(reconciler, run, changes, idempotency_key, teacher))
 
 
 def _resume(
-    controller: Controller, run: Run, changes: Changes, idempotency_key: str | None, teacher: TeacherCopy | None
+    reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: str | None, teacher: TeacherCopy | None
 ) -> dict[str, Any]:
-    with controller.database.session() as session:
-        if earlier := _answered(Context(session, controller, idempotency_key), run):
+    with reconciler.database.session() as session:
+        if earlier := _answered(Context(session, reconciler, idempotency_key), run):
             return earlier
     chosen = choose(run, changes.checkpoint)
     if chosen and changes.checkpoint is not None:
@@ -160,10 +160,10 @@ def _resume(
             chosen.verify()  # reads all of it: before others have to wait for it
         except DamagedCheckpoint as error:
             raise refusal(run, chosen, error) from None
-    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    controller.check_writable(adds=True)
-    with controller.writing, controller.database.session() as session:
-        context = Context(session, controller, idempotency_key, teacher=teacher)
+    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    reconciler.check_writable(adds=True)
+    with reconciler.writing, reconciler.database.session() as session:
+        context = Context(session, reconciler, idempotency_key, teacher=teacher)
         if earlier := _answered(context, run):
             return earlier
         document = spec_of(session, run)
@@ -188,7 +188,7 @@ def _resume(
         if chosen and changes.checkpoint is not None:
             environment["MUSTER_CHECKPOINT"] = chosen.name
         submitted, _ = submit(context, spec, changes.directory, f"run {run.name}", environment)
-    controller.wake()
+    reconciler.wake()
     return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
 
 
@@ -210,9 +210,10 @@ def _answered(context: Context, run: Run) -> dict[str, Any] | None:
 def last_metrics(run: Run) -> dict[str, Any] | None:
     """The newest record of the run's metrics."""
     try:
-        return history_of(run).last()
+        newest = sampled(run, 2)
     except (DamagedFile, OSError):
         return None
+    return newest[-1] if newest else None
 
 
 def _check_algorithm(run: Run, before: Spec, changed: Mapping[str, Any]) -> None:

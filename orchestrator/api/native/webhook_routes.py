@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request
 
 from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.control.deliveries import Deliveries
@@ -24,7 +24,7 @@ def list_webhooks(request: Request) -> list[dict[str, Any]]:
     deliveries: Deliveries | None = request.app.state.deliveries
     if deliveries is None:
         return []
-    with controller_of(request).database.session() as session:
+    with reconciler_of(request).database.session() as session:
         return deliveries.described(session)
 
 

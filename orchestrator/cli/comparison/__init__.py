@@ -1,1 +1,1 @@
-"""Runs side by side: their groups, their curves, how weights differ."""
+"""Comparison of runs: groups, curves, and differences of weights."""

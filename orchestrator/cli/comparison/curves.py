@@ -14,23 +14,23 @@ Curves = Sequence[tuple[str, Sequence[tuple[float, float, float, int]]]]
 
 
 ENDINGS = (".png", ".svg", ".pdf", ".csv")
-"""Of the files that can be written."""
+"""Endings of the files that can be written."""
 
 
 def draw(groups: Sequence[Group], path: Path) -> None:
-    """Write mean return over environment steps, of each group with one standard deviation over its runs.
+    """Write each group's mean return over environment steps, with one standard deviation over its runs.
 
-    A picture, in which each group is a line with a band, or a table of ``group``, ``env_steps``, ``return``, ``std`` and ``runs``.
+    The file is a picture with one line and band per group, or a table of ``group``, ``env_steps``, ``return``, ``std`` and ``runs``.
 
-    Raises ValueError where no run has a finished episode yet, ImportError without matplotlib for a picture, OSError.
+    Raises ValueError if no run has a finished episode yet, ImportError for a picture without matplotlib, OSError.
 
     Args:
-        groups: What is drawn.
-        path: With one of :data:`ENDINGS`.
+        groups: The groups to draw.
+        path: A file with one of :data:`ENDINGS`.
     """
     curves = [(group.label, group.curve()) for group in groups]
     if not any(curve for _, curve in curves):
-        raise ValueError("no episode of these runs has finished yet, there is nothing to draw")
+        raise ValueError("no episode of these runs has finished yet, so nothing can be drawn")
     content = _table(curves) if path.suffix == ".csv" else _picture(curves, path.suffix[1:])
     write_atomic(path.absolute(), content)
 

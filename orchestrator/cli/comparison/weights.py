@@ -1,4 +1,4 @@
-"""How the weights of two exported policies differ: their parameters as ONNX has them. Imports no torch."""
+"""Differences between the weights of two exported policies, from their ONNX parameters. Imports no torch."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 from shared_store.wording import counted
 
 LARGEST = 512 << 20
-"""Bytes of a policy that is read."""
+"""Greatest size of a policy file that is read [bytes]."""
 
 
 def difference(before: Path, after: Path) -> str | None:
-    """What differs between the parameters of two ONNX files, as ``differ: …``.
+    """Differences between the parameters of two ONNX files, as ``differ: …``.
 
     Returns:
-        Empty where all parameters are equal; None where they can't be compared here: the files are not on this machine, are too
-        large, or the package ``onnx`` is missing.
+        Empty if all parameters are equal; None if they can't be compared here: the files are not on this machine or too large, or the
+        package ``onnx`` is missing.
     """
     try:
         import numpy
@@ -32,14 +32,14 @@ def difference(before: Path, after: Path) -> str | None:
 
 
 def _parameters(path: Path) -> dict[str, Any]:
-    """Arrays by name, float64. Raises ImportError, OSError, ValueError for what is no ONNX file with its parameters inside."""
+    """Arrays by name, float64. Raises ImportError, OSError, and ValueError for anything but an ONNX file that contains its parameters."""
     import onnx
 
     if path.stat().st_size > LARGEST:
         raise ValueError(f"{path} is larger than {LARGEST} bytes")
     try:
         model = onnx.load_model_from_string(path.read_bytes())
-    except Exception as error:  # protobuf's own, of whichever implementation is there
+    except Exception as error:  # protobuf's own, from any of its implementations
         raise ValueError(str(error)) from None
     tensors = sorted(model.graph.initializer, key=lambda tensor: str(tensor.name))
     if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in tensors):

@@ -2,7 +2,7 @@
 // orchestrator/console/curves.py.
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [600, 220];
-const [LEFT, RIGHT, TOP, BOTTOM] = [62, 10, 8, 26];
+const [LEFT, RIGHT, TOP, BOTTOM] = [62, 10, 8, 40];
 const COLOURS = 6;
 let counted = 0;
 
@@ -87,9 +87,9 @@ export class Chart {
       frame.append(written(shown(value), { x: LEFT - 6, y: y + 4, "text-anchor": "end" }));
     }
     for (const value of ticks(...this.xs, 5)) {
-      frame.append(written(shown(value), { x: this.#x(value), y: HEIGHT - 10, "text-anchor": "middle" }));
+      frame.append(written(shown(value), { x: this.#x(value), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle" }));
     }
-    frame.append(written(label, { x: WIDTH - RIGHT, y: HEIGHT - BOTTOM - 4, "text-anchor": "end" }));
+    frame.append(written(label, { x: WIDTH - RIGHT, y: HEIGHT - 6, "text-anchor": "end" }));
     return frame;
   }
 
@@ -124,16 +124,15 @@ export class Chart {
     return HEIGHT - BOTTOM - ((value - this.ys[0]) / (this.ys[1] - this.ys[0])) * (HEIGHT - TOP - BOTTOM);
   }
 
-  /** The values at a point (the last one where none is marked) beside the names. */
+  /** The values at a point (the last ones where none is marked) beside the names. */
   #tell(at) {
     this.at = at;
     const { x, xLabel, lines } = this.data;
-    const place = at < 0 ? x.length - 1 : at;
     const entries = lines.map((line, index) => {
       const entry = document.createElement("li");
       const sign = drawn("svg", { viewBox: "0 0 24 6", class: "sign", "aria-hidden": "true" });
       sign.append(drawn("path", { class: `curve ${colour(index)}`, d: "M0 3H24" }));
-      entry.append(sign, ` ${line.name} `, made("b", shown(line.y[place])));
+      entry.append(sign, ` ${line.name} `, made("b", shown(at < 0 ? line.y.findLast((value) => value != null) : line.y[at])));
       return entry;
     });
     if (at >= 0) entries.unshift(made("li", `${xLabel ?? ""} ${shown(x[at])}:`));

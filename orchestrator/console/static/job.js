@@ -17,7 +17,10 @@ function follow() {
   for (const [name, value] of Object.entries(log?.filter ?? {})) if (value) url.searchParams.set(name, value);
   url.searchParams.set("last", JSON.stringify({ i: curves?.last ?? null, l: log?.last ?? {} }));
   stream = subscribe(url.pathname + url.search, {
-    facts: (data) => page.querySelectorAll("[data-facts]").forEach((place) => fill(place, data)),
+    facts: (data) => {
+      if (data.run && !page.dataset.curves) location.reload(); // it has started: now there is more to see
+      page.querySelectorAll("[data-facts]").forEach((place) => fill(place, data));
+    },
     attempts: (data) => renewed("[data-attempts]", data),
     checkpoints: (data) => renewed("[data-checkpoints]", data),
     metrics: (data) => curves?.add(data),

@@ -4,6 +4,7 @@ import { show } from "./forms.js";
 
 const POINTS = 300;
 const MOST = 3 * POINTS;
+const RANK = "rank_collect_seconds/";
 const GROUPS = [
   { label: "Reward", fits: (name) => name === "reward" || name === "score" },
   { label: "Reward terms", fits: (name) => name.startsWith("reward_") },
@@ -20,6 +21,7 @@ const GROUPS = [
     fits: (name) => ["collect_seconds", "learn_seconds", "stall_seconds"].includes(name),
     isStacked: true,
   },
+  { label: "Simulation of each rank [s of an iteration]", fits: (name) => name.startsWith(RANK) },
   { label: "Slowest rank [share over the median]", fits: (name) => name === "slowest_excess" },
 ];
 const AXES = ["env_steps", "total_seconds"];
@@ -101,7 +103,7 @@ export class JobCurves {
     const axis = this.axis.value;
     const x = AXES.includes(axis) ? this.data.series[axis] ?? [] : this.data.iterations;
     const weight = Number(this.smooth.value);
-    const lines = names.map((name) => ({ name, y: smoothed(this.data.series[name], weight) }));
+    const lines = names.map((name) => ({ name: name.replace(RANK, "rank "), y: smoothed(this.data.series[name], weight) }));
     this.charts.get(group.label).draw({ x, xLabel: this.axis.selectedOptions[0].textContent, lines });
   }
 

@@ -195,7 +195,7 @@ export class JobLog {
   }
 }
 
-/** Lines of one time as one element, which the browser may leave unlaid while it is out of sight. */
+/** Lines that came together as one element, which is dropped as one. */
 function block(lines) {
   const whole = document.createElement("div");
   whole.className = "block";

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.aws_batch import OPTIONS
+from shared_store.wording import explain, nearest, shown
 
 
-@dataclass(frozen=True)
-class AwsConfig:
+class AwsConfig(BaseModel):
     """Where jobs go on AWS."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     region: str
     job_queue: str
@@ -34,11 +35,11 @@ class AwsConfig:
     share: str | None = None
     """Share identifier, where the queue has a fair-share policy."""
     efa: bool = False
-    max_vcpus: int = 256
+    max_vcpus: int = Field(256, ge=1)
     """What the compute environment may grow to, until AWS has said it."""
-    poll: float = 2.0
+    poll: float = Field(2.0, gt=0)
     """Seconds between two looks at a gang, and at its logs."""
-    quiet: float = 6.0
+    quiet: float = Field(6.0, ge=0)
     """Seconds without a line after a node's end, after which its log is whole: AWS's log driver sends every five."""
     endpoint_url: str | None = None
     stack: str | None = None
@@ -46,17 +47,8 @@ class AwsConfig:
 
     def with_options(self, options: Mapping[str, str]) -> AwsConfig:
         """The same with what tags say."""
-        told = {option.name: value for option in OPTIONS if (value := options.get(option.name))}
-        changes: dict[str, Any] = {name.replace("-", "_"): value for name, value in told.items()}
-        return replace(self, **changes)
-
-
-_WORDS = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
-_KINDS = {
-    name: get_args(kind) or ((int, float) if kind is float else (kind,))
-    for name, kind in get_type_hints(AwsConfig).items()
-}
-"""The types of a key's values."""
+        told = {option.name.replace("-", "_"): options[option.name] for option in OPTIONS if options.get(option.name)}
+        return self.model_copy(update=told)
 
 
 def config_path(home: Path) -> Path:
@@ -64,34 +56,38 @@ def config_path(home: Path) -> Path:
 
 
 def load_config(home: Path) -> AwsConfig:
-    """Read ``aws.json``. Raises EngineError where it is missing or damaged, with what to do."""
+    """Read ``aws.json``. Raises EngineError where it is missing or damaged: one line with what to do."""
     path = config_path(home)
     try:
-        told = json.loads(path.read_text())
-        if not isinstance(told, dict):
-            raise EngineError(f"{path}: expected a mapping; `muster aws up` writes it anew")
-        known = {field.name for field in fields(AwsConfig)}
-        if unknown := set(told) - known:
-            raise EngineError(f"{path}: unknown key {min(unknown)}; valid: {', '.join(sorted(known))}")
-        for name, kinds in _KINDS.items():
-            if name in told and type(told[name]) not in kinds:
-                wanted = _WORDS[float if float in kinds else kinds[0]]
-                raise EngineError(f"{path}: {name}: expected {wanted}, found {json.dumps(told[name])}")
-        return AwsConfig(**told)
+        return AwsConfig.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         raise EngineError(
             f"{path} is missing: the aws-batch engine does not know where to send jobs; make the stack with `muster aws up`"
         ) from None
-    except (OSError, ValueError, TypeError) as error:
-        raise EngineError(f"{path}: {error}; `muster aws up` writes it anew") from None
+    except OSError as error:
+        raise EngineError(f"{path}: can't be read: {error.strerror}; make it readable for this user") from None
+    except ValidationError as error:
+        raise EngineError(f"{path}: {problem_of(error)}") from None
+
+
+def problem_of(error: ValidationError) -> str:
+    """The key and what is wrong with it, in one line."""
+    # a misspelt key comes before the one that is missing for it
+    problem = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+    if not problem["loc"]:  # the document as a whole
+        wrong = problem["msg"] if problem["type"] == "json_invalid" else explain(problem)
+        return f"{wrong}; `muster aws up` writes it anew"
+    key = problem["loc"][0]
+    if problem["type"] == "extra_forbidden":
+        return f"unknown key {shown(key)}; {nearest(key, AwsConfig.model_fields)}"
+    return f"{key}: {explain(problem)}"
 
 
 def save_config(home: Path, config: AwsConfig) -> Path:
     """Write ``aws.json``; returns its path. Raises OSError."""
     home.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = config_path(home)
-    told = {name: value for name, value in asdict(config).items() if value is not None}
-    path.write_text(json.dumps(told, indent=1) + "\n")
+    path.write_text(config.model_dump_json(indent=1, exclude_none=True) + "\n")
     return path
 
 

@@ -8,11 +8,10 @@ checkpoints stay on the volume.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,8 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
 from botocore.parsers import ResponseParserError
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Limit, Queued
+from orchestrator.domain.resources import Resources
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -39,10 +39,8 @@ from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
 from orchestrator.engines.toolkit.endings import ended
-from shared_store.files import DamagedFile
-from shared_store.layout import Store
-from shared_store.log_files import LIMIT
-from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
+from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
+from shared_store.outcomes import EX_TEMPFAIL, Outcome
 from shared_store.wording import counted
 
 _OVER = ("SUCCEEDED", "FAILED")
@@ -96,7 +94,6 @@ class AwsBatchEngine:
     """One account's AWS Batch, as ``$MUSTER_HOME/aws.json`` describes it."""
 
     name = "aws-batch"
-    queues = True
     elastic = True
     images = True
     address: str | None = None  # nodes on AWS do not reach this machine
@@ -118,26 +115,28 @@ class AwsBatchEngine:
             self._logs = session.client("logs", endpoint_url=url, config=twice)
         except (BotoCoreError, NoRegionError) as error:
             raise EngineError(f"AWS: {error}; see `aws configure`") from None
-        self._hosts: dict[str, tuple[float, Host]] = {}
+        self._limits: dict[str, tuple[float, int]] = {}
+        """By job queue: when it was asked for (monotonic [s]), and its vCPUs."""
         self._gangs: dict[str, _Watched] = {}
         self._lock = threading.Lock()
         self._check_queue()
 
-    def capacity(self) -> Sequence[Host]:
-        """One host: what the queue's compute environments may grow to.
+    def capacity(self) -> Queued:
+        """What the queue's compute environments may grow to.
 
         AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
         is taken as their number, and what does not exist waits there with AWS's own reason.
         """
         queue = self.config.job_queue
-        asked, host = self._hosts.get(queue, (0.0, self._host(self.config.max_vcpus)))
+        asked, vcpus = self._limits.get(queue, (0.0, self.config.max_vcpus))
         if not asked or time.monotonic() - asked > _CAPACITY_AGE:
             try:
-                host = self._host(self._max_vcpus(queue))
+                vcpus = self._max_vcpus(queue)
             except (ClientError, BotoCoreError, ResponseParserError):
                 pass  # as before
-            self._hosts[queue] = (time.monotonic(), host)
-        return [host]
+            self._limits[queue] = (time.monotonic(), vcpus)
+        name = f"{self.name}/{queue.rpartition('/')[2]}"
+        return Queued(Limit(name, Resources(float(vcpus), vcpus // 4, vcpus * _MEMORY)))
 
     def plan(self, gang: Gang) -> Plan[Requests]:
         """The requests; nodes' addresses are AWS's to give."""
@@ -158,7 +157,8 @@ class AwsBatchEngine:
         except (BotoCoreError, ResponseParserError) as error:
             raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
         facts = {
-            **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main", "log_limit")},
+            **store_facts(gang),
+            "main": gang.main,
             "aws": job,
             "queue": queue,
             "supervised": list(requests.supervised),
@@ -307,24 +307,19 @@ class AwsBatchEngine:
         reason = container.get("reason") or ("" if code == 0 else detail.get("statusReason") or "")
         stopped = float(detail.get("stoppedAt") or time.time() * 1000) / 1000
         asked = bool(watched.main_stopped) and detail.get("stoppedAt", 0) > (watched.main_stopped or 0)
-        seen = Outcome(
-            index, handle.facts["epoch"], code or 0, None, str(reason) or _exited(code), None, stopped, stopped, asked
-        )
-        if code is not None and not self._settled(handle, watched, log, seen):
+        outcome = seen(handle, index, code or 0, str(reason), stopped, asked)
+        if code is not None and not self._settled(handle, watched, log, outcome):
             return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
         return _ended(address, code, str(reason))
 
-    def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, seen: Outcome) -> bool:
+    def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, outcome: Outcome) -> bool:
         """Whether the store has the node's outcome; it is written here where nobody else did."""
-        run = Store(handle.facts["store"]).run(handle.facts["run"])
-        if read_outcome(run, handle.facts["job"], handle.facts["attempt"], seen.node) is not None:
+        if recorded(handle, outcome.node) is not None:
             return True
-        since = time.monotonic() - watched.ended[seen.node]
+        since = time.monotonic() - watched.ended[outcome.node]
         if not (log.whole if log is not None else since > _FIXED):
             return False
-        if run.path.exists():
-            with contextlib.suppress(DamagedFile):  # a link in its place: what AWS says of the node counts then
-                write_outcome(run, handle.facts["job"], handle.facts["attempt"], (log.outcome if log else None) or seen)
+        record(handle, (log.outcome if log else None) or outcome)
         return True
 
     def _follow(self, handle: Handle, watched: _Watched, index: int, stream: str | None, over: bool) -> NodeLog | None:
@@ -336,14 +331,9 @@ class AwsBatchEngine:
 
     def _copies(self, handle: Handle) -> GangLogs:
         """The copies of a gang's logs, begun."""
-        run, shared = Store(handle.facts["store"]).run(handle.facts["run"]), self._is_shared(handle.facts["store"])
+        shared = self._is_shared(handle.facts["store"])
         nodes = [
-            NodeLog(
-                run.log(handle.facts["job"], handle.facts["attempt"], index),
-                supervised,
-                copied=not (supervised and shared),
-                limit=handle.facts.get("log_limit", LIMIT),
-            )
+            NodeLog(*log_of(handle, index), supervised, copied=not (supervised and shared))
             for index, supervised in enumerate(handle.facts["supervised"])
         ]
         logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
@@ -356,11 +346,6 @@ class AwsBatchEngine:
         return is_mounted_from(Path(store).resolve(), self.config.file_system, Path("/proc/self/mountinfo").read_text())
 
     # -- capacity -----------------------------------------------------------------------------------------------------
-
-    def _host(self, vcpus: int) -> Host:
-        name = self.config.job_queue.rpartition("/")[2]
-        gpus = tuple(str(number) for number in range(vcpus // 4))
-        return Host(f"{self.name}/{name}", float(vcpus), gpus, vcpus * _MEMORY)
 
     def _max_vcpus(self, queue: str) -> int:
         found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
@@ -401,10 +386,6 @@ def _ended(address: str, code: int | None, reason: str) -> NodeStatus:
     if code is None and reason and not reason.startswith("Host EC2"):
         return NodeStatus(NodePhase.ENDED, address, reason)  # it never started, or AWS does not say
     return ended(address, code, reason)
-
-
-def _exited(code: int | None) -> str:
-    return f"container exited with code {code}" if code else "done"
 
 
 def _is_transient(error: ClientError) -> bool:

@@ -15,8 +15,8 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 from botocore.parsers import ResponseParserError
 
+from orchestrator.engines.toolkit.log_copy import LogCopy
 from shared_store.files import DamagedFile, json_object
-from shared_store.log_files import LIMIT, LogWriter
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
 from shared_store.outcomes import Outcome, parse_outcome
 
@@ -32,18 +32,14 @@ class NodeLog:
     """The copy of one node's log."""
 
     path: Path
+    limit: int
+    """Bytes of the copy that are kept."""
     supervised: bool
     copied: bool = True
     """False where the supervisor writes it to the store that is here, too."""
-    limit: int = LIMIT
-    """Bytes of the copy that are kept."""
     stream: str | None = None
     """Name of the stream; None until the node has one."""
     token: str | None = None
-    skip: int = 0
-    """Lines that are in the copy already: a controller before this one wrote them."""
-    pending: bytes = b""
-    """Lines that came and are not in the copy yet: the volume has no room."""
     ended: float | None = None
     """When the node was first seen to have ended (monotonic [s])."""
     heard: float = 0.0
@@ -51,19 +47,18 @@ class NodeLog:
     outcome: Outcome | None = None
     whole: bool = False
     """Nothing more will come."""
-    _writer: LogWriter | None = None
+    _copy: LogCopy | None = None
 
     def open(self) -> None:
         """Go on with the copy. Raises OSError."""
-        if self._writer is None:
-            writer = LogWriter(self.path, self.limit)
-            self.skip, self._writer = writer.lines, writer
-        self._write()
+        if self._copy is None:
+            self._copy = LogCopy(self.path, self.limit)
+        self._copy.flush()
 
     def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        if self._copy is not None:
+            self._copy.close()
+            self._copy = None
 
     def take(self, events: list[Mapping[str, Any]]) -> None:
         """Append what came; the outcome is the last line of a supervised node.
@@ -76,20 +71,10 @@ class NodeLog:
                 break
             self.heard = time.monotonic()
             line = self._line(str(event["message"]), float(event["timestamp"]) / 1000)
-            if line is None:
-                continue
-            if self.skip:
-                self.skip -= 1
-            else:
+            if line is not None:
                 lines.append(line)
-        self.pending += "".join(lines).encode(errors="backslashreplace")
-        self._write()
-
-    def _write(self) -> None:
-        assert self._writer is not None
-        self.pending = self.pending[self._writer.append(self.pending) :]
-        if self.pending:
-            raise self._writer.error or OSError(f"{self.path}: not written")
+        assert self._copy is not None
+        self._copy.append(lines)
 
     def _line(self, message: str, seconds: float) -> str | None:
         """As it belongs into the run's log; None for the outcome, which is kept."""
@@ -106,7 +91,7 @@ class NodeLog:
     def settle(self, quiet: float) -> None:
         """Whether all is there: the outcome has come, or nothing has for ``quiet`` seconds after the end."""
         silent = self.ended is not None and time.monotonic() - max(self.ended, self.heard) > quiet
-        self.whole = not self.pending and (self.outcome is not None or silent)
+        self.whole = (self._copy is None or self._copy.is_whole) and (self.outcome is not None or silent)
 
 
 def read_outcome_line(text: str) -> Outcome | None:

@@ -104,8 +104,7 @@ def _name(text: str, most: int) -> str:
 
 def _has_muster(gang: Gang, index: int, config: AwsConfig) -> bool:
     image = _image(gang, index)
-    native = "MUSTER_ON_CHILD_FAILURE" in gang.environments[index]
-    return native or image in ("", "muster") or _repository(image) == _repository(config.image)
+    return gang.is_native or image in ("", "muster") or _repository(image) == _repository(config.image)
 
 
 def _repository(image: str) -> str:

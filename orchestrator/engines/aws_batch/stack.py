@@ -15,9 +15,10 @@ import boto3
 import yaml
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
 from botocore.parsers import ResponseParserError
+from pydantic import ValidationError
 
 from orchestrator.domain.errors import ServerError
-from orchestrator.engines.aws_batch.config import AwsConfig, config_path, save_config
+from orchestrator.engines.aws_batch.config import AwsConfig, config_path, problem_of, save_config
 from shared_store.wording import nearest
 
 _PLACES = (
@@ -152,8 +153,8 @@ class Stack:
         with _said():
             batch = self._session.client("batch")
             queues = batch.describe_job_queues(jobQueues=[outputs["JobQueueArn"]])["jobQueues"]
-            pools = batch.describe_compute_environments(computeEnvironments=[outputs["ComputeEnvironmentArn"]])
-            for key, each in (("queue", queues), ("computeEnvironment", pools["computeEnvironments"])):
+            described = batch.describe_compute_environments(computeEnvironments=[outputs["ComputeEnvironmentArn"]])
+            for key, each in (("queue", queues), ("computeEnvironment", described["computeEnvironments"])):
                 wanted = ("state", "status", "statusReason")
                 told[key] = {name: each[0][name] for name in wanted if each[0].get(name)} if each else {}
             told["jobs"] = self.jobs(outputs["JobQueueArn"])
@@ -262,23 +263,25 @@ def write_config(home: Path, stack: Stack, endpoint_url: str | None) -> Path:
         }
     except (OSError, ValueError, TypeError):
         pass
-    config = AwsConfig(
-        region=stack.region,
-        job_queue=outputs["JobQueue"],
-        image=f"{outputs['RepositoryUri']}:latest",
-        log_group=outputs["LogGroupName"],
-        file_system=outputs["FileSystemId"],
-        access_point=outputs["AccessPointId"],
-        job_role=outputs["JobRoleArn"],
-        efa=outputs.get("UseEfa") == "true",
-        max_vcpus=int(float(outputs["MaxvCpus"])),
-        endpoint_url=endpoint_url,
-        stack=stack.name,
-        profile=stack.profile,
-        **kept,
-    )
     try:
+        config = AwsConfig(
+            region=stack.region,
+            job_queue=outputs["JobQueue"],
+            image=f"{outputs['RepositoryUri']}:latest",
+            log_group=outputs["LogGroupName"],
+            file_system=outputs["FileSystemId"],
+            access_point=outputs["AccessPointId"],
+            job_role=outputs["JobRoleArn"],
+            efa=outputs.get("UseEfa") == "true",
+            max_vcpus=int(float(outputs["MaxvCpus"])),
+            endpoint_url=endpoint_url,
+            stack=stack.name,
+            profile=stack.profile,
+            **kept,
+        )
         return save_config(home, config)
+    except ValidationError as error:  # in what a person has added
+        raise ServerError(f"{config_path(home)}: {problem_of(error)}") from None
     except OSError as error:
         raise ServerError(f"{config_path(home)}: {error.strerror}") from None
 

@@ -30,7 +30,7 @@ from docker.models.images import Image
 from docker.models.networks import Network
 from docker.types import IPAMConfig, IPAMPool
 
-from orchestrator.domain.hosts import HERE, Host
+from orchestrator.domain.hosts import HERE, Host, Hosts
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -44,15 +44,15 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
-from orchestrator.engines.docker.logs import LogCopy
+from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
 from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
 from orchestrator.engines.toolkit.gpus import visible_gpus
+from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from shared_store import __version__
 from shared_store.files import DamagedFile
 from shared_store.layout import Store
-from shared_store.log_files import LIMIT
-from shared_store.outcomes import Outcome, read_outcome, write_outcome
+from shared_store.outcomes import read_outcome
 
 log = logging.getLogger("muster.engines")
 
@@ -71,7 +71,6 @@ class DockerEngine:
     """One machine's Docker Engine."""
 
     name = "docker"
-    queues = False
     elastic = False
     images = True
 
@@ -101,14 +100,14 @@ class DockerEngine:
         self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
         self._pulls: dict[str, Future[Image]] = {}
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
-        self._copies: dict[str, LogCopy] = {}
+        self._copies: dict[str, FollowedLog] = {}
         self._copying = threading.Lock()
         """Held where a copy is looked for and begun: a log has one writer."""
         self._ended: dict[str, dict[int, NodeStatus]] = {}
         self._away = False
 
-    def capacity(self) -> Sequence[Host]:
-        return [self._host]
+    def capacity(self) -> Hosts:
+        return Hosts([self._host])
 
     def plan(self, gang: Gang) -> Plan[Sequence[ContainerRequest]]:
         """With the addresses of the first subnet that would be tried."""
@@ -178,7 +177,7 @@ class DockerEngine:
         addresses = _addresses(subnet, len(gang.placements))
         requests = [r.at(addresses[index], addresses[gang.main]) for index, r in enumerate(plan.request)]
         run = Store(gang.store).run(gang.run)
-        handle = Handle(self.name, gang.name, len(requests), {**_facts(gang), "addresses": addresses})
+        handle = Handle(self.name, gang.name, len(requests), {**store_facts(gang), "addresses": addresses})
         try:
             for index in sorted(range(len(requests)), key=lambda index: index != gang.main):
                 if index in there:
@@ -295,33 +294,22 @@ class DockerEngine:
                 return False
             if copy.trouble is not None and not isinstance(copy.trouble, APIError | DamagedFile):  # these will stay
                 raise copy.trouble
-        run = Store(handle.facts["store"]).run(handle.facts["run"])
-        if read_outcome(run, handle.facts["job"], handle.facts["attempt"], index) is not None or not run.path.exists():
-            return True
-        code = int(state["ExitCode"])
-        reason = words or ("done" if code == 0 else f"container exited with code {code}")
-        ended = time.time()
-        outcome = Outcome(index, handle.facts["epoch"], code, None, reason, None, ended, ended)
-        with contextlib.suppress(DamagedFile):  # a link in its place: what Docker says of the container counts then
-            write_outcome(run, handle.facts["job"], handle.facts["attempt"], outcome)
+        record(handle, seen(handle, index, int(state["ExitCode"]), words, time.time()))
         return True
 
     def _follow(self, container: Container, handle: Handle, index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""
         if not container.labels.get(PLAIN):
             return
-        key, run = f"{handle.gang}/{index}", Store(handle.facts["store"]).run(handle.facts["run"])
+        key = f"{handle.gang}/{index}"
         with self._copying:  # a gang that is being stopped is looked at by two threads
             before = self._copies.get(key)
             if before is not None and not before.is_due_again:
                 return
-            if read_outcome(run, handle.facts["job"], handle.facts["attempt"], index) is not None:
+            if recorded(handle, index) is not None:
                 return
-            path, limit = (
-                run.log(handle.facts["job"], handle.facts["attempt"], index),
-                handle.facts.get("log_limit", LIMIT),
-            )
-            self._copies[key] = LogCopy(container, path, limit, before)
+            path, limit = log_of(handle, index)
+            self._copies[key] = FollowedLog(container, path, limit, before)
 
     def _remove(self, gang: str) -> None:
         for container in self._containers(gang).values():
@@ -339,7 +327,7 @@ class DockerEngine:
             for key in keys:
                 self._copies.pop(key, None)
 
-    def _copies_of(self, gang: str) -> dict[str, LogCopy]:
+    def _copies_of(self, gang: str) -> dict[str, FollowedLog]:
         """The copies of a gang's logs, by their keys."""
         with self._copying:
             return {key: copy for key, copy in self._copies.items() if key.startswith(f"{gang}/")}
@@ -376,18 +364,6 @@ def _is_here(url: str, name: str) -> bool:
     """
     host = urlsplit(url).hostname  # docker-py has "localhost" for a Unix socket, and "ssh" for a machine behind SSH
     return host in ("localhost", "127.0.0.1", "::1") or name == socket.gethostname()
-
-
-def _facts(gang: Gang) -> dict[str, Any]:
-    """What a handle remembers."""
-    return {
-        "job": gang.job,
-        "attempt": gang.attempt,
-        "epoch": gang.epoch,
-        "run": gang.run,
-        "store": gang.store,
-        "log_limit": gang.log_limit,
-    }
 
 
 def _subnet(gang: str, salt: int) -> str:

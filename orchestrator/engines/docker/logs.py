@@ -15,7 +15,7 @@ import requests
 from docker.models.containers import Container
 from urllib3.exceptions import HTTPError
 
-from shared_store.log_files import LogWriter
+from orchestrator.engines.toolkit.log_copy import LogCopy
 from shared_store.logs import format_line
 
 _TIME = re.compile(rb"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?Z) ")
@@ -27,10 +27,10 @@ _ENDING = 1.0
 log = logging.getLogger("muster.engines")
 
 
-class LogCopy:
+class FollowedLog:
     """Appends what a container prints to a log until it ends, in a thread. What is there already is not copied twice."""
 
-    def __init__(self, container: Container, path: Path, limit: int, before: LogCopy | None) -> None:
+    def __init__(self, container: Container, path: Path, limit: int, before: FollowedLog | None) -> None:
         """Args:
         container: What prints.
         path: The log; nothing else may write it.
@@ -86,18 +86,11 @@ def _copy(container: Container, path: Path, limit: int, follow: bool) -> bytes |
 
     Raises OSError where the log can't be written.
     """
-    writer = LogWriter(path, limit)
     last: bytes | None = b""
-    try:
-        copied = writer.lines
+    with LogCopy(path, limit) as copy:
         for chunk, lines in _lines(container, follow):
             last = chunk if chunk.endswith(b"\n") else None
-            fresh, copied = lines[copied:], max(0, copied - len(lines))
-            data = "".join(format_line(at, 0, "o", line) for at, line in fresh).encode(errors="backslashreplace")
-            if data and writer.append(data) < len(data):
-                raise writer.error or OSError(f"{path}: not written")
-    finally:
-        writer.close()
+            copy.append(format_line(at, 0, "o", line) for at, line in lines)
     return last
 
 

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from orchestrator.domain.hosts import HERE, Host
+from orchestrator.domain.hosts import HERE, Host, Hosts
 from orchestrator.engines.api import (
     EngineError,
     Gang,
@@ -46,7 +46,7 @@ from shared_store.layout import Store
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.outcomes import read_outcome
 from shared_store.ports import first_port, free_port
-from shared_store.processes import find_process, marked, unkillable
+from shared_store.processes import await_marks, find_process, marked, unkillable
 from shared_store.shim import STUCK, group_of, shimmed
 
 log = logging.getLogger("muster.engines")
@@ -76,7 +76,6 @@ class LocalEngine:
     """One machine as an engine."""
 
     name = "local"
-    queues = False
     elastic = False
     images = False
     address: str | None = None
@@ -103,8 +102,8 @@ class LocalEngine:
         self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
 
-    def capacity(self) -> Sequence[Host]:
-        return [self._host]
+    def capacity(self) -> Hosts:
+        return Hosts([self._host])
 
     def plan(self, gang: Gang) -> Plan[Sequence[NodeProcess]]:
         addresses = [_address(gang, index) for index in range(len(gang.placements))]
@@ -220,6 +219,7 @@ class LocalEngine:
                 start_new_session=True,
             )
         self._children[process.pid] = process
+        await_marks(process.pid)
         return process.pid
 
     def _observe_node(self, gang: str, index: int, node: dict[str, object]) -> NodeStatus:

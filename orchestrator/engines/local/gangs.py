@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from shared_store.processes import find_process
+
 
 def running_gangs(home: Path) -> dict[str, list[int]]:
     """Gangs that were started from this home directory and run now: by name, the process of each node to send SIGTERM to."""
@@ -30,7 +32,5 @@ def running_gangs(home: Path) -> dict[str, list[int]]:
 
 def parent_of(pid: int) -> int:
     """Pid of a process's parent; 0 for a process that is gone."""
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:
-        return 0
+    process = find_process(pid)
+    return process.parent if process else 0

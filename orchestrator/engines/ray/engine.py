@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -56,7 +56,6 @@ class RayEngine:
     """One Ray cluster."""
 
     name = "ray"
-    queues = False
     elastic = True
     images = False
 
@@ -96,7 +95,7 @@ class RayEngine:
 
     # -- the cluster --------------------------------------------------------------------------------------------------
 
-    def capacity(self) -> Sequence[Host]:
+    def capacity(self) -> Hosts:
         """The machines that have CPUs, and those that the autoscaler could add (``ray/+1``, …).
 
         One that was added for a gang is called what the gang's placement calls it until that is over.
@@ -110,7 +109,7 @@ class RayEngine:
             free = (name for name in names if name not in taken)
             for _ in range(shape["most"] - len(like)):
                 hosts.append(Host(next(free), shape["cpus"], _ids(shape["gpus"]), shape["memory"], single=True))
-        return hosts
+        return Hosts(hosts)
 
     def _machines(self) -> dict[str, dict[str, Any]]:
         """The cluster's machines that have CPUs, by host name."""

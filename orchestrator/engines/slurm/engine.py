@@ -16,16 +16,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Queued
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -42,8 +41,9 @@ from orchestrator.engines.slurm.commands import Hosts, Jobs, SlurmJob, Unreachab
 from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
-from shared_store.layout import Run, Store
-from shared_store.outcomes import Outcome, read_outcome
+from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
+from shared_store.layout import Store
+from shared_store.outcomes import Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """What sbatch says where it would take the job later."""
@@ -69,7 +69,6 @@ class SlurmEngine:
     """A Slurm cluster, by the commands of this machine."""
 
     name = "slurm"
-    queues = True
     elastic = True
     images = False
 
@@ -83,8 +82,8 @@ class SlurmEngine:
         self._pending: dict[str, Future[str]] = {}
         """Submissions that are not answered, by gang."""
 
-    def capacity(self) -> Sequence[Host]:
-        return self._hosts.get()
+    def capacity(self) -> Queued:
+        return Queued(self._hosts.get())
 
     def plan(self, gang: Gang) -> Plan[Submission]:
         """With the whole script; the nodes' addresses are known when Slurm has placed them."""
@@ -94,14 +93,7 @@ class SlurmEngine:
 
     def launch(self, plan: Plan[Submission]) -> Handle:
         gang = plan.gang
-        facts = {
-            "job": gang.job,
-            "attempt": gang.attempt,
-            "run": gang.run,
-            "store": gang.store,
-            "main": gang.main,
-            "output": plan.request.output,
-        }
+        facts = {**store_facts(gang), "main": gang.main, "output": plan.request.output}
         patience = 0.0 if self._pending else _PATIENCE
         if gang.name not in self._pending:
             if trouble := self._jobs.away():
@@ -128,11 +120,16 @@ class SlurmEngine:
         trouble = f"Slurm: {why}" if (why := self._jobs.trouble) else ""
         if job is not None and job.state in QUEUED:
             return [_queued(job, trouble)] * count
-        run = Store(facts["store"]).run(facts["run"])
-        ends = _outcomes(run, facts, count)
+        ends = all_recorded(handle)
         output = _said(facts)
         nodes = [_node(facts, job, output, index, ends.get(index)) for index in range(count)]
-        return [dataclasses.replace(node, stale=trouble) if node.running else node for node in nodes]
+        found = _MEETING.search(output)
+        names = json.loads(found[1])["nodes"] if found else []
+        hosts = [f"slurm/{names[_task(facts, index)]}" if names else "" for index in range(count)]
+        return [
+            dataclasses.replace(node, host=host, stale=trouble if node.running else "")
+            for node, host in zip(nodes, hosts, strict=True)
+        ]
 
     def stop(self, handle: Handle, grace: float) -> None:
         number, deadline, asked, killed = handle.facts["slurm"], time.monotonic() + grace, False, 0.0
@@ -236,21 +233,6 @@ def _said(facts: Mapping[str, Any]) -> str:
         return ""
 
 
-def _outcomes(run: Run, facts: Mapping[str, Any], nodes: int) -> dict[int, Outcome]:
-    """By node index; one look at the folder, however many nodes there are."""
-    try:
-        names = set(os.listdir(run.outcome(facts["job"], facts["attempt"], 0).parent))
-    except FileNotFoundError:
-        return {}
-    found = {}
-    for index in range(nodes):
-        if run.outcome(facts["job"], facts["attempt"], index).name in names:
-            outcome = read_outcome(run, facts["job"], facts["attempt"], index)
-            if outcome is not None:
-                found[index] = outcome
-    return found
-
-
 def _queued(job: SlurmJob, trouble: str) -> NodeStatus:
     """A node of a job that Slurm has not started; ``trouble``: why there is no newer picture."""
     phase = NodePhase.STARTING if job.state == "CONFIGURING" else NodePhase.QUEUED
@@ -259,7 +241,7 @@ def _queued(job: SlurmJob, trouble: str) -> NodeStatus:
 
 def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int, outcome: Outcome | None) -> NodeStatus:
     """How one node is, by its outcome, else by what srun says of its task, else by its job."""
-    task = 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
+    task = _task(facts, index)
     meeting = _MEETING.search(said)
     address = json.loads(meeting[1])["addresses"][task] if meeting else ""
     if outcome is not None:
@@ -284,6 +266,11 @@ def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int,
         return NodeStatus(NodePhase.ENDED, address, "Slurm has forgotten the job, and the node left no outcome")
     cause, exit_code, words = ending(job, facts["output"])
     return NodeStatus(NodePhase.ENDED, address, words, cause, exit_code)
+
+
+def _task(facts: Mapping[str, Any], index: int) -> int:
+    """Number of a node's task: the main node is the first, the others follow by their index."""
+    return 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
 
 
 def _among(task: int, tasks: str) -> bool:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Capacity, Host, Hosts
 from orchestrator.engines.api import Cause, Gang, GangStatus, Handle, NodePhase, NodeStatus, Plan, node_plans
 from orchestrator.engines.toolkit.endings import ended
 
@@ -29,18 +28,17 @@ class FakeEngine:
     """An engine that starts nothing. A node runs from its launch on until a test, or a stop, ends it."""
 
     name = "fake"
-    queues = False
     elastic = False
     images = False
     address: str | None = None
 
-    def __init__(self, cluster: FakeCluster | None = None, hosts: Sequence[Host] | None = None) -> None:
+    def __init__(self, cluster: FakeCluster | None = None, capacity: Capacity | None = None) -> None:
         """Args:
         cluster: What its gangs run on; one of its own by default.
-        hosts: What it has; one of 8 cores and 8 GiB by default.
+        capacity: What it has; one host of 8 cores and 8 GiB by default.
         """
         self.cluster = cluster or FakeCluster()
-        self.hosts = hosts if hosts is not None else [Host(f"{self.name}/host", 8.0, (), 8192)]
+        self.offered = capacity or Hosts([Host(f"{self.name}/host", 8.0, (), 8192)])
         self.error: Exception | None = None
         """Raised by every call, until it is None again."""
         self.answers = threading.Event()
@@ -51,9 +49,9 @@ class FakeEngine:
         self.closed = 0
         """How often it was closed."""
 
-    def capacity(self) -> Sequence[Host]:
+    def capacity(self) -> Capacity:
         self._called()
-        return self.hosts
+        return self.offered
 
     def plan(self, gang: Gang) -> Plan[Gang]:
         return Plan(gang, node_plans(gang, [f"10.0.0.{index + 1}" for index in range(len(gang.commands))], 29500), gang)

@@ -93,7 +93,7 @@ class ShellRig:
         run.create({"run": job})
         if read_epoch(run) < 1:
             raise_epoch(run, 1)
-        host = self.engine.capacity()[0].name
+        host = self.engine.capacity().places[0].name
         containers = [self._container] * nodes if self._container else []
         self._jobs[job] = nodes
         return make_gang(job, str(self.store.path), nodes, host, ["sh", "-c", _SCRIPT], containers)
@@ -144,5 +144,6 @@ def make_gang(
         placements=[Placement(host, (), 0.2, 64)] * nodes,
         grace=1.0,
         directory=None,
+        is_native=True,
         containers=containers,
     )

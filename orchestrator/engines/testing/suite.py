@@ -31,7 +31,9 @@ class EngineSuite:
     """See the module; each test has a rig of its own."""
 
     def test_its_hosts_have_names_of_their_own_that_say_whose_they_are(self, rig: Rig) -> None:
-        hosts = rig.engine.capacity()
+        capacity = rig.engine.capacity()
+        assert type(rig.new_engine().capacity()) is type(capacity), "an engine either has hosts or queues, for good"
+        hosts = capacity.places
         names = [host.name for host in hosts]
         assert names and len(set(names)) == len(names), f"hosts {names}: at least one, and no name twice"
         for host in hosts:

@@ -67,9 +67,16 @@ class Backoff:
             if trouble := self._troubles.get(subject):
                 trouble.next = 0.0
 
-    def worked(self, subject: Hashable) -> bool:
-        """The subject works; returns whether it had failed before."""
-        if subject not in self._troubles:  # the usual case, without the lock
+    def worked(self, subject: Hashable, *, lasting: bool = False) -> bool:
+        """The subject works; returns whether it had failed before.
+
+        ``lasting``: that it failed is forgotten only once it has worked for as long as the last pause, so that what fails at every
+        other try is one failure.
+        """
+        trouble = self._troubles.get(subject)
+        if trouble is None:  # the usual case, without the lock
+            return False
+        if lasting and time.monotonic() < trouble.next + trouble.pause:
             return False
         with self._lock:
             return self._troubles.pop(subject, None) is not None

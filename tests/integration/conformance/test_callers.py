@@ -76,7 +76,7 @@ for method, path in (("GET", "/api/runs"), ("POST", "/v1/listjobs"), ("GET", "/h
     assert health.startswith("200 ")
 
 
-def test_what_holds_secrets_is_the_users_alone_and_jobs_keep_the_users_umask(shared_server: Serving) -> None:
+def test_files_with_secrets_are_private_and_jobs_keep_the_users_umask(shared_server: Serving) -> None:
     made = shared_server.home / "made by a job"
     job = shared_server.gang(f"open({str(made)!r}, 'w')")
     shared_server.wait(job, "SUCCEEDED")
@@ -88,6 +88,6 @@ def test_what_holds_secrets_is_the_users_alone_and_jobs_keep_the_users_umask(sha
     assert made.stat().st_mode & 0o777 == 0o666 & ~before
 
 
-def test_the_start_of_the_server_says_who_may_come_in(shared_server: Serving) -> None:
+def test_the_server_prints_at_its_start_who_may_connect(shared_server: Serving) -> None:
     assert shared_server.process.stdout is not None
     assert "without a key; `muster keys create NAME` lets others in" in shared_server.process.stdout.readline()

@@ -22,7 +22,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture(scope="module")
 def parked(batch: Batch) -> Iterator[str]:
     """A queue whose jobs never start: what was submitted can be looked at for as long as it takes."""
-    yield batch.queue("def-parked", batch.pool("def-parked", state="DISABLED"))
+    yield batch.queue("def-parked", batch.compute_environment("def-parked", state="DISABLED"))
     batch.remove(["def-parked"], ["def-parked"])
 
 
@@ -277,7 +277,7 @@ def listed(batch: Batch, queue: str) -> list[str]:
     return [each["jobId"] for page in pages for each in page["jobSummaryList"]]
 
 
-def test_what_the_model_of_aws_forbids_is_refused_in_the_words_of_aws(shared_server: Serving) -> None:
+def test_violations_of_the_aws_model_are_refused_in_the_words_of_aws(shared_server: Serving) -> None:
     """boto3 would not even send these."""
     for operation, body, parameter in [
         ("registerjobdefinition", {"type": "multinode"}, "jobDefinitionName"),

@@ -63,7 +63,7 @@ def batch(server: Serving) -> Batch:
         ("route53", lambda route53: route53.list_hosted_zones(), "InvalidAction"),
     ],
 )
-def test_a_service_that_is_not_here_says_so_in_its_own_protocol(
+def test_an_unsupported_service_is_refused_in_its_own_protocol(
     server: Serving, service: str, call: Callable[[Any], Any], code: str
 ) -> None:
     with pytest.raises(ClientError) as caught:

@@ -110,8 +110,8 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
         done = run_muster("keys", "delete", "a", home=tmp_path)
-        assert "deleted key a\nit was the last one" in done.stdout, done.stdout
-        assert "on loopback from its own user" in done.stdout and "does not start until" in done.stdout
+        assert "deleted key a\nthis was the last key" in done.stdout, done.stdout
+        assert "its own user's requests on loopback" in done.stdout and "does not start without a key" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
     finally:
         server.close()

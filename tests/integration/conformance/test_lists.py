@@ -33,7 +33,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture(scope="module")
 def parked(batch: Batch) -> Iterator[str]:
     """A queue whose jobs never start."""
-    yield batch.queue("lists-parked", batch.pool("lists-parked", state="DISABLED"))
+    yield batch.queue("lists-parked", batch.compute_environment("lists-parked", state="DISABLED"))
     batch.remove(["lists-parked"], ["lists-parked"])
 
 
@@ -116,8 +116,10 @@ def test_pages_follow_each_other_without_gap_or_repeat(batch: Batch, parked: str
     queues = batch.api.get_paginator("describe_job_queues").paginate(PaginationConfig={"PageSize": 1})
     names = [each["jobQueueName"] for page in queues for each in page["jobQueues"]]
     assert names == sorted(set(names)) and {"default", parked} <= set(names)
-    pools = batch.api.get_paginator("describe_compute_environments").paginate(PaginationConfig={"PageSize": 1})
-    names = [each["computeEnvironmentName"] for page in pools for each in page["computeEnvironments"]]
+    compute_environments = batch.api.get_paginator("describe_compute_environments").paginate(
+        PaginationConfig={"PageSize": 1}
+    )
+    names = [each["computeEnvironmentName"] for page in compute_environments for each in page["computeEnvironments"]]
     assert names == sorted(set(names)) and parked in names
     front_of_queue = wait_for(lambda: len(found := batch.front(parked)) == 100 and found, what="a whole snapshot")
     assert [job for job in front_of_queue if job in jobs] == [job for job in jobs if job in front_of_queue]

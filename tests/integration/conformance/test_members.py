@@ -153,7 +153,7 @@ def test_members_without_effect_stand_in_the_documentation() -> None:
 
 
 @pytest.mark.parametrize("member", REFUSED)
-def test_what_can_not_be_done_is_refused_by_name(batch: Batch, member: str) -> None:
+def test_unsupported_members_are_refused_by_name(batch: Batch, member: str) -> None:
     change = REFUSED[member]
     name = member.rpartition(".")[2]
     name = {"eksProperties": "Properties", "platformCapabilities": "FARGATE"}.get(name, name)

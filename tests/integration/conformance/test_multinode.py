@@ -26,7 +26,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture
 def queue(batch: Batch) -> Iterator[str]:
     """A queue whose compute environment a test may disable, so that nothing new starts while it looks."""
-    yield batch.queue("mnp-held", batch.pool("mnp-held"))
+    yield batch.queue("mnp-held", batch.compute_environment("mnp-held"))
     batch.remove(["mnp-held"], ["mnp-held"])
 
 
@@ -239,7 +239,9 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
 
 
 @pytest.mark.parametrize("code", [1, 75])
-def test_without_tries_left_any_code_of_the_main_node_is_a_failure(batch: Batch, code: int, tmp_path: Path) -> None:
+def test_without_attempts_left_any_exit_code_of_the_main_node_is_a_failure(
+    batch: Batch, code: int, tmp_path: Path
+) -> None:
     """75 means "requeue me" in our own jobs only (there after 10 s at the soonest, and this one is older)."""
     script = f"{UNTIL.format('go')}; exit {code}"
     job = batch.submit(batch.multinode(f"mnp-exits-{code}", script, 1, env={"GATE": str(tmp_path)}))
@@ -283,7 +285,7 @@ def test_cancel_leaves_a_running_job_alone(batch: Batch, tmp_path: Path) -> None
     assert detail["statusReason"] == EXITED
 
 
-def test_what_has_not_started_is_cancelled_by_either_operation(batch: Batch, queue: str) -> None:
+def test_a_job_that_has_not_started_is_cancelled_by_either_operation(batch: Batch, queue: str) -> None:
     batch.api.update_compute_environment(computeEnvironment=queue, state="DISABLED")
     definition = batch.multinode("mnp-cancelled", "true", retryStrategy={"attempts": 3})
     runnable, other = batch.submit(definition, queue=queue), batch.submit(definition, queue=queue)
@@ -331,7 +333,7 @@ def test_many_jobs_are_ended_at_once_each_with_its_own_result(batch: Batch, queu
 
 
 @pytest.mark.parametrize("operation", ["cancel_job", "terminate_job"])
-def test_what_can_not_be_ended_is_refused(batch: Batch, operation: str) -> None:
+def test_ending_an_impossible_job_is_refused(batch: Batch, operation: str) -> None:
     call: Callable[..., Any] = getattr(batch.api, operation)
     with refused("Job no-such-job does not exist"):
         call(jobId="no-such-job", reason="x")

@@ -104,6 +104,7 @@ TABLE = {
     Operation.READ_KEYS: ALL_READ,
     Operation.CREATE_KEY: SHARED_WRITE,
     Operation.DELETE_KEY: SHARED_WRITE,
+    Operation.LIST_TRACKS: SHARED_READ,
     Operation.READ_WEBHOOKS: ALL_READ,
     Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
@@ -215,6 +216,7 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.READ_KEYS),
         lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
         lambda key: world.delete_key(key),
+        of_ours(of.LIST_TRACKS),
         of_ours(of.READ_WEBHOOKS),
         of_ours(of.TEST_WEBHOOK, {}),
     ]
@@ -394,7 +396,7 @@ def test_names_of_others_are_not_told_by_errors_and_not_found_by_name(world: Wor
         assert {queue["jobQueueName"] for queue in shown} >= names and ("robots" in str(shown)) is (key == "admin")
 
 
-def test_a_run_without_a_record_belongs_to_whom_its_own_file_names(world: World) -> None:
+def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> None:
     """As after the database was lost, or in a store that came from elsewhere."""
     described = json.loads((world.server.home / "store" / "runs" / world.run / "run.json").read_text())
     assert (described["queue"], described["owner"]) == ("robots", "key robots")

@@ -22,7 +22,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture(scope="module")
 def parked(batch: Batch) -> Iterator[str]:
     """A queue whose jobs never start."""
-    yield batch.queue("q-parked", batch.pool("q-parked", state="DISABLED"))
+    yield batch.queue("q-parked", batch.compute_environment("q-parked", state="DISABLED"))
     batch.remove(["q-parked"], ["q-parked"])
 
 
@@ -49,7 +49,7 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
     assert shown["computeResources"] == resources and shown["tags"] == {"a": "1"}
     assert (shown["type"], shown["state"], shown["status"]) == ("MANAGED", "ENABLED", "VALID")
     with refused("q-ce exists already"):
-        batch.pool("q-ce")
+        batch.compute_environment("q-ce")
     batch.queue("q-on-ce", "q-ce")
     with refused("q-ce is ENABLED"):
         batch.api.delete_compute_environment(computeEnvironment="q-ce")
@@ -169,7 +169,7 @@ def test_a_job_that_is_stuck_at_the_head_is_cancelled_by_its_queues_limit(server
     """The API takes no limit below ten minutes, so a shorter one is written to the database of a stopped server."""
     batch = Batch(server)
     limit = {"reason": NO_ROOM, "state": "RUNNABLE", "maxTimeSeconds": 600, "action": "CANCEL"}
-    batch.queue("q-limited", batch.pool("q-limited", cpus=1), jobStateTimeLimitActions=[limit])
+    batch.queue("q-limited", batch.compute_environment("q-limited", cpus=1), jobStateTimeLimitActions=[limit])
     definition = batch.single("q-stuck", "exec sleep 600", cpus="1")
     running, stuck, behind = (batch.submit(definition, queue="q-limited") for _ in range(3))
     batch.wait(running, "RUNNING")

@@ -91,7 +91,7 @@ def test_boto3_with_a_right_key_works(served: Serving, key: Key) -> None:
     batch.terminate_job(jobId=job, reason="seen enough")
 
 
-def test_a_wrong_secret_and_an_unknown_key_are_told_apart(served: Serving, key: Key) -> None:
+def test_a_wrong_secret_and_an_unknown_key_get_different_errors(served: Serving, key: Key) -> None:
     with pytest.raises(ClientError, match="does not match the signature") as wrong:
         client(served.url, key.access_key_id, key.secret[::-1]).list_jobs(jobQueue="default")
     assert code(wrong) == ("InvalidSignatureException", 403)
@@ -116,7 +116,7 @@ def test_no_signature_is_refused_everywhere_but_at_the_health_check(served: Serv
     assert httpx.get(f"{served.url}/healthz").json()["status"] == "ok"
 
 
-def test_a_websocket_gets_in_no_more_easily(served: Serving) -> None:
+def test_a_websocket_needs_the_same_authentication(served: Serving) -> None:
     address = urlsplit(served.url)
     upgrade = (
         b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: " + b"A" * 22
@@ -157,7 +157,7 @@ def test_logs_requests_are_verified_too_and_other_services_are_not(served: Servi
     refused(answer, "IncompleteSignature", "batch or logs")
 
 
-def test_whatever_is_changed_after_signing_is_noticed(served: Serving, key: Key) -> None:
+def test_any_change_after_signing_is_detected(served: Serving, key: Key) -> None:
     url = f"{served.url}/v1/describejobs"
 
     def changed(request: AWSRequest, **changes: Any) -> AWSResponse:
@@ -207,7 +207,7 @@ def test_the_bearer_form_of_a_key_and_the_command_work(served: Serving, key: Key
         refused(answer, "UnrecognizedClientException", "set MUSTER_TOKEN")
 
 
-def test_a_read_only_key_may_look_and_nothing_else(served: Serving, home: Path) -> None:
+def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
     reader = KeyStore(home).create("reader", read_only=True)
     batch = client(served.url, reader.access_key_id, reader.secret)
     assert batch.describe_jobs(jobs=["x"])["jobs"] == []
@@ -340,7 +340,7 @@ def test_requests_are_as_large_as_on_aws_and_no_larger(served: Serving, key: Key
     )
 
 
-def test_a_body_is_refused_by_its_declared_length_and_a_client_that_leaves_harms_nothing(served: Serving) -> None:
+def test_a_body_is_refused_by_its_declared_length_and_a_disconnecting_client_does_no_harm(served: Serving) -> None:
     address = urlsplit(served.url)
     for declared in (b"99999999", b"9" * 25):
         with socket.create_connection((address.hostname, address.port), timeout=30) as connection:

@@ -19,11 +19,11 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture
 def one_cpu(batch: Batch) -> Iterator[str]:
     """A compute environment of one CPU with two queues, ``q-low`` and ``q-high``."""
-    pool = batch.pool("q-one-cpu", cpus=1)
-    batch.queue("q-low", pool, priority=1)
-    batch.queue("q-high", pool, priority=10)
-    yield pool
-    batch.remove(["q-low", "q-high"], [pool])
+    compute_environment = batch.compute_environment("q-one-cpu", cpus=1)
+    batch.queue("q-low", compute_environment, priority=1)
+    batch.queue("q-high", compute_environment, priority=10)
+    yield compute_environment
+    batch.remove(["q-low", "q-high"], [compute_environment])
 
 
 def test_a_disabled_queue_finishes_what_it_has(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_every_job_that_waits_says_what_it_needs_and_for_whom_it_waits(
     assert [batch.wait(job)["status"] for job in (head, second, pending)] == ["SUCCEEDED"] * 3
 
 
-def test_a_snapshot_shows_who_is_next_and_what_is_in_use(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
+def test_a_snapshot_shows_the_next_jobs_and_the_resources_in_use(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
     definition = batch.single("q-snapped", UNTIL.format("go"), env={"GATE": str(tmp_path)}, cpus="1")
     running = batch.submit(definition, queue="q-low")
     batch.wait(running, "RUNNING")
@@ -117,10 +117,10 @@ def test_a_snapshot_shows_who_is_next_and_what_is_in_use(batch: Batch, one_cpu: 
 
 def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch) -> None:
     """Equal jobs of three shares that used nothing yet: the share with half the weight factor comes twice as often."""
-    pool = batch.pool("q-shares", state="DISABLED")
+    compute_environment = batch.compute_environment("q-shares", state="DISABLED")
     fair = {"shareDistribution": [{"shareIdentifier": "Heavy*", "weightFactor": 0.5}]}
     policy = batch.api.create_scheduling_policy(name="q-shares", fairsharePolicy=fair)["arn"]
-    batch.queue("q-shares", pool, schedulingPolicyArn=policy)
+    batch.queue("q-shares", compute_environment, schedulingPolicyArn=policy)
     definition = batch.single("q-share", "true", cpus="1", schedulingPriority=5)
     with refused("give a shareIdentifier"):
         batch.submit(definition, queue="q-shares")
@@ -146,15 +146,15 @@ def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch
     found = batch.api.list_jobs(jobQueue="q-shares", filters=[{"name": "SHARE_IDENTIFIER", "values": ["Light"]}])
     assert [each["jobId"] for each in found["jobSummaryList"]] == [urgent, *reversed(rest)]
     assert {each["shareIdentifier"] for each in found["jobSummaryList"]} == {"Light"}
-    batch.remove(["q-shares"], [pool])
+    batch.remove(["q-shares"], [compute_environment])
     batch.api.delete_scheduling_policy(arn=policy)
 
 
-def test_who_has_used_less_comes_first_and_a_reservation_is_kept_free(batch: Batch, tmp_path: Path) -> None:
+def test_the_share_with_less_use_goes_first_and_a_reservation_is_kept_free(batch: Batch, tmp_path: Path) -> None:
     """Of 4 CPUs a reservation of 50 keeps half for others while one share is active, a quarter while two are."""
-    pool = batch.pool("q-used", cpus=4)
+    compute_environment = batch.compute_environment("q-used", cpus=4)
     policy = batch.api.create_scheduling_policy(name="q-used", fairsharePolicy={"computeReservation": 50})["arn"]
-    batch.queue("q-used", pool, schedulingPolicyArn=policy)
+    batch.queue("q-used", compute_environment, schedulingPolicyArn=policy)
     definition = batch.single("q-user", UNTIL.format("go"), env={"GATE": str(tmp_path)}, cpus="1")
     mine = [batch.submit(definition, queue="q-used", shareIdentifier="mine") for _ in range(4)]
     for job in mine[:2]:
@@ -174,7 +174,7 @@ def test_who_has_used_less_comes_first_and_a_reservation_is_kept_free(batch: Bat
     assert held == {"mine": 2.0, "yours": 1.0} and shown["activeShareCount"] == 2
     gate(tmp_path, "go")
     assert {batch.wait(job)["status"] for job in (*mine, *yours)} == {"SUCCEEDED"}
-    batch.remove(["q-used"], [pool])
+    batch.remove(["q-used"], [compute_environment])
     batch.api.delete_scheduling_policy(arn=policy)
 
 

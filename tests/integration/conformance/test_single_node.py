@@ -25,7 +25,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture(scope="module")
 def parked(batch: Batch) -> Iterator[str]:
     """A queue whose jobs never start."""
-    yield batch.queue("one-parked", batch.pool("one-parked", state="DISABLED"))
+    yield batch.queue("one-parked", batch.compute_environment("one-parked", state="DISABLED"))
     batch.remove(["one-parked"], ["one-parked"])
 
 
@@ -238,7 +238,7 @@ def test_impossible_arrays_and_dependencies_are_refused(
 # -- dependencies -----------------------------------------------------------------------------------------------------
 
 
-def test_a_dependency_is_success_and_failure_goes_on_down(batch: Batch, tmp_path: Path) -> None:
+def test_a_dependency_waits_for_success_and_failure_propagates(batch: Batch, tmp_path: Path) -> None:
     definition = batch.single("one-decides", f"{UNTIL.format('go')}; exit $CODE", env={"GATE": str(tmp_path)})
 
     def ends_with(code: int) -> str:

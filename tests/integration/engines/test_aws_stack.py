@@ -20,7 +20,8 @@ from moto.cloudformation.models import cloudformation_backends
 from moto.ec2.models import ec2_backends
 
 from orchestrator.cli import main
-from orchestrator.domain.hosts import Placement
+from orchestrator.domain.hosts import Limit, Placement, Queued
+from orchestrator.domain.resources import Resources
 from orchestrator.engines.aws_batch.config import load_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from orchestrator.engines.aws_batch.stack import Event, first_failure
@@ -163,11 +164,11 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
     batch = account.client("batch")
     [queue] = batch.describe_job_queues(jobQueues=["muster"])["jobQueues"]
     [order] = queue["computeEnvironmentOrder"]
-    [pool] = batch.describe_compute_environments(computeEnvironments=[order["computeEnvironment"]])[
+    [described] = batch.describe_compute_environments(computeEnvironments=[order["computeEnvironment"]])[
         "computeEnvironments"
     ]
-    resources = pool["computeResources"]
-    assert (pool["type"], resources["type"], int(resources["maxvCpus"])) == ("MANAGED", "EC2", 256)
+    resources = described["computeResources"]
+    assert (described["type"], resources["type"], int(resources["maxvCpus"])) == ("MANAGED", "EC2", 256)
     assert resources["subnets"] == [account.physical("PrivateSubnet1")] and resources["instanceTypes"] == [
         "g6.12xlarge"
     ]
@@ -222,8 +223,7 @@ def test_the_engine_works_on_what_up_has_written(
     for name, value in account.env.items():
         monkeypatch.setenv(name, value)
     engine = AwsBatchEngine(account.home)
-    [host] = engine.capacity()
-    assert (host.name, host.cpus, len(host.gpus)) == ("aws-batch/muster", 256.0, 64)
+    assert engine.capacity() == Queued(Limit("aws-batch/muster", Resources(256.0, 64, 256 * 32 * 1024)))
     gang = make_gang(
         tmp_path,
         job="11111111-2222-4333-8444-555555555555",
@@ -258,6 +258,10 @@ def test_status_says_what_is_there_and_writes_what_the_engine_needs(account: Acc
     (account.home / "aws.json").unlink()
     told = json.loads(account.muster("status", "--json", "--write").stdout)
     assert (account.home / "aws.json").read_text() == before
+    (account.home / "aws.json").write_text(json.dumps({**json.loads(before), "poll": "2"}))
+    refused = account.muster("status", "--write").stderr
+    assert refused.splitlines()[-1].endswith("aws.json: poll: expected a number, found a text ('2')")
+    (account.home / "aws.json").write_text(before)
     assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
     assert account.muster("status", "--stack-name", "other").stderr == (
         "muster: there is no stack other in us-east-1; create it with `muster aws up`\n"

@@ -89,7 +89,7 @@ def test_what_is_mounted_and_where_are_absolute_paths(source: str, target: str) 
 
 
 def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
-    assert make_engine("local", Setting(tmp_path, cpus=2.0, gpus=["3"])).capacity()[0].gpus == ("3",)
+    assert make_engine("local", Setting(tmp_path, cpus=2.0, gpus=["3"])).capacity().machines[0].gpus == ("3",)
     with pytest.raises(EngineError, match="there is no engine 'kubernetes'"):
         make_engine("kubernetes", Setting(tmp_path))
 

@@ -27,13 +27,13 @@ bench = slurm_bench
 
 
 def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: SlurmBench) -> None:
-    hosts = bench.engine.capacity()
+    hosts = bench.engine.capacity().machines
     assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
         (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
     ]
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
     try:
-        assert [host.away for host in SlurmEngine().capacity()] == [False, True, False]
+        assert [host.away for host in SlurmEngine().capacity().machines] == [False, True, False]
         handle = bench.launch(bench.gang(nodes=3))
         wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].words, 20, "it is queued")
         bench.engine.stop(handle, 0.0)
@@ -116,6 +116,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     addresses = bench.cluster.addresses
     assert [env["MUSTER_ADDRESS"] for env in told] == [addresses[name] for name in ("n2", "n1", "n3")]
     assert [node.address for node in bench.engine.observe(handle)] == [env["MUSTER_ADDRESS"] for env in told]
+    assert [node.host for node in bench.engine.observe(handle)] == ["slurm/n2", "slurm/n1", "slurm/n3"]
     for env in told:
         assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
         assert env["SLURM_JOB_NAME"] == gang.title

@@ -65,7 +65,7 @@ def test_the_engine_of_the_page_has_under_300_lines_and_passes_the_suite(written
 def test_an_engine_of_another_package_is_found_by_its_entry_point_and_has_its_options(written: Path) -> None:
     code = (
         "import pathlib; from orchestrator.engines.api import Setting; from orchestrator.engines.installed import *;"
-        "print(ENGINES, make_engine('plain', Setting(pathlib.Path('.'), cpus=2)).capacity()[0].name)\n"
+        "print(ENGINES, make_engine('plain', Setting(pathlib.Path('.'), cpus=2)).capacity().machines[0].name)\n"
         "check_tags({'muster:niceness': '5'}, ['plain'])\n"
         "try: check_tags({'muster:nicenes': '5'}, ['plain'])\n"
         "except ValueError as error: print(error)"

@@ -174,7 +174,7 @@ def test_a_node_feigns_neither_presence_nor_absence_of_another(
 
 
 @pytest.mark.parametrize("complete", [False, True])
-def test_an_answer_in_the_place_of_another_node_is_not_believed(
+def test_an_answer_under_the_name_of_another_node_is_ignored(
     bus: Bus, victim: Victim, mallory: zenoh.Session, complete: bool
 ) -> None:
     overheard: list[dict[str, Any]] = []
@@ -228,7 +228,7 @@ def test_invented_keys_leave_nothing_in_the_controller(bus: Bus, victim: Victim)
     session.close()
 
 
-def test_what_an_attempt_says_after_it_is_closed_is_dropped(tmp_path: Path) -> None:
+def test_messages_of_a_closed_attempt_are_dropped(tmp_path: Path) -> None:
     bus = Bus(tmp_path)
     bus.open()
     try:

@@ -124,7 +124,7 @@ def test_only_the_volume_that_is_short_is_named(tmp_path: Path) -> None:
     assert "the volume of the store" in str(disk.shortage()) and disk.shortage("database") is None
 
 
-def test_a_wrong_minimum_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_wrong_minimum_is_reported_in_one_line(tmp_path: Path) -> None:
     said = run_muster("serve", "--min-free", "lots", home=tmp_path)
     assert said.returncode != 0 and said.stderr.count("\n") == 1
     assert "--min-free lots: expected a size such as 1GiB, a share such as 5%, or 0" in said.stderr

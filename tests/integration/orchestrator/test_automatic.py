@@ -82,7 +82,7 @@ class Controller:
 
     def evaluations(self) -> list[tuple[int, str]]:
         """Iteration and state of each evaluation that was submitted, in their order."""
-        with self.server.controller.database.session() as session:
+        with self.server.reconciler.database.session() as session:
             jobs = session.scalars(select(Job).where(Job.name == "evaluate-taught").order_by(Job.created_at, Job.id))
             specs = [(each.node_properties["nodeRangeProperties"][0]["container"], each.status) for each in jobs]
         read = [({e["name"]: e["value"] for e in each["environment"]}, status) for each, status in specs]
@@ -130,7 +130,7 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     controller.save(80)
     assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
     assert controller.client.get(f"/api/jobs/{training}")["status"] == "RUNNING", "which no evaluation concerns"
-    with controller.server.controller.database.session() as session:
+    with controller.server.reconciler.database.session() as session:
         owners = set(session.scalars(select(Job.owner)))
     assert len(owners) == 1, "the evaluations are the training's owner's"
 
@@ -160,7 +160,7 @@ def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate_as_oth
     assert "evaluates: taught@10" in shown and controller.newest()["iteration"] == 20
 
 
-def test_what_is_known_of_a_run_that_is_gone_is_not_told_of_another_one_of_its_name(controller: Controller) -> None:
+def test_facts_of_a_deleted_run_are_not_shown_for_a_new_run_of_the_same_name(controller: Controller) -> None:
     former = controller.train({"every": 1})
     controller.save(10)
     controller.look()
@@ -180,14 +180,14 @@ def test_what_is_known_of_a_run_that_is_gone_is_not_told_of_another_one_of_its_n
     assert not controller.client.get(f"/api/jobs/{training}")["runIsReplaced"]
 
 
-def test_who_shows_a_run_is_told_which_jobs_made_it(controller: Controller) -> None:
+def test_showing_a_run_names_the_jobs_that_made_it(controller: Controller) -> None:
     job = submit_gang(controller.client, "pass", name="short")
     refused = call_muster("show", f"short-{job[:8]}", home=controller.home)
     line = f"muster: short-{job[:8]} is a run, which job short ({job[:8]}) made; see: muster show {job[:8]}\n"
     assert (refused.returncode, refused.stderr) == (2, line)
 
 
-def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_evaluation(
+def test_a_controller_stopped_at_any_moment_neither_loses_nor_repeats_an_evaluation(
     controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Killed(BaseException):
@@ -214,7 +214,7 @@ def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_eval
     assert controller.evaluations() == [(10, "RUNNABLE")]
 
 
-def test_a_checkpoint_that_a_killed_controller_kept_for_nobody_is_let_go(controller: Controller) -> None:
+def test_a_checkpoint_kept_by_a_killed_controller_for_no_job_is_released(controller: Controller) -> None:
     controller.train({"every": 1})
     controller.save(10)
     controller.look()
@@ -233,7 +233,7 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
     controller.save(90, 100)
     controller.look()
     assert controller.evaluations() == [], "the training itself evaluates its last one"
-    with controller.server.controller.database.session() as session:
+    with controller.server.reconciler.database.session() as session:
         session.get_one(Job, training).stop_reason = "enough"
         session.commit()
         controller.save(95)
@@ -286,5 +286,17 @@ def test_evaluations_that_could_never_start_are_refused_with_the_training(
         home=controller.home,
     )
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
-    with controller.server.controller.database.session() as session:
+    with controller.server.reconciler.database.session() as session:
         assert not session.scalars(select(Job)).all()
+
+
+def test_checkpoints_of_long_iterations_alone_are_not_counted(controller: Controller) -> None:
+    controller.train({"every": 2, "episodes": 8})
+    controller.save(10)
+    for iteration in (11, 12):
+        add_checkpoint(controller.server.store, "taught", iteration, scheduled=False)
+        controller.look()
+    assert controller.evaluations() == []
+    controller.save(20)
+    controller.look()
+    assert [iteration for iteration, _ in controller.evaluations()] == [20]

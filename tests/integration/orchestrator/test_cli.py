@@ -292,12 +292,12 @@ def test_for_another_program_long_reasons_are_whole_and_no_column_is_lost(capsys
     assert row.count("story") == 120
 
 
-def test_what_set_gave_is_not_blamed_on_a_line_of_the_file(tmp_path: Path) -> None:
+def test_an_error_in_set_names_no_line_of_the_file(tmp_path: Path) -> None:
     wrong = ["submit", "job_specs/cartpole.yaml", "--dry-run", "--set", "train.task=Cartpol"]
     refused(wrong, tmp_path, 2, "muster: --set: train.task: no task is called 'Cartpol'")
 
 
-def test_a_log_that_holds_nothing_of_what_was_asked_for_says_so(shared_server: Serving) -> None:
+def test_an_empty_selection_of_a_log_says_so(shared_server: Serving) -> None:
     job = shared_server.gang("print('here')", name="brief")
     shared_server.wait(job)
     for option, part in ((["--attempt", "9"], "attempt 9"), (["--rank", "77"], "rank 77")):

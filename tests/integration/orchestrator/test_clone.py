@@ -111,7 +111,7 @@ def test_the_changes_are_in_the_new_run_s_spec(full: Serving) -> None:
     assert spec["train"]["iterations"] == 50 and spec["train"]["ppo"]["optimizer"] == "adamw"
 
 
-def test_a_waiting_clone_needs_its_source_no_more_and_may_itself_be_resumed(full: Serving, store: Store) -> None:
+def test_a_waiting_clone_does_not_need_its_source_and_may_be_resumed(full: Serving, store: Store) -> None:
     add_run(store, "gone", {**SPEC, "name": "gone"})
     add_checkpoint(store, "gone", 5, b"kept")
     job = clone(full, "gone", "heir")["jobId"]
@@ -146,7 +146,7 @@ def test_a_second_call_with_the_same_key_answers_what_the_first_did(full: Servin
             "x",
             (),
             2,
-            ["taught@last: after @ stands an iteration, best or latest", "muster checkpoints taught"],
+            ["taught@last: expected an iteration, best or latest after @", "muster checkpoints taught"],
         ),
         ("taught", "taught", (), 1, ["run taught exists already: give the clone another --name"]),
         ("taught", "a b", (), 2, ["clone of run taught: name: expected letters"]),
@@ -221,7 +221,7 @@ def test_a_run_of_a_name_that_a_waiting_job_has_is_refused(full: Serving) -> Non
     assert "run waiting is being written by job waiting" in refused(full, 2, "taught", "waiting")
 
 
-def test_what_a_crash_left_of_an_earlier_clone_is_cleared_away(full: Serving, store: Store) -> None:
+def test_leftovers_of_a_crashed_clone_are_removed(full: Serving, store: Store) -> None:
     clone(full, "taught", "before-crash")
     (owner,) = {path.name.removesuffix(".json") for path in (store.path / "controllers").glob("*.json")}
     leftover, foreign = (store.path / "runs" / f".{each}.0123456789ab.clone" for each in (owner, "another"))
@@ -265,7 +265,7 @@ def student(tmp_path: Path, teacher: str) -> str:
         ("../taught", "train.rsl_rl.teacher_checkpoint: expected RUN or RUN@ITERATION"),
     ],
 )
-def test_a_teacher_that_is_not_there_is_refused_at_submission(
+def test_a_missing_teacher_is_refused_at_submission(
     full: Serving, store: Store, tmp_path: Path, teacher: str, said: str
 ) -> None:
     add_run(store, "idle")
@@ -274,12 +274,12 @@ def test_a_teacher_that_is_not_there_is_refused_at_submission(
 
 
 @pytest.mark.parametrize("teacher", ["taught", "taught@6", "taught@00000006-e1"])
-def test_a_teacher_that_is_there_is_taken(full: Serving, tmp_path: Path, teacher: str) -> None:
+def test_an_existing_teacher_is_accepted(full: Serving, tmp_path: Path, teacher: str) -> None:
     done = full.muster("submit", student(tmp_path, teacher))
     assert done.returncode == 0, done.stderr
 
 
-def test_a_run_that_goes_on_has_its_teacher_and_needs_the_teacher_s_run_no_more(
+def test_a_resumed_run_has_its_teacher_and_does_not_need_the_teachers_run(
     full: Serving, store: Store, tmp_path: Path
 ) -> None:
     add_run(store, "pupil", json.loads(Path(student(tmp_path, "late")).read_text()))
@@ -291,7 +291,7 @@ def held(run: Run, teacher: str) -> list[bytes]:
     return [(each.path / "learner.pt").read_bytes() for each in list_checkpoints(run.teacher(teacher))]
 
 
-def test_a_submitted_job_has_its_teacher_s_weights_whatever_becomes_of_the_teacher(
+def test_a_submitted_job_keeps_its_teachers_weights_whatever_happens_to_the_teacher(
     full: Serving, store: Store, tmp_path: Path
 ) -> None:
     add_run(store, "mentor")
@@ -327,7 +327,7 @@ def test_a_teacher_whose_weights_are_damaged_is_refused_at_submission(
 
 
 @pytest.mark.parametrize("fate", ["pruned", "deleted"])
-def test_who_has_the_teacher_s_weights_needs_the_teacher_no_more(
+def test_a_student_with_the_teachers_weights_does_not_need_the_teacher(
     full: Serving, store: Store, tmp_path: Path, fate: str
 ) -> None:
     teacher, pupil = f"teacher-{fate}", f"pupil-{fate}"
@@ -345,7 +345,7 @@ def test_who_has_the_teacher_s_weights_needs_the_teacher_no_more(
     assert full.client.post(f"/api/runs/heir-{fate}/resume", {})["iteration"] == 0
 
 
-def test_a_clone_that_names_another_teacher_holds_that_one(full: Serving, store: Store, tmp_path: Path) -> None:
+def test_a_clone_with_another_teacher_holds_the_new_teacher(full: Serving, store: Store, tmp_path: Path) -> None:
     add_run(store, "pupil-of-two", json.loads(Path(student(tmp_path, "gone@3")).read_text()))
     settings = {"teacher_checkpoint": "gone@3"}
     add_checkpoint(store, "pupil-of-two", 1, b"pupil", algorithm="rsl_rl", settings=settings)

@@ -114,7 +114,9 @@ def test_a_head_that_is_too_large_is_refused_however_it_arrives(inside: Server, 
             assert answer.startswith(b"HTTP/1.1 400 ") or not answer, answer
 
 
-def test_trickling_gains_a_connection_no_time(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_sending_does_not_extend_the_time_limit_of_a_connection(
+    inside: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(connections, "HEADER_TIMEOUT", 0.5)
     with half_open(inside.url) as connection:
         connection.settimeout(0.1)

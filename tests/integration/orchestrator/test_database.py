@@ -252,7 +252,7 @@ def test_a_controller_that_lost_its_database_to_another_refuses_writes_and_goes_
     other.execute(text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND granted"))
     with httpx.Client(base_url=losing.url, timeout=60) as client:
         try:
-            wait_for(lambda: losing.controller.trouble, 30, "that it notices")
+            wait_for(lambda: losing.reconciler.trouble, 30, "that it notices")
             for operation, request in (
                 ("canceljob", {"jobId": "x", "reason": "x"}),
                 ("submitjob", {"jobName": "x", "jobQueue": "default", "jobDefinition": "x"}),
@@ -286,7 +286,7 @@ def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opene
     assert told == [{"a", "b"}, {"b"}]
 
 
-def test_the_roster_is_the_same_after_a_restart(opened: Callable[[], Database]) -> None:
+def test_the_work_queue_is_the_same_after_a_restart(opened: Callable[[], Database]) -> None:
     database, live = opened(), WorkQueue()
     database.committed = live.note
     with database.session() as session:
@@ -302,7 +302,7 @@ def test_the_roster_is_the_same_after_a_restart(opened: Callable[[], Database]) 
         assert sorted(work_queue.take_due()) == due, "what was pending may have become ready while nobody looked"
 
 
-def test_a_stop_that_comes_while_the_controller_writes_is_looked_at() -> None:
+def test_a_stop_during_a_write_of_the_controller_is_processed() -> None:
     work_queue, stale = WorkQueue(), job("a", status="RUNNABLE")
     work_queue.look_again(["a"])  # a request has just ended the job
     work_queue.note([stale])  # the controller commits what it had read before
@@ -336,7 +336,7 @@ def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Da
         assert session.scalars(select(Attempt.job_id)).all() == session.scalars(select(Node.job_id)).all() == []
 
 
-def test_an_attempt_is_charged_for_what_it_held_and_lost(opened: Callable[[], Database], tmp_path: Path) -> None:
+def test_an_attempt_is_charged_for_its_use_and_losses(opened: Callable[[], Database], tmp_path: Path) -> None:
     run = Store(tmp_path / "store").open().run("r")
 
     def nodes() -> list[Node]:
@@ -356,7 +356,7 @@ def test_an_attempt_is_charged_for_what_it_held_and_lost(opened: Callable[[], Da
     assert resource_seconds(failed, 70_000) == 240.0
 
 
-def test_what_a_share_used_halves_with_its_decay_time(opened: Callable[[], Database]) -> None:
+def test_the_use_of_a_share_halves_with_its_decay_time(opened: Callable[[], Database]) -> None:
     with opened().session() as session:
         add_usage(session, "default", "red", 100.0, 60, 1_000_000)
         add_usage(session, "default", "red", 10.0, 60, 1_060_000)
@@ -380,7 +380,7 @@ def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) 
     }
 
 
-def test_a_controller_whose_lock_was_lost_takes_it_again_or_says_who_has_it(server: postgres.Server) -> None:
+def test_a_controller_with_a_lost_lock_takes_it_again_or_names_its_owner(server: postgres.Server) -> None:
     url = server.new_database()
     database, others = Database(url), create_engine(url)
 

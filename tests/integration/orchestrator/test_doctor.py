@@ -8,7 +8,7 @@ from pathlib import Path
 from tests.conftest import Serving, run_muster
 
 
-def test_all_that_is_needed_is_here(tmp_path: Path) -> None:
+def test_all_requirements_are_installed(tmp_path: Path) -> None:
     done = run_muster("doctor", "--worker", "--engine", "local", home=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     for said in ("torch 2.", "a durable write takes", "muster serve starts one", "1 host, "):
@@ -21,7 +21,7 @@ def test_a_controller_is_found(shared_server: Serving) -> None:
     assert (controller["state"], controller["said"]) == ("ok", f"{shared_server.url}, engines local")
 
 
-def test_what_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
+def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     bad = run_muster(
         *("doctor", "--store", str(tmp_path / "file" / "store"), "--engine", "docker", "--engine", "nothing"),

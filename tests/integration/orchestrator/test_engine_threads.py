@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.hosts import Host, Hosts, Placement
 from orchestrator.engines import runner
 from orchestrator.engines.api import (
     EngineError,
@@ -56,7 +56,7 @@ def gang(directory: Path, name: str = "job", host: str = HOST, script: str = "ex
 class Fake:
     """An engine whose calls do what a test wants, and note on which thread they did."""
 
-    name, queues, elastic, images, address = "engine", False, False, False, None
+    name, elastic, images, address = "engine", False, False, None
 
     def __init__(self) -> None:
         self.free, self.threads, self.closed = threading.Event(), set[str](), 0
@@ -69,9 +69,9 @@ class Fake:
         if self.error is not None:
             raise self.error
 
-    def capacity(self) -> Sequence[Host]:
+    def capacity(self) -> Hosts:
         self._do()
-        return [Host(HOST, 4, (), 1024)]
+        return Hosts([Host(HOST, 4, (), 1024)])
 
     def plan(self, gang: Gang) -> Plan[None]:
         return Plan(gang, [], None)
@@ -120,7 +120,7 @@ def launched(several: EngineSet, what: Gang) -> str:
         *((name, True) for name in ("ENOENT", "ENOTDIR", "EACCES", "EPERM", "E2BIG", "ENAMETOOLONG", "ENOEXEC")),
     ],
 )
-def test_what_may_pass_is_tried_again_and_what_may_not_is_final(number: str, final: bool) -> None:
+def test_transient_errors_are_retried_and_others_are_final(number: str, final: bool) -> None:
     assert is_final(OSError(getattr(errno, number), number)) is final
 
 
@@ -146,7 +146,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
 
         said = wait_for(says, 10, "that it does not answer")
         assert said.startswith("the engine engine has not answered since "), said
-        assert several.capacity(patience=60) == [Host(HOST, 4, (), 1024)], "what it told last"
+        assert several.capacity(patience=60) == {"engine": Hosts([Host(HOST, 4, (), 1024)])}, "what it told last"
         with pytest.raises(NotYet, match="has not answered since") as wait:
             several.launch("other/1/1", [HOST], lambda: several.plan(gang(tmp_path, "other")))
         assert wait.value.unknown, "it may have been started"
@@ -189,7 +189,7 @@ def test_an_engine_that_fails_is_logged_once_and_its_gangs_count_as_running(
     assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
 
 
-def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_started(tmp_path: Path) -> None:
+def test_without_descriptors_no_gang_counts_as_dead_and_no_half_gang_is_started(tmp_path: Path) -> None:
     Store(tmp_path / "store").open()
     engine = LocalEngine(tmp_path, cpus=4)
     with engines(engine) as several:
@@ -232,7 +232,7 @@ def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_start
     assert processes_of(tmp_path) == []
 
 
-def test_a_job_that_can_t_be_started_for_now_keeps_its_attempts_and_one_that_never_can_is_over(
+def test_a_transient_launch_error_keeps_the_attempts_and_a_permanent_one_ends_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     popen, number = subprocess.Popen, [errno.EAGAIN]

@@ -73,7 +73,7 @@ REFUSED = {
     ("nosuch",): (2, "run nosuch does not exist"),
     ("taugt",): (2, "did you mean taught"),
     ("taught@4",): (2, "run taught has no checkpoint of iteration 4; it has: 3, 6, 9"),
-    ("taught@last",): (2, "after @ stands an iteration, best or latest"),
+    ("taught@last",): (2, "expected an iteration, best or latest after @"),
     ("empty",): (2, "run empty has no checkpoint yet; train it first"),
     ("taught", "--episodes", "0"): (2, "evaluate.episodes: expected a value greater than or equal to 1, found 0"),
     ("taught", "--set", "config.angel_limit=1.0"): (2, "CartpoleConfig has no such key; did you mean angle_limit?"),
@@ -83,11 +83,11 @@ REFUSED = {
     ("taught", "--set", "resources.cpus=400"): (2, "lower nodes or resources"),
     ("taught", "--race"): (
         2,
-        "race: run taught trained Cartpole, which drives no laps; a race is for runs of a racer's",
+        "race: run taught trained Cartpole, which drives no laps; race only runs of a racer's",
     ),
-    ("fast-car", "--trials", "3"): (2, "--trials: it is for races; add --race"),
-    ("fast-car", "-o", "there"): (2, "--output: it is for races; add --race"),
-    ("fast-car", "--race", "--episodes", "3"): (2, "--episodes: a race has --trials, each in a world of its own"),
+    ("fast-car", "--trials", "3"): (2, "--trials: only races take it; add --race"),
+    ("fast-car", "-o", "there"): (2, "--output: only races take it; add --race"),
+    ("fast-car", "--race", "--episodes", "3"): (2, "--episodes: a race takes --trials instead, one world each"),
     ("fast-car", "--race", "--trials", "0"): (2, "race.trials: expected a value greater than or equal to 1, found 0"),
     ("fast-car", "--race", "--penalty", "-1"): (
         2,
@@ -168,7 +168,7 @@ def test_single_runs_that_played_the_same_episodes_are_compared_pair_by_pair(ful
         pyarrow.parquet.write_table(pyarrow.table(columns), table)
     try:
         done = call_muster("compare", "fast", "sure", "odd", "-o", str(tmp_path / "curves.csv"), home=full.home)
-        assert done.returncode == 2 and "there is nothing to draw" in done.stderr
+        assert done.returncode == 2 and "so nothing can be drawn" in done.stderr
         done = call_muster("compare", "fast", "sure", "odd", home=full.home)
         # the differences are 1, 1.5, 1, 1.5: mean 1.25, s = 0.5 / sqrt(3), and t(3) = 3.182446, so that half is 0.459
         line = "sure@9 against fast@9: return +1.25 (+0.79 to +1.71, paired over 4 episodes): better"
@@ -192,13 +192,13 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
     for options, said in (
         (["taught"], "that is one run, taught; name two or more to compare"),
         (["taught", "slwo"], "did you mean slow"),
-        (["robot-*", "slow"], "no run is called like robot-*"),
-        (["taught", "slow", "-o", str(tmp_path / "no" / "x.png")], "is no directory"),
+        (["robot-*", "slow"], "no run matches robot-*"),
+        (["taught", "slow", "-o", str(tmp_path / "no" / "x.png")], "is not a directory"),
         (
             ["taught", "slow", "-o", str(tmp_path / "x.xyz")],
-            "the ending says what is written; there are .png, .svg, .pdf",
+            "unknown ending; use .png, .svg, .pdf",
         ),
-        (["empty", "empty*", "of-*", "-o", str(tmp_path / "x.png")], "no run is called like of-*"),
+        (["empty", "empty*", "of-*", "-o", str(tmp_path / "x.png")], "no run matches of-*"),
     ):
         done = call_muster("compare", *options, home=full.home)
         assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
@@ -219,7 +219,7 @@ def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Se
     assert "races" in shown and "fast-car" in shown
 
 
-def test_a_copy_of_step_logs_replaces_none(full: Serving, tmp_path: Path) -> None:
+def test_copying_step_logs_replaces_no_file(full: Serving, tmp_path: Path) -> None:
     (tmp_path / "sim-trace").mkdir()
     done = call_muster("evaluate", "fast-car", "--race", "-o", str(tmp_path), home=full.home)
     assert done.returncode == 2 and "sim-trace exists; name another directory" in done.stderr

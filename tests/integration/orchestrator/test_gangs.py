@@ -16,14 +16,11 @@ import pytest
 
 from orchestrator.api.batch import rules
 from orchestrator.client import Client
-from orchestrator.control import attempts
 from orchestrator.domain.errors import ApiError
 from orchestrator.domain.gang import GangSpec, gang_needs
-from orchestrator.domain.job import Ending, NodeEnd, Verdict
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
-from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.server import Server
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
 from tests.support.orchestrator.jobs import await_status, detail
@@ -266,26 +263,6 @@ def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
         server.close()
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {said}"]
     assert processes_of(tmp_path) == []
-
-
-def test_a_main_node_that_was_told_to_end_waits_for_the_cause_for_a_limited_time(
-    inside: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    container = {"command": ["x"], "environment": [{"name": key, "value": value} for key, value in NATIVE.items()]}
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": 2, "mainNode": 0, "nodeRangeProperties": ranges}
-    job = Job(id="j", name="j", queue="default", definition="d", request={}, run="j", node_properties=properties)
-    attempt = Attempt(job_id="j", number=1, nodes=[Node(host="localhost"), Node(host="localhost")])
-    ends = [NodeEnd(143, "rank 0 was killed by SIGTERM", 1.0, asked=True), None]
-    judged = inside.controller.attempts
-    try:
-        assert judged._verdict(job, attempt, ends, 0) is None, "the child may tell the cause"
-        monkeypatch.setattr(attempts, "_CAUSE_PATIENCE", -1.0)
-        assert judged._verdict(job, attempt, ends, 0) == Verdict(
-            Ending.FAILED, "main node: rank 0 was killed by SIGTERM", 143, certain=False
-        )
-    finally:
-        judged._uncertain.clear()
 
 
 def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(

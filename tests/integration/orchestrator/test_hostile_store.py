@@ -151,7 +151,7 @@ def test_after_an_internal_error_a_client_that_keeps_its_connection_is_served(
     with httpx.Client(base_url=inside.url) as client:
         for _ in range(3):
             with monkeypatch.context() as patched:
-                patched.setattr(inside.controller.engine, "capacity", fail)
+                patched.setattr(inside.reconciler.engine, "capacity", fail)
                 answer = client.get("/api/capacity")
             assert answer.status_code == 500 and answer.headers["connection"] == "close"
             assert answer.json()["message"] == "internal error; the controller's log has the details"
@@ -177,14 +177,14 @@ def damaged_home(home: Path) -> Path:
     return home / "muster.db"
 
 
-def test_a_damaged_page_of_the_database_is_said_in_one_line_at_the_start(tmp_path: Path) -> None:
+def test_a_damaged_page_of_the_database_is_reported_in_one_line_at_the_start(tmp_path: Path) -> None:
     path = damaged_home(tmp_path)
     served = run_muster("serve", "--port", "0", home=tmp_path)
     assert served.returncode == 1 and served.stderr.count("\n") == 1, served.stderr
     assert f"{path} is damaged" in served.stderr and f"`sqlite3 {path} .recover`" in served.stderr
 
 
-def test_a_damaged_page_that_is_met_while_serving_is_said_to_each_request(tmp_path: Path) -> None:
+def test_a_damaged_page_found_while_serving_is_reported_to_each_request(tmp_path: Path) -> None:
     path = damaged_home(tmp_path)
     database = Database.at(tmp_path)
     for _ in range(2):

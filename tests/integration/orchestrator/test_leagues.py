@@ -22,7 +22,7 @@ from shared_store.layout import Store
 from shared_store.models import Model
 from tests.conftest import Serving, call_muster
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
-from tests.support.shared_store.leagues import CONFIG, race, summary
+from tests.support.shared_store.leagues import CONFIG, league, race, summary
 
 TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
 JOBS = 6
@@ -123,6 +123,14 @@ REFUSED = {
         "totl",
     ): "--ranking totl: there is no such ranking; did you mean total?",
     ("create", "x", "--track", "oval", "--laps", "0"): "--laps: expected a value greater than or equal to 1",
+    (
+        "create",
+        "x",
+        "--track",
+        "oval",
+        "--closes",
+        "2020-01-01T00:00Z",
+    ): "2020-01-01 00:00:00 UTC is past: no race could",
     ("create", "x", "--track", "oval", "--opens", "soon"): "--opens soon: expected a time such as 2026-12-24T18:00",
     (
         "create",
@@ -138,7 +146,7 @@ REFUSED = {
     ("show", "cup", "7"): "league cup: entry 7 does not exist",
     ("submit", "cup", "fats"): "model fats does not exist; did you mean fast?",
     ("submit", "cup", "fast@9"): "model fast has no version 9; there are: 1, 2, 3, 4",
-    ("submit", "cup", "fast@x"): "fast@x: after @ stands a version, such as fast@1",
+    ("submit", "cup", "fast@x"): "fast@x: expected a version after @, such as fast@1",
     (
         "submit",
         "cup",
@@ -153,15 +161,16 @@ REFUSED = {
     ("submit", "future", "fast@1"): "league future opens at 2999-01-01 00:00:00 UTC",
     ("disqualify", "cup", "9", "--reason", "x"): "league cup: entry 9 does not exist",
     ("disqualify", "cup", "9"): "--reason is missing",
-    ("table", "cup", "-o", "cup.pdf"): "the ending says what it is to be: .csv, .png",
+    ("table", "cup", "-o", "cup.pdf"): "unknown ending; use one of .csv, .png",
     ("tabel", "cup"): "did you mean table?",
 }
 
 
 @pytest.fixture(scope="module")
 def cups(paddock: Paddock) -> Paddock:
-    for options in (("cup",), ("past", "--closes", "2020-01-01T00:00Z"), ("future", "--opens", "2999-01-01T00:00Z")):
+    for options in (("cup",), ("future", "--opens", "2999-01-01T00:00Z")):
         paddock.done("create", *options, "--track", "oval")
+    leagues.create(paddock.store, league("past", seed=1, closes=1_577_836_800.0))
     return paddock
 
 
@@ -179,7 +188,7 @@ def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     job = json.loads(call_muster("list", "--json", home=cups.server.home).stdout)[0]["jobId"]
     assert told.splitlines() == [
         f"submitted the race of fast@2 as {job}",
-        f"enter it when it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
+        f"enter it after it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
     ]
     detail = cups.server.detail(job)
     assert (detail["name"], detail["kind"], detail["queue"]) == ("race-long-fast-2", "race", "default")
@@ -239,7 +248,7 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
     shown = cups.done("show", "spring", "2")
     assert "disqualified: not a car" in shown and "0:12.500" in shown and f"job {fast}" in shown
     assert cups.done("verify", "spring").splitlines() == [
-        f"entry {number}: as it was entered, and so is its model" for number in (1, 2)
+        f"entry {number}: the entry and its model are unchanged" for number in (1, 2)
     ]
 
 
@@ -269,18 +278,17 @@ def test_an_evaluation_that_is_not_of_the_league_s_race_is_not_entered(cups: Pad
 
 
 def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_closed(cups: Paddock) -> None:
-    body = {"track": ["oval"], "closes": cups.ended}
-    cups.server.client.post("/api/leagues", {"name": "ended", **body})
+    leagues.create(cups.store, league("ended", seed=1, closes=cups.ended))
     job = cups.raced(3, race([12.0, 12.0, 12.0]))
     assert "league ended closed at" in cups.refused("submit", "ended", "fast@1")
     assert "rank 1" in cups.done("submit", "ended", "fast@1", "--evaluation", job)
-    cups.server.client.post("/api/leagues", {"name": "missed", **body, "closes": cups.ended - 3600})
+    leagues.create(cups.store, league("missed", seed=1, closes=cups.ended - 3600))
     assert f"and job test ({job[:8]}) was not submitted in between" in cups.refused(
         "submit", "missed", "fast@1", "--evaluation", job
     )
 
 
-def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
+def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     cups.done("create", "honest", "--track", "oval")
     for job in (0, 1):
         cups.raced(job, race([12.0 + job] * 3), job + 1)
@@ -291,18 +299,33 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     rows = cups.rows("honest")
     assert [(row["rank"], row["entry"], row["status"]) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
     verified = cups.muster("verify", "honest")
-    assert verified.returncode == 1 and "entry 1: league honest: entry 1 is altered" in verified.stdout
+    assert (
+        verified.returncode == 1
+        and "entry 1: the content of entry.json was altered (SHA-256 differs)\n" in verified.stdout
+    )
+    shown = cups.muster("show", "honest", "1")
+    assert (
+        shown.returncode == 1 and shown.stdout == "entry 1: the content of entry.json was altered (SHA-256 differs)\n"
+    )
+    assert cups.muster("show", "honest", "2").returncode == 0
     listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert "entry 2: as it was entered" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
+    assert (
+        "entry 2: the entry and its model are unchanged" in verified.stdout
+        and cups.muster("verify", "honest", "2").returncode == 0
+    )
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
     onnx.write_bytes(b"Weights")
     verified = cups.muster("verify", "honest", "2", "--rerun")
-    assert verified.returncode == 1 and "entry 2: model fast@2 was altered: " in verified.stdout
+    assert (
+        verified.returncode == 1
+        and "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
+        in verified.stdout
+    )
     before = cups.races()
-    assert "model fast@2 was altered: bundle " in cups.refused("submit", "honest", "fast@2")
+    assert "model fast@2: the content of bundle/policy.onnx was altered" in cups.refused("submit", "honest", "fast@2")
     onnx.write_bytes(b"weights")
     weights = cups.store.run("racer").checkpoints / "00000012-e1" / "learner.pt"
     weights.write_bytes(b"Weights")
@@ -320,6 +343,8 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     rules.chmod(0o644)
     rules.write_bytes(rules.read_bytes().replace(b'"seed": 1', b'"seed": 2'))
     for ask in (("table", "honest"), ("show", "honest"), ("submit", "honest", "fast@1")):
-        assert "league honest is altered" in cups.refused(*ask)
+        assert "league honest: the content of league.json was altered" in cups.refused(*ask)
     (told,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
-    assert "league honest is altered" in told["problem"] and "league honest is altered" in cups.done("list")
+    assert "league honest: the content of league.json was altered" in told[
+        "problem"
+    ] and "league honest: the content of league.json was altered" in cups.done("list")

@@ -70,18 +70,18 @@ def test_a_supervisor_that_has_not_begun_yet_is_not_taken_for_its_shim(bench: Lo
 # -- capacity and plan ------------------------------------------------------------------------------------------------
 
 
-def test_the_machine_is_the_only_host_with_what_it_was_given() -> None:
-    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity()
+def test_the_machine_is_the_only_host_with_its_configured_resources() -> None:
+    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity().machines
     assert (host.name, host.cpus, host.gpus) == ("localhost", 6, ("2", "5"))
     assert host.memory == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
 
 
 def test_without_a_limit_the_machine_s_own_cpus_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1,3")
-    [host] = LocalEngine(Path("/nowhere")).capacity()
+    [host] = LocalEngine(Path("/nowhere")).capacity().machines
     assert (host.cpus, host.gpus) == (float(os.cpu_count() or 1), ("1", "3"))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert LocalEngine(Path("/nowhere")).capacity()[0].gpus == ()
+    assert LocalEngine(Path("/nowhere")).capacity().machines[0].gpus == ()
 
 
 def test_a_plan_starts_nothing_and_is_the_same_each_time(bench: LocalBench) -> None:
@@ -165,14 +165,14 @@ def test_nodes_get_the_contract_their_environment_and_their_gpus(
     assert (first.get(main), second.get(main)) == (first["MASTER_ADDR"], None)
 
 
-def test_a_gang_that_can_not_be_started_whole_is_not_started_at_all(bench: LocalBench) -> None:
+def test_a_gang_starts_completely_or_not_at_all(bench: LocalBench) -> None:
     with pytest.raises(ValueError, match="null"):
         bench.launch(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "a zero byte: \0"]]))
     assert bench.processes() == []
 
 
 def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: LocalBench) -> None:
-    gang = bench.gang("echo $RANK of $WORLD_SIZE", environments=[{"MUSTER_RANKS_PER_NODE": "2"}] * 2)
+    gang = bench.gang("echo $RANK of $WORLD_SIZE", ranks=[2, 2])
     bench.ended(bench.launch(gang))
     assert sorted(bench.printed()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
 
@@ -295,7 +295,7 @@ def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench
     assert not bench.new_engine().observe(other)[0].running
 
 
-def test_what_a_supervisor_said_before_it_reached_the_store_is_told(bench: LocalBench) -> None:
+def test_output_of_a_supervisor_before_it_reaches_the_store_is_reported(bench: LocalBench) -> None:
     raise_epoch(bench.run, 5)
     status = bench.ended(bench.launch(bench.gang(nodes=1, epoch=4)))
     assert (status[0].exit_code, status[0].words) == (

@@ -42,7 +42,7 @@ def small(tmp_path: Path) -> Iterator[Serving]:
     server.close()
 
 
-def test_a_scrape_tells_of_waiting_running_and_ended_jobs_and_what_they_used(small: Serving) -> None:
+def test_a_scrape_reports_waiting_running_and_ended_jobs_and_their_use(small: Serving) -> None:
     before = scraped(small)
     assert value(before, "muster_jobs", queue="default", status="RUNNING") == 0
     assert value(before, "muster_database_usable") == 1 and value(before, "muster_volume_short", volume="store") == 0

@@ -66,6 +66,7 @@ def test_every_node_is_a_row_that_says_what_the_json_said_and_back_again(old: st
     with database.session() as session:
         attempts = session.scalars(select(Attempt)).all()
         assert {(each.job_id, each.number): [node.shown() for node in each.nodes] for each in attempts} == told
+        assert {each.compute_environment for each in attempts} == {"local"}
         assert len(told) == 7 and sum(len(nodes) for nodes in told.values()) == 11
         main = session.scalars(select(Job).where(Job.name == "failed")).one().attempts[0].nodes[0]
         assert main.placement == Placement("localhost", (), 0.1, 16)
@@ -143,6 +144,7 @@ def test_jobs_in_every_state_go_on_where_the_older_controller_left_them(old: str
                 "SUCCEEDED",
             ]
             [done] = detail(client, jobs["done"])["attempts"]
+            assert done["computeEnvironment"] == "local"
             answered = [{key: value for key, value in node.items() if key != "log"} for node in done["nodes"]]
             assert answered == [{**node, "progress": None, "running": False} for node in before[jobs["done"], 1]]
     finally:

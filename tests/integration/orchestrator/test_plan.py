@@ -39,7 +39,7 @@ def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(server: Se
     assert server.client.batch("ListJobs", jobQueue="default")["jobSummaryList"] == []
 
 
-def test_the_whole_command_is_there_however_narrow_the_terminal(server: Serving) -> None:
+def test_the_whole_command_is_printed_on_any_width_of_terminal(server: Serving) -> None:
     whole = "python -P my_train.py " + " ".join(f"--option-{number}=value" for number in range(12))
     (server.home / "job.yaml").write_text(
         f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n"
@@ -48,7 +48,7 @@ def test_the_whole_command_is_there_however_narrow_the_terminal(server: Serving)
     assert narrow.stdout.splitlines()[2].rstrip().endswith(whole), narrow.stdout
 
 
-def test_a_plan_is_made_of_what_a_submission_would_be_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, given = LocalEngine.plan, []
 
     def noted(engine: LocalEngine, gang: Gang) -> Plan[Any]:
@@ -85,7 +85,7 @@ def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:
     "definition",
     [{}, {"jobDefinitionName": "a", "type": "container"}, {"jobDefinitionName": "a", "type": "multinode"}, {"type": 3}],
 )
-def test_what_is_no_gang_is_refused(server: Serving, definition: dict) -> None:
+def test_properties_that_describe_no_gang_are_refused(server: Serving, definition: dict) -> None:
     with pytest.raises(ApiError) as refusal:
         server.client.post("/api/plan", {"definition": definition})
     assert refusal.value.status == 400 and "\n" not in str(refusal.value)

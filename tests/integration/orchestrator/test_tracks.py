@@ -30,12 +30,12 @@ def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_p
     track = resolve("hills", store)
     assert len(track.center) == round(40 / 0.15)
 
-    assert "hills exists already, and a track is never changed" in refused("make", "hills", "--seed", "8")
+    assert "hills exists already, and tracks are immutable" in refused("make", "hills", "--seed", "8")
     assert "give one of --preset" in refused("make", "both", "--seed", "8", "--preset", "oval")
     assert "--roughness belongs to --seed" in refused("make", "x", "--preset", "oval", "--roughness", "1")
     assert "did you mean hills?" in refused("show", "hils")
     assert "it exists; --overwrite replaces it" in refused("show", "hills", "-o", str(picture))
-    assert "the ending says what it is to be: .png, .npy" in refused("show", "hills", "-o", str(tmp_path / "hills.gif"))
+    assert "unknown ending; use one of .png, .npy" in refused("show", "hills", "-o", str(tmp_path / "hills.gif"))
 
     shown = call_muster("tracks", "show", "hills", "-o", str(file), "--json", home=home)
     assert json.loads(shown.stdout)["digest"] == track.digest

@@ -103,7 +103,7 @@ def test_a_damaged_row_answers_for_itself_alone(
     inside: Server, http: httpx.Client, ended: tuple[str, str], value: str
 ) -> None:
     broken, whole = ended
-    home = Path(str(inside.controller.database.volume))
+    home = Path(str(inside.reconciler.database.volume))
     [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", broken)
     asked = {"jobQueue": "default", "filters": [{"name": "AFTER_CREATED_AT", "values": ["0"]}]}
     run = http.get(f"/api/jobs/{broken}").json()["run"]
@@ -136,7 +136,7 @@ def test_a_job_whose_definition_is_gone_from_the_database_answers_for_itself_alo
     inside: Server, http: httpx.Client, ended: tuple[str, str]
 ) -> None:
     broken, whole = ended
-    home = Path(str(inside.controller.database.volume))
+    home = Path(str(inside.reconciler.database.volume))
     [[kept]] = change(home, "SELECT definition FROM jobs WHERE id = ?", broken)
     change(home, "UPDATE jobs SET definition = 'gone:9' WHERE id = ?", broken)
     try:
@@ -242,7 +242,7 @@ def test_gangs_of_a_database_that_was_deleted_are_named_at_the_next_start_with_h
     assert sum("has no such job" in record.getMessage() for record in caplog.records) == 1
 
 
-def test_what_was_committed_into_a_deleted_file_is_not_acknowledged(tmp_path: Path) -> None:
+def test_a_commit_to_a_deleted_database_file_is_not_acknowledged(tmp_path: Path) -> None:
     database = Database.at(tmp_path)
     with pytest.raises(DatabaseError, match="was deleted while the controller runs"), database.session() as session:
         session.add(job("lost"))
@@ -308,7 +308,7 @@ def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Pat
     assert stopped, "while the machines were looked at"
 
 
-def test_a_volume_that_does_not_answer_is_named_starts_nothing_and_holds_up_nobody(
+def test_a_hanging_volume_is_named_starts_nothing_and_delays_no_request(
     inside: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     look, answers = os.statvfs, threading.Event()
@@ -322,7 +322,7 @@ def test_a_volume_that_does_not_answer_is_named_starts_nothing_and_holds_up_nobo
     monkeypatch.setattr(os, "statvfs", hanging)
     try:
         with Client(inside.url) as client:
-            wait_for(inside.controller.disk.shortage, 30, "that the volume is missed")
+            wait_for(inside.reconciler.disk.shortage, 30, "that the volume is missed")
             waiting = submit_gang(client, "print('at last')")
             [listed] = client.batch("ListJobs", jobQueue="default", jobStatus="RUNNABLE")["jobSummaryList"]
             assert listed["jobId"] == waiting

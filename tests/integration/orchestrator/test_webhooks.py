@@ -99,7 +99,7 @@ def test_a_message_is_tried_again_by_the_next_controller_with_the_same_id_and_bo
     assert is_signed(first, body) and is_signed(second, again)
 
 
-def test_a_receiver_that_is_slow_or_away_keeps_no_job_waiting(told: Serving, receiver: Receiver) -> None:
+def test_a_slow_or_unreachable_receiver_delays_no_job(told: Serving, receiver: Receiver) -> None:
     receiver.gate.clear()
     first = told.gang("print(1)", name="first")
     wait_for(lambda: receiver.of(first), 20, "a message that is not answered")
@@ -119,7 +119,7 @@ def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serv
     place = f"http://127.0.0.1:{receiver.server_port}"
     accepted, note = sent.stdout.splitlines()
     assert accepted == f"chat: {place} accepted the sample (webhook-id {headers['webhook-id']})", sent.stderr
-    assert note == "a sample is sent once, about no job; it is none of the messages that muster webhooks list counts"
+    assert note == "this sample belongs to no job; muster webhooks list does not count it"
     assert is_signed(headers, body) and json.loads(body)["type"] == "webhook.test"
     receiver.answers = [302]
     refused = command("test", "chat")
@@ -132,7 +132,7 @@ def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serv
     assert SECRET not in everything and "a-path-that-is-secret" not in everything
 
 
-def test_what_no_receiver_takes_is_given_up_after_the_last_try_and_shown(
+def test_an_undeliverable_message_is_given_up_after_the_last_try_and_shown(
     tmp_path: Path, receiver: Receiver, caplog: pytest.LogCaptureFixture
 ) -> None:
     receiver.answers = [500, 503, 404]
@@ -146,7 +146,7 @@ def test_what_no_receiver_takes_is_given_up_after_the_last_try_and_shown(
         job = submit_gang(client, "print(1)")
         wait_for(lambda: all(each["failed"] for each in client.get("/api/webhooks")), 20, "both are given up")
         chat, gone_one = client.get("/api/webhooks")
-        metrics = server.controller.monitoring.registry.get_sample_value
+        metrics = server.reconciler.monitoring.registry.get_sample_value
         counted = {"webhook": "chat", "result": "failed"}, {"webhook": "chat", "result": "given up"}
         assert [metrics("muster_webhook_tries_total", labels) for labels in counted] == [2.0, 1.0]
     (message,) = chat["failed"]
@@ -175,7 +175,7 @@ def test_a_receiver_that_answers_a_byte_at_a_time_is_left_after_the_deadline_of_
         assert dripping.drip.wait(30), "the connection is closed, not kept"
 
 
-def test_a_queue_that_is_not_there_is_named_at_the_start_with_the_nearest(
+def test_an_unknown_queue_is_named_at_the_start_with_the_nearest(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = write_webhooks(
@@ -193,31 +193,31 @@ def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: 
         here = {"url": gone.url}
     file = write_webhooks(tmp_path / "hooks.json", chat=here, trained={**here, "kinds": ["train"]})
     server = Server(tmp_path / "home", cpus=1, webhooks=file)  # nothing is started: nothing is sent
-    with server.controller.database.session() as session:
+    with server.reconciler.database.session() as session:
         session.add_all([rows.job("a", status=Status.RUNNING), rows.job("b", status=Status.RUNNING)])
-    with pytest.raises(RuntimeError), server.controller.database.session() as session:
+    with pytest.raises(RuntimeError), server.reconciler.database.session() as session:
         session.get_one(Job, "a").move(Status.FAILED, "no")
         session.flush()
         raise RuntimeError
-    with server.controller.database.session() as session:
+    with server.reconciler.database.session() as session:
         assert session.scalars(select(WebhookDelivery)).all() == []
         session.get_one(Job, "b").move(Status.SUCCEEDED)
-    with server.controller.database.session() as session:
+    with server.reconciler.database.session() as session:
         (row,) = session.scalars(select(WebhookDelivery))
         assert (row.webhook, row.job, row.tries, row.body) == ("chat", "b", 0, None)
     server.close()
 
 
-def test_what_waits_for_a_webhook_is_given_up_by_a_controller_that_has_others_and_by_none_without(
+def test_messages_of_an_unknown_webhook_are_given_up_only_by_a_controller_with_webhooks(
     tmp_path: Path,
 ) -> None:
     with receiving() as gone:
         here = {"url": gone.url}
     home = tmp_path / "home"
     server = Server(home, cpus=1, webhooks=write_webhooks(tmp_path / "hooks.json", chat=here))
-    with server.controller.database.session() as session:
+    with server.reconciler.database.session() as session:
         session.add(rows.job("a", status=Status.RUNNING))
-    with server.controller.database.session() as session:
+    with server.reconciler.database.session() as session:
         session.get_one(Job, "a").move(Status.SUCCEEDED)
     server.close()
     for file, problem in (
@@ -226,7 +226,7 @@ def test_what_waits_for_a_webhook_is_given_up_by_a_controller_that_has_others_an
     ):
         server = Server(home, cpus=1, webhooks=file)
         server.start()
-        with server.controller.database.session() as session:
+        with server.reconciler.database.session() as session:
             (row,) = session.scalars(select(WebhookDelivery))
             assert (row.problem or "").startswith(problem or "") and (row.next_at is None) == (problem is not None)
         server.close()

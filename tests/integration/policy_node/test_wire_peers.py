@@ -23,11 +23,11 @@ import pytest
 import xxhash
 import zenoh
 from mcap_ros2._dynamic import generate_dynamic as dynamic
-from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 
 from muster_policy.graph import Node, open_session
-from muster_policy.messages import EMPTY, JOINT_STATE, TWIST, Messages
+from muster_policy.messages import EMPTY, JOINT_STATE, RESET, TWIST, Messages
 from muster_policy.wire import parse_token, read_attachment
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.policy_node import write_bundle
@@ -138,7 +138,42 @@ def test_another_implementation_of_the_wire_drives_the_node_and_hears_it(running
         ZenohSession.get_instance().close()
 
 
-def test_what_the_node_says_is_read_by_another_cdr_reader_and_has_rmw_zenoh_s_attachment(running: Running) -> None:
+def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(tmp_path: Path) -> None:
+    """Type hash, key, token and request are the peer's own."""
+    bundle = write_bundle(tmp_path / "bundle", contract(SPEED), np.array([[1.0], [0.0]]))
+    running = Running(bundle, tmp_path / "log")
+    nothing = "uint8 structure_needs_at_least_one_member"
+    client = ROS2ServiceClient(
+        "/muster_policy/reset",
+        RESET,
+        request_definition=nothing,
+        response_definition=nothing,
+        router_ip="127.0.0.1",
+        router_port=running.port,
+    )
+    try:
+        assert client.type_hash == MESSAGES.type_hash(RESET)
+        with open_session(running.endpoint, None) as session:
+            keys = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**", timeout=5)]
+        ours, theirs = (next(key for key in keys if f"/{kind}/%/%/" in key) for kind in ("SS", "SC"))
+        assert ours.split("/")[-4:] == theirs.split("/")[-4:], (
+            "name, type, hash and quality of service are written alike"
+        )
+        assert client.call(structure_needs_at_least_one_member=0) is not None, "the answer"
+        assert client.call(structure_needs_at_least_one_member=0) is not None, "the next one"
+        with open_session(running.endpoint, None) as session:
+            stranger = session.get(client.keyexpr, target=zenoh.QueryTarget.ALL_COMPLETE, timeout=5)
+            assert list(stranger) == [], "a request without rmw_zenoh's attachment"
+        assert running.end() == 0 and " 2 resets," in running.said().splitlines()[-1], running.said()
+    finally:
+        client.close()
+        ZenohSession.get_instance().close()
+        running.process.kill()
+
+
+def test_messages_of_the_node_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachment(
+    running: Running,
+) -> None:
     got: list[zenoh.Sample] = []
     with open_session(running.endpoint, None) as session:
         node = Node(session, MESSAGES, name="sensors")
@@ -202,7 +237,7 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
     assert running.process.poll() is None
 
 
-def test_a_silent_robot_is_told_and_a_reset_begins_a_fresh_episode_and_the_end_undeclares_everything(
+def test_a_silent_robot_is_reported_a_reset_starts_an_episode_and_the_end_undeclares_everything(
     running: Running,
 ) -> None:
     wait_for(lambda: "/joint_states is silent for" in running.said(), 20, "the watchdog")
@@ -228,7 +263,7 @@ def test_a_silent_robot_is_told_and_a_reset_begins_a_fresh_episode_and_the_end_u
 
         wait_for(lambda: diagnosed(False), 20, "the end of what the tests before sent")
         wait_for(lambda: diagnosed(True), 20, "a diagnosis of the acting node")
-        wait_for(lambda: any("all inputs are there" in line for line in said), 20, "the line on /rosout")
+        wait_for(lambda: any("all inputs have arrived" in line for line in said), 20, "the line on /rosout")
         reset.publish(MESSAGES.make(EMPTY, structure_needs_at_least_one_member=0))
 
         def told(sample: zenoh.Sample) -> None:

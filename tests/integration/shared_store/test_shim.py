@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.cgroups import own_group, remove_abandoned_groups, remove_group
+from shared_store.cgroups import kill_group, members, own_group, remove_abandoned_groups, remove_group
 from shared_store.nodes import NodeProcesses, end_nodes
-from shared_store.processes import end_all, find_process, marked
+from shared_store.processes import await_marks, end_all, find_process, marked
 from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
 from tests.conftest import PATIENCE, wait_for
 from tests.support.processes import alive, await_end, frozen, processes_running, signal_all
@@ -113,7 +113,7 @@ def test_with_a_control_group_a_job_that_kills_the_shim_leaves_nothing_either(pi
     assert not os.path.exists(group)
 
 
-def test_without_one_what_kept_its_marks_is_found_by_them_and_others_are_left_alone(pids: Path) -> None:
+def test_without_a_group_marked_processes_are_found_and_others_are_left_alone(pids: Path) -> None:
     gang = f"shim-{os.getpid()}/1/1"
     script = f"setsid sleep 600 & echo $! >>{pids}; exec sleep 600"
     shim, other = start(script, "", MUSTER_GANG=gang), start(script, "", MUSTER_GANG=f"{gang}1")
@@ -137,7 +137,7 @@ def test_requests_reach_the_supervisor_also_where_a_job_stopped_it(number: int, 
     assert shim.wait(20 * PATIENCE) == 75
 
 
-def test_a_shim_that_a_job_stopped_ends_all_the_same(group: str, pids: Path) -> None:
+def test_a_shim_stopped_by_a_job_still_ends(group: str, pids: Path) -> None:
     shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", group)
     wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
     shim.send_signal(signal.SIGSTOP)
@@ -205,11 +205,44 @@ def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pi
 
 @pytest.mark.parametrize("marks", [[], ["MUSTER_GANG="], ["MUSTER_GANG"], ["MUSTER_GANG=job/1/1", ""]])
 def test_marks_that_would_fit_every_process_are_refused(marks: list[str]) -> None:
-    with pytest.raises(ValueError, match="no process can be told by the marks"):
+    with pytest.raises(ValueError, match="no process can be identified by the marks"):
         marked(marks)
 
 
-def test_abandoned_groups_are_removed_and_neither_those_in_use_nor_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_was_just_started_is_found_by_its_marks() -> None:
+    for number in range(50):  # without the wait about every third would not be
+        mark = f"MUSTER_GANG=just-started/{number}/{os.getpid()}"
+        with subprocess.Popen(["sleep", "600"], env=dict([mark.split("=")])) as child:
+            await_marks(child.pid)
+            found = [process.pid for process in marked([mark])]
+            child.kill()
+        assert found == [child.pid]
+    await_marks(child.pid)  # of one that is gone it returns
+
+
+def test_the_kernel_ends_a_whole_control_group_at_once_even_one_that_keeps_forking() -> None:
+    if not (groups := own_group()):
+        pytest.skip(
+            "this process can't make control groups of version 2: run the test as root, or in a delegated group"
+        )
+    group = f"{groups}/muster-test-{os.getpid()}"
+    os.mkdir(group)
+    try:
+        if not os.path.exists(f"{group}/cgroup.kill"):
+            pytest.skip(f"kernel {os.uname().release} has no cgroup.kill (Linux 5.14 and later)")
+        script = f'echo $$ > {group}/cgroup.procs; while :; do setsid sh -c "sleep 600 & sleep 0.01" & sleep 0.01; done'
+        with subprocess.Popen(["sh", "-c", script]) as forking:
+            wait_for(lambda: len(members(group)) > 5, 20, "processes in the group")
+            kill_group(group)  # and nothing else: no pid is looked for
+            assert forking.wait(20) == -signal.SIGKILL
+            wait_for(lambda: not members(group), 20, "an empty group")
+    finally:
+        kill_group(group)
+        remove_group(group)
+    assert not os.path.exists(group)
+
+
+def test_only_abandoned_groups_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
     if not (groups := own_group()):
         pytest.skip("this process can't make control groups")
     directory = f"{groups}/muster-test-{os.getpid()}"

@@ -103,7 +103,7 @@ def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> N
     assert n.stderr.read_text() == "log of node 0 can't be written: No space left on device\n"
 
 
-def test_where_nothing_at_all_can_be_written_the_exit_code_is_still_the_rank_s(node: Nodes) -> None:
+def test_the_exit_code_is_the_ranks_even_if_nothing_can_be_written(node: Nodes) -> None:
     n = node()
     (n.run.path / "outcomes").write_text("a file where a directory should be")
     n.stderr.symlink_to("/dev/full")
@@ -207,7 +207,7 @@ def test_no_variable_of_the_installed_torchrun_is_missing(node: Nodes) -> None:
     assert names - found.keys() == set()
 
 
-def test_what_the_user_set_stands_but_not_against_the_rank_s_own_place(node: Nodes) -> None:
+def test_variables_of_the_user_are_kept_except_those_of_the_ranks_placement(node: Nodes) -> None:
     n = node(cpus=4.0)
     [found] = environment_of_ranks(n, OMP_NUM_THREADS="3", NCCL_SOCKET_IFNAME="ib0", RANK="7", WORLD_SIZE="9")
     assert (found["OMP_NUM_THREADS"], found["NCCL_SOCKET_IFNAME"]) == ("3", "ib0")

@@ -197,7 +197,7 @@ def test_a_rank_that_its_engine_ended_before_the_supervisor_knew_was_asked(node:
     assert (n.wait(), n.ended().asked) == (143, True)
 
 
-def test_a_rank_that_does_not_heed_the_failure_of_another_is_killed(node: Nodes) -> None:
+def test_a_rank_that_ignores_the_failure_of_another_is_killed(node: Nodes) -> None:
     n = node(ranks_per_node=2)
     main = "import sys, worker.node.supervisor as s; s._PEER_GRACE = 0.5; sys.exit(s.main(sys.argv[1:]))"
     script = 'if [ $RANK = 0 ]; then sleep 0.5; exit 3; fi; trap "" TERM; while :; do sleep 0.1; done'
@@ -236,12 +236,12 @@ def test_a_request_to_leave_reaches_the_ranks_and_exit_75_is_kept(node: Nodes, n
     assert (outcome.exit_code, outcome.reason, outcome.error) == (75, "checkpointed and left on request", None)
 
 
-def test_a_node_whose_ranks_are_done_or_left_on_request_left_on_request(node: Nodes) -> None:
+def test_a_node_exits_on_request_if_its_ranks_are_done_or_exited_on_request(node: Nodes) -> None:
     n = node(ranks_per_node=2)
     assert n.shell("[ $RANK = 0 ] && exit 75; exit 0") == 75
 
 
-def test_a_rank_that_does_not_leave_within_the_grace_is_killed(node: Nodes) -> None:
+def test_a_rank_that_does_not_exit_within_the_grace_time_is_killed(node: Nodes) -> None:
     n = node(grace=0.6)
     n.start("sh", "-c", STAYS)
     n.wait_for_output("ready")

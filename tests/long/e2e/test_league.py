@@ -44,13 +44,13 @@ def test_a_racer_is_trained_registered_raced_ranked_and_verified(server: Serving
     assert order == [(1, 1, rows[0]["time"]), (2, 2, rows[0]["time"])], "the same policy: the earlier entry is ahead"
 
     assert done("league", "verify", "cup", "1", "--rerun").splitlines() == [
-        "entry 1: every lap is the same to the last bit"
+        "entry 1: every lap is the same, bit for bit"
     ]
     path = cup.path / "entries" / "2" / "entry.json"
     path.chmod(0o644)
     path.write_bytes(path.read_bytes().replace(b'"racer": "bob"', b'"racer": "eve"'))
     altered = server.muster("league", "verify", "cup")
-    assert altered.returncode == 1 and "entry 2: league cup: entry 2 is altered" in altered.stdout
+    assert altered.returncode == 1 and "entry 2: the content of entry.json was altered" in altered.stdout
     assert [row["status"] for row in json.loads(done("league", "table", "cup", "--json")) if row["entry"] == 2] == [
         "altered"
     ]

@@ -106,10 +106,10 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         ("record", f"{run.name}@7", "-o", "x.mcap"): f"no checkpoint of iteration 7; the nearest is {iterations[0]}",
         ("record", run.name, "-o", str(tmp_path)): "it is a directory; name a file in it",
         ("record", run.name, "-o", str(tmp_path / "no" / "x.mcap")): f"there is no directory {tmp_path / 'no'}",
-        ("record", run.name, "-o", "x.bag"): "the ending says what it is to be: .mcap",
+        ("record", run.name, "-o", "x.bag"): "unknown ending; use one of .mcap",
         ("record", run.name): "-o is missing: muster record",
         ("record", "--recover", str(tmp_path / "x.mcap.partial")): "there is no such file",
-        ("render", run.name, "-o", "x.avi"): "the ending says what it is to be: .gif, .mp4, .png",
+        ("render", run.name, "-o", "x.avi"): "unknown ending; use one of .gif, .mp4, .png",
         ("render", run.name, "-o", "x.gif", "--size", "big"): "expected WIDTHxHEIGHT, such as 640x360",
     }
     for arguments, words in refused.items():

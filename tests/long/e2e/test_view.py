@@ -227,7 +227,7 @@ def test_what_can_t_be_viewed_is_refused_in_one_line(server: Serving, job: str, 
         ("view", run.name, "--memory", "much"): "expected a number with MB or GB",
         ("view", str(tmp_path / "text.mcap")): "it does not begin as an MCAP file does",
         ("view", str(tmp_path / "text.rrd")): "it does not begin as an .rrd file does",
-        ("view", str(tmp_path / "text.rrd"), "--episodes", "1"): "it is for the policy of a RUN",
+        ("view", str(tmp_path / "text.rrd"), "--episodes", "1"): "only the policy of a RUN takes it",
     }
     for arguments, words in refused.items():
         done = server.muster(*arguments)

@@ -57,4 +57,4 @@ def test_killed_it_ends_with_the_same_bits(tmp_path: Path, name: str) -> None:
     (tmp_path / "job.yaml").write_text(job)
     said = muster(home, tmp_path, "verify-resume", "job.yaml", "--at", "9", "--iterations", "3", *options)
     assert re.search(r"^equal: \d+ tensors, 12 iterations$", said, re.MULTILINE), said
-    assert re.search(r"went on from iteration [48]$", said, re.MULTILINE), said
+    assert re.search(r"resumed from iteration [48]$", said, re.MULTILINE), said

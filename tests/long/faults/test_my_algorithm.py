@@ -68,7 +68,7 @@ def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_pat
     done = run_muster("verify-resume", SPEC, "--at", "6", "--iterations", "3", *small, home=home, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^equal: \d+ tensors, 9 iterations$", done.stdout, re.M), done.stdout
-    killed = re.search(r"^killed: +(\S+), by SIGKILL .* went on from iteration (\d+)$", done.stdout, re.M)
+    killed = re.search(r"^killed: +(\S+), by SIGKILL .* resumed from iteration (\d+)$", done.stdout, re.M)
     assert killed and int(killed[2]) in (0, 4), done.stdout
     run = Store(home / "store").run(killed[1])
     assert [record["iteration"] for record in read_metrics(run)] == list(range(1, 10))

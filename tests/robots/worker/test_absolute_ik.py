@@ -186,7 +186,7 @@ def test_the_contract_names_numbers_of_a_pose_and_their_units() -> None:
     actions = policy_contract(task, "Posed").actions
     assert [action.name for action in actions] == [f"palm_{axis}" for axis in FULL]
     assert [action.unit for action in actions] == ["m"] * 3 + ["1"] * 4
-    assert "one number of the pose that it shall have" in actions[0].rule
+    assert "one number of its wanted pose" in actions[0].rule
     assert "bring the site palm in the world's frame to x, y, z, qx, qy, qz, qw" in actions[0].rule
 
 

@@ -305,7 +305,10 @@ def test_actions_and_tables_and_the_contract_name_the_columns() -> None:
     first, second, grip = policy_contract(task, "Planar").actions
     assert (first.name, first.kind, first.unit, first.scale) == ("tip_x", "position", "m", pytest.approx(0.02))
     assert (second.scale, second.stiffness, second.clip) == (pytest.approx(0.01), 0.0, (-1.0, 1.0))
-    assert first.rule.startswith("A movement of a body or site") and "position targets of shoulder, elbow" in first.rule
+    assert (
+        first.rule.startswith("A displacement of a body or site")
+        and "position targets of shoulder, elbow" in first.rule
+    )
     assert "the site tip in the root's frame by x, y" in first.rule and "damping = 0.05" in first.rule
     assert grip.rule == ""
     fewer = type("Fewer", (Planar,), {"actions": {"tip": Action(terms.move_frame, size=1)}}).sketch(ArmConfig())  # type: ignore[attr-defined]

@@ -14,10 +14,13 @@ import yaml
 
 from tests.conftest import REPOSITORY
 from tests.support.worker.page_tasks import blocks, module
+from tests.support.worker.robots import need_mjlab
 from tests.support.worker.tasks import observe, put
 from worker.learning.job import configure
 from worker.tasks import find_task
+from worker.tasks.configs.velocity import Go1FlatConfig
 from worker.tasks.declared import DeclaredTask
+from worker.tasks.settings_page import sketch
 
 SIZES = re.compile(r"(\d+) observations, (\d+) actions?")
 
@@ -110,6 +113,23 @@ def test_isaac_labs_cartpole_as_it_is_on_the_page(tmp_path: Path) -> None:
     assert task.observations[0].tolist() == pytest.approx([0.5, 0.3, -2.0, 4.0], abs=1e-6)
     [action] = task.interface().actions
     assert (action.name, action.scale, action.clip, action.effort_limit) == ("slider_to_cart", 100.0, None, 400.0)
+
+
+def test_mjlabs_go1_on_the_page_has_the_functions_and_weights_of_the_task() -> None:
+    need_mjlab()
+    declared, weights = sketch("Go1Flat").task.plan.declaration, Go1FlatConfig().rewards
+    table = (REPOSITORY / "docs/tasks/ports.md").read_text().partition("## mjlab")[2]
+    rows = {line.split("`")[1].partition(":")[0]: line for line in table.splitlines() if line.startswith("| `")}
+    shown = {name: reward for name, reward in declared.rewards.items() if weights[name]}
+    wrong = [
+        name
+        for name, reward in shown.items()
+        if f"terms.{reward.function.key}" not in rows[name]
+        or f"{weights[name]}" not in rows[name].replace("-1e-5", "-1e-05")
+    ]
+    assert len(shown) == 10 and wrong == []
+    assert "`body_ang_vel`, `angular_momentum`, `air_time`: weight 0" in table
+    assert {name for name in weights if not weights[name]} == {"body_ang_vel", "angular_momentum", "air_time"}
 
 
 def test_the_ant_of_the_page_on_sensors_feels(tmp_path: Path) -> None:

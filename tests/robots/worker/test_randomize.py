@@ -369,7 +369,7 @@ def test_a_declaration_that_can_not_be_is_refused(what: str, options: dict[str, 
         (Randomize("mass", bodies="*", range=(1.0, 2.0), robot="cube"), "no robot or object is called 'cube'"),
         (
             Randomize("friction", geoms="*", range=(1.0, 2.0)),
-            "so that they have no friction; choose geoms that collide",
+            "so they have no friction; choose geoms that collide",
         ),
         (Randomize("stiffness", actuators="wrist", range=(1.0, 2.0)), "is a motor, which has no stiffness"),
         (Randomize("stiffness", actuators="elbow", range=(1.0, 2.0)), "is a velocity actuator, which has no stiffness"),

@@ -261,5 +261,5 @@ def walking() -> SensorContext:
 
 def test_an_imu_on_a_body_fixed_to_the_world_is_refused() -> None:
     context = scene({"robot": swing().replace('<body name="base"', '<site name="post"/><body name="base"')}, 1)
-    with pytest.raises(ValueError, match="Imu: post is fixed to the world, so that it never moves"):
+    with pytest.raises(ValueError, match="Imu: post is fixed to the world, so it never moves"):
         Imu(site="post").build(context)

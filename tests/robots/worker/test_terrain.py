@@ -182,12 +182,12 @@ def test_the_default_is_the_rough_terrain_of_others() -> None:
     [
         (lambda: Terrain(kinds={}), ["Terrain.kinds is empty"]),
         (lambda: Terrain(kinds={Flat(): 0.0}), ["share of Flat is 0.0", "> 0"]),
-        (lambda: Terrain(kinds={"flat": 1.0}), ["'flat' is no patch", "Flat()"]),  # type: ignore[dict-item]
+        (lambda: Terrain(kinds={"flat": 1.0}), ["'flat' is not a patch", "Flat()"]),  # type: ignore[dict-item]
         (lambda: Terrain(levels=0), ["Terrain.levels is 0", ">= 1"]),
         (lambda: Terrain(columns=3), ["Terrain.columns is 3", "at least 7"]),
         (lambda: Terrain(resolution=0.0), ["Terrain.resolution is 0.0"]),
         (lambda: Terrain(kinds={Flat(platform=0, border=0): 1}, size=(0.1, 8.0)), ["0.1 m has fewer than 2 cells"]),
-        (lambda: Terrain(size=(8.0, 8.05)), ["8.05 m is no multiple", "use 8"]),
+        (lambda: Terrain(size=(8.0, 8.05)), ["8.05 m is not a multiple", "use 8"]),
         (lambda: Terrain(size=(4.0, 4.0)), ["Stairs", "wider than a patch of 4 m"]),
         (lambda: Terrain(resolution=0.4), ["Stairs.step_width", "0.3 m", "0.4 m"]),
         (lambda: Terrain(kinds={Gaps(widths=(0.1, 0.5)): 1.0}), ["Gaps.widths", "two cells"]),
@@ -208,7 +208,8 @@ def test_an_impossible_configuration_is_refused_in_one_line(build: Any, parts: l
 def test_a_field_outside_memory_is_refused_before_it_is_built() -> None:
     terrain = Terrain(resolution=0.0005)
     with pytest.raises(
-        ValueError, match=r"10 x 7 patches at 0\.0005 m have 17,920,\d\d\d,001 heights, .*GiB.* use a resolution from"
+        ValueError,
+        match=r"10 x 7 patches at 0\.0005 m have 17,920,\d\d\d,001 heights, .*GiB.* use a resolution of at least",
     ):
         terrain.check_memory("cpu")
     assert "heights" not in vars(terrain), "nothing was computed"

@@ -93,7 +93,7 @@ class Batch:
         snapshot = self.api.get_job_queue_snapshot(jobQueue=queue)
         return [each["jobArn"].rpartition("/")[2] for each in snapshot["frontOfQueue"]["jobs"]]
 
-    def pool(self, name: str, cpus: int = 8, state: str = "ENABLED") -> str:
+    def compute_environment(self, name: str, cpus: int = 8, state: str = "ENABLED") -> str:
         """A compute environment of at most ``cpus``; a DISABLED one holds its jobs RUNNABLE for as long as a test likes."""
         resources = {"type": "EC2", "maxvCpus": cpus, "subnets": ["subnet-none"]}
         self.api.create_compute_environment(
@@ -101,21 +101,21 @@ class Batch:
         )
         return name
 
-    def queue(self, name: str, pool: str, priority: int = 1, **request: Any) -> str:
-        order = [{"order": 1, "computeEnvironment": pool}]
+    def queue(self, name: str, compute_environment: str, priority: int = 1, **request: Any) -> str:
+        order = [{"order": 1, "computeEnvironment": compute_environment}]
         self.api.create_job_queue(jobQueueName=name, priority=priority, computeEnvironmentOrder=order, **request)
         return name
 
-    def remove(self, queues: list[str], pools: list[str]) -> None:
-        """Delete queues with all their jobs, then pools: other tests of the same server have at most 50 of each, too."""
+    def remove(self, queues: list[str], compute_environments: list[str]) -> None:
+        """Delete queues with all their jobs, then compute environments: other tests of the same server have at most 50 of each, too."""
         for queue in queues:
             self.api.update_job_queue(jobQueue=queue, state="DISABLED")
             self.api.delete_job_queue(jobQueue=queue)
-        for pool in pools:
-            self.api.update_compute_environment(computeEnvironment=pool, state="DISABLED")
+        for compute_environment in compute_environments:
+            self.api.update_compute_environment(computeEnvironment=compute_environment, state="DISABLED")
         wait_for(lambda: not self.api.describe_job_queues(jobQueues=queues)["jobQueues"], 60, f"the end of {queues}")
-        for pool in pools:
-            self.api.delete_compute_environment(computeEnvironment=pool)
+        for compute_environment in compute_environments:
+            self.api.delete_compute_environment(computeEnvironment=compute_environment)
 
 
 def container(script: str, changes: dict[str, Any]) -> dict[str, Any]:

@@ -64,9 +64,11 @@ class Fuzzed(Serving):
         for queue in self._names("DescribeJobQueues", "jobQueues", "jobQueueName") - KEPT:
             self._try("UpdateJobQueue", jobQueue=queue, state="DISABLED")
             self._try("DeleteJobQueue", jobQueue=queue)
-        for pool in self._names("DescribeComputeEnvironments", "computeEnvironments", "computeEnvironmentName") - KEPT:
-            self._try("UpdateComputeEnvironment", computeEnvironment=pool, state="DISABLED")
-            self._try("DeleteComputeEnvironment", computeEnvironment=pool)
+        for compute_environment in (
+            self._names("DescribeComputeEnvironments", "computeEnvironments", "computeEnvironmentName") - KEPT
+        ):
+            self._try("UpdateComputeEnvironment", computeEnvironment=compute_environment, state="DISABLED")
+            self._try("DeleteComputeEnvironment", computeEnvironment=compute_environment)
         for name in ("fuzz", "spare", "made"):
             self._try("CreateComputeEnvironment", **good.environment(name))
             self._try("CreateSchedulingPolicy", **good.policy(name))

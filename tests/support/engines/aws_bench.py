@@ -42,6 +42,7 @@ class AwsBench(Bench):
             "environments": [environment] * nodes,
             "placements": [Placement("aws-batch/default", (), 0.5, 64)] * nodes,
             "directory": "/no/such/directory",
+            "is_native": native,
             "containers": [{"image": "muster" if native else "busybox"}] * nodes,
             "title": self.home.name.replace("_", "-"),
         }

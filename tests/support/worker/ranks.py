@@ -82,6 +82,7 @@ def train() -> int:
     """What ``worker.train`` does, with the test double as the task."""
     from tests.support.worker.point_task import Point
     from worker.distributed import Placement, connect, use_cpu_threads
+    from worker.learning import leaving
     from worker.learning.job import Job, StopRequest
     from worker.learning.loop import Loop
     from worker.learning.training import Training
@@ -90,7 +91,7 @@ def train() -> int:
     job = Job.from_env(os.environ, "train")
     use_cpu_threads(os.environ)
     gang = connect(Placement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60")))
-    code = Loop(Training.of(job, Point), gang, stop).train()  # type: ignore[arg-type]
+    code = leaving.train(Loop(Training.of(job, Point), gang, stop), stop)  # type: ignore[arg-type]
     gang.close()
     return code
 

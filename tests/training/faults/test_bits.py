@@ -46,7 +46,7 @@ def proven(process: subprocess.Popen[str], iterations: int) -> tuple[str, str, i
     tensors = re.search(rf"^equal: (\d+) tensors, {iterations} iterations$", output, re.MULTILINE)
     assert tensors and int(tensors[1]) > 30, output
     told = re.search(
-        r"^straight: (\S+)\nkilled: +(\S+), by SIGKILL .* went on from iteration (\d+)$", output, re.MULTILINE
+        r"^straight: (\S+)\nkilled: +(\S+), by SIGKILL .* resumed from iteration (\d+)$", output, re.MULTILINE
     )
     assert told, output
     return told[1], told[2], int(told[3])

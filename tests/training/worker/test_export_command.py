@@ -68,15 +68,15 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
     [
         (("export", "RUN@7"), "run RUN has no checkpoint of iteration 7; the nearest is 2; it has: 1, 2"),
         (("export", "RUNX"), "did you mean RUN?"),
-        (("export", "RUN@last"), "after @ stands an iteration, best or latest"),
-        (("export", "RUN", "-o", "/"), "-o /: exists already; name a directory that does not"),
+        (("export", "RUN@last"), "expected an iteration, best or latest after @"),
+        (("export", "RUN", "-o", "/"), "-o /: exists already; name a new directory"),
         (("models", "register", "RUN@7", "--name", "x"), "run RUN has no checkpoint of iteration 7; it has: 1, 2"),
         (
             ("models", "register", "RUN", "--name", "../x"),
             "model name '../x': use letters, digits, '.', '_' and '-' only",
         ),
         (("models", "show", "nothing"), "model nothing does not exist"),
-        (("models", "verify", "cart@0"), "cart@0: after @ stands a version, such as cart@1"),
+        (("models", "verify", "cart@0"), "cart@0: expected a version after @, such as cart@1"),
     ],
 )
 def test_wrong_use_is_one_line(home: Path, arguments: tuple[str, ...], said: str) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
@@ -176,7 +177,10 @@ def test_a_finished_run_has_all_its_files(tmp_path: Path, capsys: pytest.Capture
     assert f"last checkpoint: {run.checkpoints / '00000003-e1'}" in output
     assert f"reward plot: {run.metrics / 'reward.png'}" in output
     assert (run.metrics / "reward.png").read_bytes().startswith(b"\x89PNG")
-    assert list(run.metrics.glob("events.out.tfevents.*"))
+    events = EventAccumulator(str(run.metrics)).Reload()
+    assert [(each.step, each.value) for each in events.Scalars("episode/reward")] == [
+        (each["iteration"], pytest.approx(each["reward"])) for each in read_metrics(run) if each["reward"] is not None
+    ], "TensorBoard, pointed at the run"
     result = json.loads((run.evaluations / "00000003-e1.json").read_text())
     assert result["episodes"] == 8 and result["max_length"] == 20 and 0 < result["mean_length"] <= 20
     record = read_metrics(run)[-1]

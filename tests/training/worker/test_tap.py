@@ -75,6 +75,7 @@ def test_the_terms_of_the_step_that_ends_an_episode_are_kept(task: Cartpole) -> 
     rows = reading.take()
     terms = dict(zip(rows.layout.terms, rows.terms[0].T, strict=True))
     assert rows.mark("done")[0].tolist() == [1, 0]
+    assert rows.cause(0, 0) == "dropped_pole"
     assert terms["fall"].tolist() == [-2.0, 0.0] and terms["alive"].tolist() == [0.0, np.float32(0.1)]
     tap.close()
 

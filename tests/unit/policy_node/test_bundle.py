@@ -66,7 +66,7 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
             lambda path: (path / "manifest.json").unlink(),
             "manifest.json is missing; name a bundle that `muster export` made",
         ),
-        (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is no manifest of a bundle"),
+        (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is not a bundle's manifest"),
         (
             lambda path: (path / "manifest.json").write_text(
                 (path / "manifest.json").read_text().replace("by-hand", "by-tool")
@@ -108,7 +108,7 @@ def test_a_policy_that_acts_otherwise_than_it_was_trained_is_refused(tmp_path: P
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda found: found.update(format=9), "has format 9, this node reads up to 2; upgrade muster-policy"),
+        (lambda found: found.update(format=9), "has format 9, this node reads up to 3; upgrade muster-policy"),
         (lambda found: found.pop("actions"), "actions is missing; export the policy again"),
         (lambda found: found.update(control_hz=0), "control_hz is 0; export the policy again"),
         (lambda found: found.update(groups=7), "it is no policy contract"),

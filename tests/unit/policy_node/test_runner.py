@@ -71,10 +71,10 @@ def rig(tmp_path: Path) -> Rig:
 def test_nothing_is_commanded_before_all_inputs_have_come(rig: Rig) -> None:
     assert not rig.step(0.0) and rig.given == []
     assert rig.step(0.02, knee=0.4) and rig.given == [pytest.approx(0.3 + 0.5 * 0.4)]
-    assert rig.lines == ["all inputs are there: it commands the joints now, with a fresh episode"]
+    assert rig.lines == ["all inputs have arrived: it commands the joints now, in a new episode"]
 
 
-def test_the_policy_sees_its_last_action_as_it_asked_for_it(rig: Rig) -> None:
+def test_the_policy_observes_its_last_action_unclipped(rig: Rig) -> None:
     rig.step(0.0, knee=3.0)
     rig.step(0.02, knee=0.0)
     # asked for 3, clipped to 2 for the joint; then half of the 3 that it asked for
@@ -90,7 +90,7 @@ def test_a_silent_input_stops_the_node_with_one_last_command_that_holds_the_join
     assert rig.lines[-1].startswith(
         "joint_states is silent for 70 ms: one last command holds the joints where they are"
     )
-    assert "it goes on when no input has been older than 60 ms (--timeout) for 0.5 s" in rig.lines[-1]
+    assert "it resumes when no input has been older than 60 ms (--timeout) for 0.5 s" in rig.lines[-1]
     assert [rig.step(0.1 + 0.05 * step, knee=0.2) for step in range(9)] == [False] * 9
     assert rig.step(0.6, knee=0.2), "it goes on by itself"
     assert rig.given[-1] == pytest.approx(0.3 + 0.5 * 0.2), "with a fresh episode: there is no last action"
@@ -174,7 +174,7 @@ def test_each_kind_of_command_is_a_message_of_its_own_with_the_robot_s_names() -
     [
         (
             {"discrete": True, "actions": (), "action_names": ("left", "right")},
-            "the policy chooses among left, right",
+            "the policy does not say what its actions are: left, right",
         ),
         ({"actions": (), "action_names": ("knee",)}, "the policy does not say what its actions are: knee"),
         (

@@ -52,7 +52,7 @@ def test_an_epoch_never_goes_back_and_is_never_given_twice(tmp_path: Path, epoch
     assert read_epoch(run) == 5
 
 
-def test_the_owner_passes_and_the_attempt_before_it_does_not(tmp_path: Path) -> None:
+def test_the_owner_passes_the_fence_and_the_previous_attempt_does_not(tmp_path: Path) -> None:
     run = Run(tmp_path / "run")
     raise_epoch(run, 5)
     check_epoch(run, 5)

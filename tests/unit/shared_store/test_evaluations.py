@@ -13,6 +13,7 @@ from shared_store.evaluations import (
     checkpoint_of,
     evaluation_is_over,
     evaluation_name,
+    in_one_line,
     keep_for_evaluation,
     lines,
     list_evaluations,
@@ -113,6 +114,18 @@ def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_s
     assert [each.iteration for each in list_checkpoints(run)] == [6, 15], "of the greatest score, the newest"
 
 
+def test_one_line_tells_the_successes_of_a_task_that_declares_them_and_else_how_long_episodes_lasted() -> None:
+    found: dict[str, Any] = {**FIGURES, "mean_return": 96.5, "episodes": 64}
+    lasted = "mean episode length 9.0 of 10 (90 %), mean return 96.50 over 64 episodes"
+    share = {"count": 62, "share": 62 / 64, "low": 0.9, "high": 1.0}
+    assert in_one_line(found) == in_one_line({**found, "success": None, "success_is": None}) == lasted
+    assert in_one_line({**found, "success": share, "success_is": "the clock ended the episode"}) == lasted
+    laps = {"success": share, "success_is": "lap_complete ended the episode", "shown": {"progress": "98.1 %"}}
+    assert in_one_line({**found, **laps}) == (
+        "62 of 64 episodes succeeded (96.9 %: lap_complete ended the episode), progress 98.1 %, mean length 9.0 steps, mean return 96.50"
+    )
+
+
 def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:
     told = "\n".join(
         lines({**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}})
@@ -130,6 +143,12 @@ def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> Non
     told = "\n".join(lines({**FIGURES, **whole}))
     assert "with config.randomize.friction: [0.4, 0.6]" in told and "config.curriculum: {}" in told
     assert " ".join(told.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
+    term = {"mean": 1.0, "low": 0.5, "high": 1.5, "std": 0.1}
+    rows = list(lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}}))
+    heading = next(row for row in rows if row.endswith("std"))
+    assert {len(row) for row in rows if row.startswith(("reward", "metric", "return"))} == {len(heading)}, (
+        "columns stand"
+    )
 
 
 def test_changes_reach_into_sections_and_an_empty_section_replaces_one() -> None:

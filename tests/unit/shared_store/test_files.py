@@ -51,7 +51,7 @@ def test_content_is_durable_before_it_gets_its_name_and_the_name_before_the_call
     assert [path for _, path in seen[1:]] == [str(tmp_path / "file"), str(tmp_path)]
 
 
-def test_a_write_that_the_volume_refuses_leaves_the_old_content_and_no_other_file(
+def test_a_failed_write_leaves_the_old_content_and_no_other_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python takes a module that it cached by half for whole
@@ -92,7 +92,7 @@ def _umask() -> int:
     return value
 
 
-def test_a_tree_killed_while_it_is_removed_is_whole_or_out_of_sight(tmp_path: Path) -> None:
+def test_a_directory_whose_removal_is_killed_is_complete_or_hidden(tmp_path: Path) -> None:
     tree = tmp_path / "prepared" / "tree"
     tree.mkdir(parents=True)
     for name in "abc":

@@ -57,7 +57,7 @@ def test_a_relative_path_and_a_home_directory_become_absolute(tmp_path: Path, mo
 
 
 @pytest.mark.parametrize("name", ["ant", "a", "0", "Ant_v2.1-b", "x" * 128])
-def test_a_run_may_be_called_what_a_directory_may_be_called(tmp_path: Path, name: str) -> None:
+def test_a_run_may_have_the_name_of_a_directory(tmp_path: Path, name: str) -> None:
     assert Store(tmp_path).run(name).path == tmp_path / "runs" / name
 
 

@@ -93,7 +93,7 @@ def test_a_follower_that_falls_behind_learns_how_much_it_missed(run: Run) -> Non
     assert numbers(after)[-1] == 49_999 and all(b == a + 1 for a, b in pairwise(numbers(after)))
 
 
-def test_a_writer_that_comes_back_goes_on_where_the_one_before_was_killed(run: Run) -> None:
+def test_a_restarted_writer_continues_where_the_killed_one_stopped(run: Run) -> None:
     path = run.log("job", 1, 0)
     written(path, 9000).close()
     last = segments_of(path)[-1].path

@@ -52,7 +52,7 @@ def test_a_resume_drops_records_after_its_checkpoint(tmp_path: Path) -> None:
     assert history(run) == [(1, 1), (2, 1), (3, 1), (4, 1), (5, 2), (6, 2)]
 
 
-def test_an_attempt_that_died_before_its_first_iteration_still_gives_up_the_past(tmp_path: Path) -> None:
+def test_an_attempt_that_died_before_its_first_iteration_still_supersedes_old_records(tmp_path: Path) -> None:
     run = Run(tmp_path)
     attempt(run, 1, 0, 5)
     attempt(run, 2, 3, 3)
@@ -83,7 +83,7 @@ def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(t
     assert history(run) == [(1, 1), (2, 1)]
 
 
-def test_a_number_that_is_not_finite_is_refused_instead_of_written_as_no_json(tmp_path: Path) -> None:
+def test_a_number_that_is_not_finite_is_refused_because_json_lacks_it(tmp_path: Path) -> None:
     with MetricsWriter(Run(tmp_path), 1, 0) as writer, pytest.raises(ValueError):
         writer.write({"iteration": 1, "reward": float("nan")})
     assert read_metrics(Run(tmp_path)) == []
@@ -109,7 +109,7 @@ def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 9), st.booleans()), min_size=1, max_size=6))
-def test_a_history_that_is_kept_says_what_a_fresh_one_does_whatever_was_added(
+def test_a_cached_history_equals_a_newly_read_one_after_any_append(
     attempts: list[tuple[int, int, bool]],
 ) -> None:
     with tempfile.TemporaryDirectory() as directory:

@@ -78,7 +78,7 @@ def test_versions_count_up_and_existing_ones_stay(store: Store) -> None:
     assert all(os.stat(path).st_mode & 0o222 == 0 for path in before), "nothing of it may be written"
 
 
-def test_a_checkpoint_that_is_a_version_already_is_one_again_only_on_request(store: Store) -> None:
+def test_a_registered_checkpoint_is_registered_again_only_on_request(store: Store) -> None:
     run, checkpoint = exported(store)
     first = models.register(store, "ant", run, checkpoint, {}, again=False)
     with pytest.raises(

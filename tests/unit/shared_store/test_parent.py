@@ -32,7 +32,7 @@ def names(store: Store) -> list[str]:
     return sorted(os.listdir(store.path / "runs"))
 
 
-def test_the_new_run_has_the_weights_alone_and_its_lineage(store: Store) -> None:
+def test_the_new_run_has_only_the_weights_and_its_lineage(store: Store) -> None:
     making = new(store)
     making.copy()
     assert len(names(store)) == 2 and not store.run("heir").path.exists(), "nobody sees half of it"
@@ -178,7 +178,7 @@ def test_a_run_holds_its_teacher_before_it_exists_and_after_the_teacher_s_run_is
     assert pupil.description() == {"run": "pupil"}
 
 
-def test_a_copy_of_a_teacher_that_came_to_nothing_leaves_nothing(store: Store) -> None:
+def test_an_unused_copy_of_a_teacher_leaves_nothing(store: Store) -> None:
     copy = copy_of_teacher(store)
     copy.discard()
     published = copy_of_teacher(store)

@@ -26,6 +26,7 @@ from shared_store.policy_contract import (
     differences,
     read,
 )
+from tests.conftest import REPOSITORY
 
 ANGLES = Term(
     name="joint_pos",
@@ -74,7 +75,9 @@ def after(change: Callable[[dict[str, Any]], Any]) -> list[str]:
 
 
 def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schema() -> None:
-    jsonschema.validate(document(), contract_schema())
+    published = json.loads((REPOSITORY / "docs/policy-contract.schema.json").read_text())
+    assert published == contract_schema(), "muster schema --contract > docs/policy-contract.schema.json"
+    jsonschema.validate(document(), published)
     again = read(document())
     assert again.document() == document() and differences(CONTRACT, again, ranges=True) == []
     angles = again.groups[0].terms[0]
@@ -82,15 +85,15 @@ def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schem
     assert dataclasses.replace(angles, clip=ANGLES.clip) == ANGLES
     assert (again.actions, again.commands, again.states) == (CONTRACT.actions, CONTRACT.commands, CONTRACT.states)
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(document(lambda found: found["actions"][0].pop("unit")), contract_schema())
+        jsonschema.validate(document(lambda found: found["actions"][0].pop("unit")), published)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (
-            lambda found: found.update(format=3),
-            "contract.json: has format 3, this Muster reads up to 2; upgrade Muster",
+            lambda found: found.update(format=4),
+            "contract.json: has format 4, this Muster reads up to 3; upgrade Muster",
         ),
         (lambda found: found.pop("task"), "contract.json: task is missing"),
         (
@@ -159,7 +162,7 @@ def test_each_change_of_meaning_is_a_line() -> None:
     assert after(lambda found: found["commands"].clear()) == ["the command velocity is gone"]
 
 
-def test_where_a_quantity_is_measured_counts_where_both_contracts_say_it() -> None:
+def test_the_frame_of_a_quantity_is_compared_if_both_contracts_have_it() -> None:
     def placed(*position: float) -> Contract:
         frame = Frame("imu", "trunk", position, (0.0, 0.0, 0.0, 1.0), True)  # type: ignore[arg-type]
         group = dataclasses.replace(CONTRACT.groups[0], terms=(ANGLES, dataclasses.replace(SPEED, frame=frame)))

@@ -30,7 +30,7 @@ def test_of_sections_the_first_key_that_differs_is_told() -> None:
     assert innermost("actor", None, {"a": 1}) == ("actor", None, {"a": 1})
 
 
-def test_what_is_fixed_is_as_the_class_says_and_as_the_checkpoint_knows() -> None:
+def test_fixed_settings_are_those_of_the_class_that_the_checkpoint_has() -> None:
     assert fixed_settings(KIND) == ["sizes", "net.depth", "rate"] and fixed_settings(None) == []
     assert fixed_settings(KIND, of_clone=True) == ["sizes", "net.depth"]
     assert fixed_settings(KIND, {"net": None}, of_clone=True) == ["net.depth"]

@@ -28,7 +28,7 @@ def contender(entry: int, times: list[int], racer: str = "", laps: int = 3, **fa
         ([], None, None, None),
     ],
 )
-def test_total_wants_every_lap_and_the_others_count_the_complete_ones(
+def test_total_requires_every_lap_and_other_rankings_use_complete_ones(
     times: list[int], total: int | None, best: int | None, average: int | None
 ) -> None:
     driven = Race(3, tuple(time / 1000 for time in times), 0, 0, 0)
@@ -136,7 +136,7 @@ def test_an_altered_entry_is_shown_and_not_ranked() -> None:
     assert (rows[1].time, rows[1].completed, rows[1].resets) == (None, None, None)
 
 
-def test_two_races_are_compared_to_the_last_bit() -> None:
+def test_two_races_are_compared_bit_by_bit() -> None:
     before = race([12.0, 12.5, 13.0])
     assert differences(before, copy.deepcopy(before)) == []
     after = copy.deepcopy(before)

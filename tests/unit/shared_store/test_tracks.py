@@ -31,9 +31,7 @@ def test_a_track_is_kept_with_its_measures(store: Store) -> None:
 
 def test_a_track_is_never_changed(store: Store) -> None:
     tracks.add(store, "hills", b"rows", {})
-    with pytest.raises(
-        TrackError, match="track hills exists already, and a track is never changed; choose another name"
-    ):
+    with pytest.raises(TrackError, match="track hills exists already, and tracks are immutable; choose another name"):
         tracks.add(store, "hills", b"others", {})
     assert tracks.find(store, "hills").read() == b"rows"
     assert [path.name for path in store.tracks.iterdir()] == ["hills"], "nothing half made is left"

@@ -53,7 +53,7 @@ class Forgetful(PlainPPO):
 
 
 @pytest.mark.parametrize("name", installed())
-def test_those_that_come_with_muster_are_algorithms(name: str) -> None:
+def test_the_installed_algorithms_satisfy_the_protocol(name: str) -> None:
     assert find_algorithm(name)
 
 
@@ -91,7 +91,7 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
         check_names(["loss", "reward"], ["reward", "score"], "own:A")
 
 
-def test_what_only_an_instance_has_is_looked_for_before_the_first_iteration() -> None:
+def test_attributes_set_in_the_constructor_are_checked_before_the_first_iteration() -> None:
     chosen = find_algorithm(f"{HERE}:Forgetful")
     with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is no algorithm: it lacks steps \("):
         build_algorithm(chosen, None, Point(PointConfig(), 2), Share(0, 2, 2), alone(), 0)  # type: ignore[arg-type]

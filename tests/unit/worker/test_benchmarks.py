@@ -32,7 +32,7 @@ def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest
     assert "loaded" not in load.told([{"others": 0.01, "load_average": 0.2}])
 
 
-def test_what_a_benchmark_starts_is_not_the_load_of_others() -> None:
+def test_processes_started_by_a_benchmark_do_not_count_as_load() -> None:
     before = load.own_seconds()
     child = subprocess.Popen(["sh", "-c", f"sh -c '{BUSY}' & wait"], start_new_session=True)
     try:

@@ -89,7 +89,7 @@ def test_one_bit_of_one_element_is_found(store: Path, name: str, capsys: pytest.
         ({"a": [1, {"b": 2}]}, {"a": [1, {"b": 3}]}, "a.1.b: 2 and 3"),
     ],
 )
-def test_what_counts_as_different(one: Any, two: Any, difference: str) -> None:
+def test_differing_values_are_reported(one: Any, two: Any, difference: str) -> None:
     with pytest.raises(bitwise_diff.Difference, match=re.escape(difference)):
         bitwise_diff._compare_values("file", one, two)
 
@@ -134,7 +134,7 @@ def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
     assert all(torch.equal(tensor, content["worlds"]["state"][name][2:6]) for name, tensor in some.items())
 
 
-def test_what_can_not_be_compared_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_can_not_be_compared_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUSTER_STORE", raising=False)
     with pytest.raises(UserError, match="run some: set MUSTER_STORE"):
         bitwise_diff.find_run("some")

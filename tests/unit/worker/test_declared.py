@@ -166,7 +166,7 @@ def test_numbers_are_data_and_a_curriculum_sets_them() -> None:
     assert not task.dones[0]
 
 
-def test_an_adaptive_number_follows_the_returns_and_goes_on_after_a_restart() -> None:
+def test_an_adaptive_number_follows_the_returns_and_continues_after_a_restart() -> None:
     task = Sliders(SlidersConfig(), 2, seed=1)
     speed = task.numbers("events.kick.speed")
     found = []
@@ -345,7 +345,7 @@ def refused(section: str, **changes: Any) -> dict[str, Any]:
         ),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+def test_misfits_are_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
     class Wrong(Sliders):
         def sections(self) -> dict[str, Any]:
             sections = super().sections()

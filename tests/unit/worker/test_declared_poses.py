@@ -59,11 +59,11 @@ def push_by_place(world: int, bodies: BodyArrays, worlds: WorldArrays, robot: Ro
 @pytest.mark.parametrize(
     ("function", "reads"), [(by_position, True), (by_keyword, True), (by_another_name, True), (centre, False)]
 )
-def test_what_may_read_a_pose_is_told_from_its_text(function: Any, reads: bool) -> None:
+def test_reads_of_poses_are_detected_in_the_source_of_a_function(function: Any, reads: bool) -> None:
     assert reads_poses(function) == reads
 
 
-def test_what_only_places_roots_reads_no_pose() -> None:
+def test_functions_that_only_place_roots_read_no_pose() -> None:
     """Most tasks have such events, and would be slower if each step brought the bodies up to date for them."""
     for function in (terms.reset_root, terms.reset_to_default, terms.reset_root_on_terrain, terms.push):
         assert not reads_poses(function), function
@@ -88,7 +88,7 @@ def test_an_event_reads_the_poses_of_the_step() -> None:
     assert noted[0] > 0.5, "it moves"
 
 
-def test_an_action_reads_the_poses_of_worlds_that_were_just_placed_or_read_back() -> None:
+def test_an_action_reads_current_poses_of_reset_and_restored_worlds() -> None:
     task = sliders(actions={"force": Action(push_by_place, joints="first")})
     task.reset()
     for _ in range(2):

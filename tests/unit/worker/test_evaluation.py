@@ -156,7 +156,7 @@ def test_a_success_that_names_nothing_is_refused_with_the_nearest_name() -> None
         Misspelt.sketch(config())
 
 
-def test_a_task_that_nothing_but_the_clock_ends_has_no_success() -> None:
+def test_a_task_without_terminations_has_no_success() -> None:
     names = ["time_out", "physics_failed", "terminated"]
     sums, flags = torch.zeros(1, 2), torch.zeros(1, dtype=torch.bool)
     without = Ended(sums, torch.zeros(1, dtype=torch.int32), flags, names, [], None, False)

@@ -124,7 +124,7 @@ def recurrent() -> Any:
     return algorithm.policy()
 
 
-def test_a_stranger_repeats_a_recurrent_policy_from_the_bundle_alone(tmp_path: Path, recurrent: Any) -> None:
+def test_a_recurrent_policy_can_be_run_from_the_bundle_alone(tmp_path: Path, recurrent: Any) -> None:
     """With numpy, onnxruntime and the contract, as on a robot."""
     target = exported(Run(tmp_path / "run"), recurrent, GroupedPoint())
     contract = json.loads((target / "contract.json").read_text())

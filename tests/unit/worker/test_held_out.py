@@ -50,7 +50,7 @@ def test_a_score_follows_the_newest_episodes_and_one_lucky_iteration_is_not_the_
     assert better[-1] == pytest.approx(20.0)
 
 
-def test_a_score_tells_its_standard_error(tmp_path: Path) -> None:
+def test_a_score_has_a_standard_error(tmp_path: Path) -> None:
     returns = torch.randn(4, 75, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 3.0 + 800.0
     progress = Progress()
     for part in returns:
@@ -60,7 +60,7 @@ def test_a_score_tells_its_standard_error(tmp_path: Path) -> None:
     assert progress.score_error == pytest.approx(float(covered.std()) / 225**0.5, rel=1e-6)
 
 
-def test_a_score_of_which_a_part_was_saved_without_squares_has_no_error_until_that_part_is_old() -> None:
+def test_a_score_with_old_records_without_squares_has_no_error_until_they_expire() -> None:
     progress = Progress(recent=[[10, 100, 100.0]])  # as Muster saved it before
     found = []
     for _ in range(3):

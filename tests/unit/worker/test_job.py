@@ -30,13 +30,13 @@ def read(train: dict[str, Any], **spec: Any) -> Job:
         ({"algorithm": None}, "train.algorithm: expected a text, found nothing"),
     ],
 )
-def test_a_section_that_is_none_is_refused_in_one_line(train: dict[str, Any], said: str) -> None:
+def test_an_invalid_section_is_refused_in_one_line(train: dict[str, Any], said: str) -> None:
     with pytest.raises(UserError) as refused:
         read(train)
     assert str(refused.value) == said
 
 
-def test_a_section_of_the_spec_that_is_none_is_refused_too() -> None:
+def test_an_invalid_section_of_the_spec_is_refused_too() -> None:
     with pytest.raises(UserError, match=r"^checkpoint: expected a mapping, found a whole number \(5\)$"):
         read({"task": "Ant"}, checkpoint=5)
     assert read({"task": "Ant", "ppo": None, "config": {}}, checkpoint=None).section["task"] == "Ant"
@@ -51,7 +51,7 @@ def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) 
     )
 
 
-def test_a_source_tree_that_nobody_installed_has_the_algorithms_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_uninstalled_source_tree_has_its_own_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:
     there = algorithms.installed()
     monkeypatch.setattr(algorithms, "entry_points", lambda group: ())
     assert algorithms.installed() == there and there["ppo"] == "worker.learning.ppo.fused:PPO"

@@ -24,7 +24,7 @@ CONFIG = CartpoleConfig()
 LEARNER = PPO, CONFIG.ppo
 
 
-def test_too_many_are_refused_before_they_are_built() -> None:
+def test_too_many_worlds_are_refused_before_they_are_built() -> None:
     free = memory.free_bytes(HERE)
     with pytest.raises(UserError) as refusal, memory.within_memory(Cartpole, CONFIG, LEARNER, 200_000_000, HERE):
         pytest.fail("they are not to be built")
@@ -41,7 +41,7 @@ def test_too_many_are_refused_before_they_are_built() -> None:
     assert fit == pytest.approx(0.9 * free / (float(found[2].replace(",", "")) * 1e9 / 200e6), rel=0.25)
 
 
-def test_what_fits_goes_on_and_other_errors_stay_what_they_are() -> None:
+def test_fitting_worlds_continue_and_other_errors_are_unchanged() -> None:
     with memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         pass
     with pytest.raises(RuntimeError, match="something else"), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
@@ -82,7 +82,7 @@ LEARNERS: dict[str, tuple[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_what_worlds_need_is_known_of_every_algorithm(name: str) -> None:
+def test_the_memory_of_worlds_is_measured_for_every_algorithm(name: str) -> None:
     algorithm, settings = LEARNERS[name]
     there = r"About [\d,]+ fit: set `worlds`$"
     learner = find_algorithm(algorithm), settings
@@ -90,7 +90,7 @@ def test_what_worlds_need_is_known_of_every_algorithm(name: str) -> None:
         pytest.fail("they are not to be built")
 
 
-def test_a_batch_of_sac_is_looked_at_though_the_first_iteration_of_a_run_only_collects() -> None:
+def test_a_batch_of_sac_is_measured_although_the_first_iteration_only_collects() -> None:
     def need(settings: SACConfig) -> memory.Need:
         return memory.measure(Cartpole, CONFIG, (find_algorithm("sac"), settings), HERE)
 
@@ -102,7 +102,7 @@ def test_a_batch_of_sac_is_looked_at_though_the_first_iteration_of_a_run_only_co
     assert few.world == pytest.approx(1024 * 12 * 4, rel=0.5) and many.world < 3 * few.world
 
 
-def test_what_does_not_grow_with_the_worlds_leaves_less_room_for_them() -> None:
+def test_constant_memory_leaves_less_for_the_worlds() -> None:
     told = memory._explain(Cartpole, 1000, HERE, 10_000_000, memory.Need(4.5e6, 9_000.0))
     assert told.endswith("than the 0.0 GB that are free: about 0.0 GB. About 500 fit: set `worlds`")
     told = memory._explain(Cartpole, 1000, HERE, 10_000_000, memory.Need(9e6, 9_000.0))

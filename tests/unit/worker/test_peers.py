@@ -80,7 +80,7 @@ def test_the_table_says_when_muster_was_as_good_as_a_peer() -> None:
     assert table.reached(own[:2], theirs["rows"][-1]) is None
 
 
-def test_a_folder_without_records_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_records_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"there are no records in .*benchmarks\.peers\.muster"):
         table.read_all(tmp_path)
     (tmp_path / "muster.json").write_text(json.dumps({"peer": "muster"}))
@@ -103,7 +103,7 @@ def test_a_rate_counts_what_follows_the_warm_iterations() -> None:
     assert run.thinned(curve) == curve
 
 
-def test_a_training_that_stopped_early_is_no_record() -> None:
+def test_a_training_that_stopped_early_makes_no_record() -> None:
     case = cases.find_case("go1")
     options = run.options_of("mjlab", None, ["go1"]).parse_args(["--iterations", "5"])
     with pytest.raises(ValueError, match="5 iterations were asked for, 3 are in its log"):
@@ -141,7 +141,7 @@ def test_a_converted_policy_acts_as_rsl_rl_says(tmp_path: Path, normalized: bool
         conversion.check_probe(policy, probe | {"actions": (expected + 0.1).tolist()})
 
 
-def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:
+def test_files_other_than_policies_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.pt"
     with pytest.raises(ValueError, match="there is no checkpoint"):
         conversion.read_rsl_rl(path)
@@ -250,7 +250,7 @@ def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration
         ("environment mjlab --python nowhere", "nowhere is no Python that can be started"),
     ],
 )
-def test_what_the_commands_refuse(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_options_of_the_commands_are_refused(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     name, *arguments = words.split()
     with pytest.raises(SystemExit) as ended:
         importlib.import_module(f"benchmarks.peers.{name}").main(arguments)
@@ -267,7 +267,9 @@ def test_what_the_commands_refuse(words: str, said: str, capsys: pytest.CaptureF
         ("--length 98", "--length 98.0: it is a share of the longest episode"),
     ],
 )
-def test_what_the_walking_benchmark_refuses(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_walking_benchmark_refuses_invalid_options(
+    words: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         walking.main(words.split())
     assert ended.value.code == 2 and said in capsys.readouterr().err

@@ -92,7 +92,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
-def test_they_learn_the_same_on_random_data(settings: dict[str, Any]) -> None:
+def test_both_implementations_learn_the_same_on_random_data(settings: dict[str, Any]) -> None:
     """Three observations and two actions, of sizes far from 1; a quarter of the steps end an episode, half of those by the clock."""
     torch.manual_seed(8)
     spaces = Spaces({"policy": (3,), "critic": (5,)}, 2)
@@ -134,7 +134,7 @@ def test_they_learn_the_same_on_random_data(settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"clip_values": False, "schedule": "fixed"}], ids=["as it is", "unlike"])
-def test_they_learn_the_same_on_the_point_task(settings: dict[str, Any]) -> None:
+def test_both_implementations_learn_the_same_on_the_point_task(settings: dict[str, Any]) -> None:
     """Each has worlds of its own, which its own actions move: five iterations of three passes over four minibatches."""
     torch.manual_seed(8)
     tasks = [Point(PointConfig(episode_seconds=1.0), WORLDS, seed=2) for _ in range(2)]

@@ -144,7 +144,7 @@ def checkpoint(task: Any, **facts: Any) -> Any:
     return SimpleNamespace(name="00000004-e1", path=Path("nowhere"), manifest=manifest)
 
 
-def test_a_checkpoint_whose_task_means_something_else_by_now_is_refused_with_what_changed(sliders: Sliders) -> None:
+def test_a_checkpoint_whose_task_changed_is_refused_with_the_change(sliders: Sliders) -> None:
     then = checkpoint(sliders, contract=published(sliders).document())
     check_contract(then, sliders)
     with pytest.raises(UserError) as caught:

@@ -367,7 +367,7 @@ def test_whole_updates_are_those_of_the_plain_loss(settings: dict[str, object]) 
         torch.testing.assert_close(tensor, plain[name], rtol=1e-3, atol=1e-5, msg=name)
 
 
-def test_a_critic_of_its_own_has_its_own_widths_and_normaliser() -> None:
+def test_a_separate_critic_has_its_own_widths_and_normaliser() -> None:
     ppo = make(critic_observations="critic", critic_hidden_sizes=(24,))
     assert [layer.out_features for layer in ppo.critic.mlp if isinstance(layer, torch.nn.Linear)] == [24, 1]
     assert ppo.critic.obs_normalizer is not ppo.actor.obs_normalizer
@@ -376,7 +376,7 @@ def test_a_critic_of_its_own_has_its_own_widths_and_normaliser() -> None:
     torch.testing.assert_close(ppo.critic.obs_normalizer._mean, ppo.actor.obs_normalizer._mean)
 
 
-def test_what_it_can_not_do_it_refuses_by_name() -> None:
+def test_unsupported_settings_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"critic_observations: the task has no group 'critic'; it has policy"):
         PPO(PointPPO(critic_observations="critic"), Setting(Spaces({"policy": (2,)}, 1), Share(0, 4, 4), alone(), 1))
     with pytest.raises(ValueError, match=r"'critic' is a group of images .*; rsl_rl can do that"):

@@ -38,7 +38,7 @@ def said(
     return [line for line in capsys.readouterr().out.splitlines() if not line.startswith("iteration")]
 
 
-def test_a_training_of_days_without_a_gpu_says_so_once_and_how_to_try_it(
+def test_a_cpu_training_of_days_is_warned_about_once_with_a_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # 998 iterations of 200 s are 199,600 s, 2.31 days; 98,304 steps in 200 s are 491.5 a second
@@ -55,13 +55,13 @@ def test_the_remainder_of_a_resumed_training_counts(tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.parametrize(("seconds", "device"), [(20.0, "cpu"), (200.0, "cuda:0")], ids=["5.5 hours", "on a GPU"])
-def test_a_training_that_ends_today_or_has_a_gpu_says_nothing(
+def test_a_short_training_or_one_with_a_gpu_is_not_warned_about(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str
 ) -> None:
     assert said(tmp_path, capsys, seconds, device) == []
 
 
-def test_what_a_task_wants_to_be_seen_is_in_the_line_in_the_record_and_in_the_plot(
+def test_metrics_shown_by_a_task_are_in_the_line_the_record_and_the_plot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Store(tmp_path).open().run("r")

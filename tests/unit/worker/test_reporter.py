@@ -36,9 +36,7 @@ def test_reports_are_made_in_order_without_blocking_training() -> None:
     assert done == list(range(1000))
 
 
-def test_a_record_waits_for_the_look_that_a_stopped_process_has_missed(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_waits_for_the_read_that_a_stopped_process_missed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     stopped, goes_on = threading.Event(), threading.Event()
 
     def look(*arguments: Any) -> None:
@@ -88,7 +86,7 @@ def test_calls_wait_at_a_gate_that_is_shut_but_only_for_a_moment(monkeypatch: py
     assert done == [1, 2]
 
 
-def test_a_report_that_fails_is_told_once_and_later_ones_are_made(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_report_is_logged_once_and_later_ones_are_written(capsys: pytest.CaptureFixture[str]) -> None:
     reporter, done = Reporter(), []
     for _ in range(3):
         reporter.do({}.__getitem__, "reward")
@@ -100,7 +98,7 @@ def test_a_report_that_fails_is_told_once_and_later_ones_are_made(capsys: pytest
     assert "warning: 3 reports failed and were lost" in told
 
 
-def test_what_a_hanging_volume_does_not_take_is_dropped_and_counted(
+def test_records_that_a_hanging_volume_refuses_are_dropped_and_counted(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reporting, "_MOST", 2)
@@ -115,7 +113,7 @@ def test_what_a_hanging_volume_does_not_take_is_dropped_and_counted(
     assert "warning: the volume did not take the last metrics (4 were dropped)" in capsys.readouterr().out
 
 
-def test_a_fence_tells_of_a_newer_attempt(run: Run) -> None:
+def test_a_fence_reports_a_newer_attempt(run: Run) -> None:
     fence = Fence(run, 1)
     time.sleep(0.05)
     fence.check()

@@ -44,7 +44,7 @@ def test_a_yaml_changes_the_weights_that_it_names() -> None:
         ([1.0], "train.config.rewards: expected a mapping, found a list"),
     ],
 )
-def test_a_weight_that_cannot_be_is_refused_in_one_line(rewards: object, message: str) -> None:
+def test_an_impossible_weight_is_refused_in_one_line(rewards: object, message: str) -> None:
     with pytest.raises(UserError) as refusal:
         configure(Ant, {"config": {"rewards": rewards}})
     assert str(refusal.value).startswith(message) and "\n" not in str(refusal.value)

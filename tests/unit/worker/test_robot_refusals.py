@@ -116,7 +116,7 @@ CASES: dict[str, tuple[Callable[[], Any], list[str]]] = {
     "geom": (view_of((SERVO,), lambda view: view.find_geoms("x*")), ["no geom of robot matches 'x*'"]),
     "no limits": (
         view_of((SERVO,), lambda view: view.need_ranges([0, 1], "reward joint_limits")),
-        ["reward joint_limits needs limits of its position, which the joint left_knee of robot has not"],
+        ["reward joint_limits needs limits of its position, which joint left_knee of robot lacks"],
     ),
     "no effort limit": (
         view_of((SERVO,), lambda view: view.need_efforts([0], "action joints")),
@@ -124,7 +124,7 @@ CASES: dict[str, tuple[Callable[[], Any], list[str]]] = {
     ),
     "no actuator where an effort is needed": (
         view_of((KNEES,), lambda view: view.need_efforts([0, 1], "action joints")),
-        ["action joints needs an actuator, which the joint left_hip", "left_knee"],
+        ["action joints needs an actuator, which joint left_hip", "left_knee"],
     ),
     "weightless box": (lambda: Box("cube", mass=0.0), ["Box 'cube': mass must be greater than 0"]),
     "flat box": (lambda: Box("cube", size=(1.0, 1.0, 0.0)), ["Box 'cube': size must be greater than 0"]),
@@ -214,7 +214,7 @@ def test_a_missing_mesh_of_a_urdf_file(tmp_path: Path, mesh: str, words: str):
     (folder / "arm.urdf").write_text(urdf)
     with pytest.raises(ValueError, match=r"arm\.urdf: .*" + words):
         template(Robot(folder / "arm.urdf", actuators=(SERVO,)))
-    with pytest.raises(ValueError, match="give the path of the URDF file"):
+    with pytest.raises(ValueError, match="relative to a URDF file; give the path of that file"):
         template(Robot(urdf, actuators=(SERVO,)))
 
 

@@ -238,7 +238,7 @@ def test_the_weights_are_those_of_rsl_rls_own_runner(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_run_that_goes_on_from_its_checkpoint_ends_with_the_same_bits(name: str) -> None:
+def test_a_run_resumed_from_its_checkpoint_ends_bit_identical(name: str) -> None:
     algorithm, task = made(name)
     train(algorithm, task, 2)
     saved = save(algorithm, task)
@@ -252,7 +252,7 @@ def test_a_run_that_goes_on_from_its_checkpoint_ends_with_the_same_bits(name: st
     assert_same(fresh.state_dict(), task.state_dict())
 
 
-def test_what_is_kept_of_worlds_begins_with_their_index() -> None:
+def test_saved_state_of_worlds_has_their_index_as_its_first_dimension() -> None:
     kept = {
         "nothing": {},
         "GRU": {"actor.0": (8, 1, 8), "critic.0": (8, 1, 8)},
@@ -280,7 +280,7 @@ def test_the_recurrent_state_of_a_world_is_forgotten_where_its_episode_ended() -
     assert ended
 
 
-def test_weights_alone_leave_the_optimizer_as_it_was() -> None:
+def test_loading_only_weights_leaves_the_optimizer_unchanged() -> None:
     trained, task = made("RND")
     train(trained, task, 3)
     state = copy.deepcopy(dict(trained.state_dict()))
@@ -324,7 +324,7 @@ def test_a_teacher_has_the_weights_of_a_run_of_ppo_and_must_fit_it() -> None:
     pupil.load_teacher(teaching.state_dict())
     pupil.begin(0)
     assert_same(pupil.algorithm.teacher.state_dict(), dict(teaching.policy().state_dict()))
-    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher: the weights do not fit; give .*") as refusal:
+    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher: the weights do not fit; set .*") as refusal:
         build(task, section).load_teacher(teaching.state_dict())
     assert "\n" not in str(refusal.value)
     with pytest.raises(ValueError, match=r"^rsl_rl\.teacher_checkpoint: only Distillation has a teacher"):

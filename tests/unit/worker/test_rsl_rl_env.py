@@ -34,7 +34,7 @@ def test_an_environment_logs_what_the_terms_of_the_reward_came_to() -> None:
     torch.testing.assert_close(extras["log"]["reward_place"], returns.mean().expand(8))
 
 
-def test_who_sets_the_clock_of_an_environment_sets_that_of_the_task() -> None:
+def test_setting_the_clock_of_an_environment_sets_that_of_the_task() -> None:
     task = Seen(seed=3)
     env = TaskVecEnv(task)  # type: ignore[arg-type]
     buffer = task.episode_length

@@ -26,7 +26,7 @@ def test_settings_are_read_without_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
 
-def test_a_section_with_a_class_is_taken_as_it_is_and_one_without_changes_the_defaults() -> None:
+def test_a_section_with_a_class_is_used_unchanged_and_one_without_overrides_the_defaults() -> None:
     given = {"class_name": "MLPModel", "hidden_dims": [7]}
     config = settings({"critic": given, "actor": {"hidden_dims": [5], "distribution_cfg": {"init_std": 0.3}}})
     assert config.section("critic") == given

@@ -184,7 +184,7 @@ def test_only_what_the_replay_holds_is_saved() -> None:
     assert held < buffer.tell() < 3 * held < sac.replay.nbytes / 10
 
 
-def test_weights_alone_are_taken_over_with_fresh_optimizers() -> None:
+def test_only_weights_are_loaded_with_new_optimizers() -> None:
     task = point()
     sac = make(task)
     iterate(sac, task, 0, 4)
@@ -276,7 +276,7 @@ class Watch(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("settings", [{"n_step": 3, "max_grad_norm": 1.0}, {"atoms": 1, "combine": "min"}])
-def test_what_is_recorded_asks_the_device_for_nothing_and_draws_nothing(settings: dict[str, Any]) -> None:
+def test_recording_neither_reads_from_the_device_nor_draws_random_numbers(settings: dict[str, Any]) -> None:
     task = point()
     sac = make(task, **settings)
     iterate(sac, task, 0, 3)

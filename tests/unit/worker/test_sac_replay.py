@@ -109,7 +109,7 @@ def test_only_what_is_there_is_drawn_and_all_of_it(n_step: int) -> None:
 
 
 @pytest.mark.parametrize("n_step", [1, 2])
-def test_what_an_iteration_draws_is_there_once_its_steps_are_written(n_step: int) -> None:
+def test_an_iterations_draws_exist_once_its_steps_are_written(n_step: int) -> None:
     """Rows are drawn before the steps that overwrite the oldest ones; each row is read after them."""
     task = point(3)
     sac = make(task, replay_steps=10, n_step=n_step, batch_size=400, warm_up=0)
@@ -166,7 +166,7 @@ def transition(observation: float, terminal: float, reward: float, done: bool, t
     return Transition(seen, ended, torch.tensor([reward]), torch.tensor([done]), torch.tensor([time_out]))
 
 
-def test_a_time_out_bootstraps_from_the_observation_before_the_reset_and_an_end_does_not() -> None:
+def test_a_time_out_bootstraps_from_the_observation_before_the_reset_and_a_termination_does_not() -> None:
     setting = Setting(Spaces({"policy": (1,)}, 1), Share(0, 1, 1), alone(), 0)
     sac = SAC(dataclasses.replace(SMALL, atoms=1, steps=3, warm_up=100, normalize_observations=False), setting)
     nan = float("nan")

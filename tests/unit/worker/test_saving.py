@@ -51,7 +51,7 @@ def test_saves_are_committed_in_order_and_verify(run: Run) -> None:
     saver.close()
 
 
-def test_what_is_saved_is_the_state_at_the_order_not_at_the_writing(run: Run) -> None:
+def test_a_save_holds_the_state_at_its_order_not_at_its_writing(run: Run) -> None:
     saver = Saver(run, 1, 0, 1, keep=None)
     live = torch.zeros(200_000)
     saver.save(1, {"learner.pt": saver.copy({"value": live})}, {})
@@ -74,7 +74,7 @@ def test_a_copy_that_is_still_being_written_is_not_written_over(run: Run, monkey
     saver.close()
 
 
-def test_a_state_that_can_not_be_written_down_ends_the_training_and_not_in_silence(run: Run) -> None:
+def test_a_state_that_can_not_be_serialised_ends_the_training_with_an_error(run: Run) -> None:
     saver = Saver(run, 1, 0, 1, keep=None)
     saver.save(1, {"learner.pt": {"value": lambda: None}}, {})
     with pytest.raises((AttributeError, pickle.PicklingError), match="local object"):

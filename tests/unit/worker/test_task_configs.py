@@ -113,7 +113,7 @@ class Strict(TaskConfig):
 
 
 @pytest.mark.parametrize("kind", [Plain, Strict])
-def test_a_configuration_of_one_s_own_may_be_a_dataclass_of_either_kind(kind: type[Any]) -> None:
+def test_a_users_configuration_may_be_a_plain_or_a_pydantic_dataclass(kind: type[Any]) -> None:
     made = configured(
         kind, {"sizes": [4], "corners": [[1, 2]], "limit": 3, "camera": {"width": 8}, "rewards": {"near": 2}}
     )

@@ -62,7 +62,7 @@ def test_a_smoothed_target_has_two_numbers_for_each_joint() -> None:
     assert torch.equal(task._memory[:, task.plan.commands[0].first], command)
 
 
-def test_a_command_hides_what_its_function_keeps() -> None:
+def test_a_command_has_hidden_numbers_of_its_function() -> None:
     command = Command(terms.heading_velocity_command, **VELOCITIES, heading=(-3.0, 3.0))
     plan = sliders(
         commands={"v": command}, curricula={}, events={}, observations={"v": Observation(terms.command_number)}
@@ -164,12 +164,12 @@ def test_commands_of_other_counts_are_refused() -> None:
 
 def test_a_joint_without_limits_is_refused_where_they_are_needed() -> None:
     refused(
-        "actions.f: share_of_range_target needs limits of its position, which the joint second of robot has not",
+        "actions.f: share_of_range_target needs limits of its position, which joint second of robot lacks",
         robot=held(),
         actions={"f": Action(terms.share_of_range_target, kind="position")},
     )
     refused(
-        "metrics.m: joint_effort_excess needs a limit of its force, which the joint first of robot has not",
+        "metrics.m: joint_effort_excess needs a limit of its force, which joint first of robot lacks",
         metrics={"m": Metric(terms.joint_effort_excess)},
     )
 

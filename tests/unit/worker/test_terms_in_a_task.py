@@ -99,7 +99,7 @@ class Walker(Quadruped):
         )
 
 
-def test_a_task_of_terms_steps_and_shows_what_they_say() -> None:
+def test_a_task_of_terms_steps_and_shows_its_terms() -> None:
     task = Walker(WalkerConfig(episode_seconds=1.0), 2, seed=1)
     assert task.observation_shape == (3 + 3 + 3 + 3 + 12 + 12 + 4 + 2 + 12 + 6,)
     command = task.observations[:, 9:12].clone()

@@ -153,7 +153,7 @@ sys.exit(track.afterwards(sys.argv[1], "mlflow"))
 """
 
 
-def test_while_a_service_is_away_one_line_says_so_and_later_everything_is_sent(
+def test_an_unreachable_service_is_reported_in_one_line_and_everything_is_sent_later(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service, said = Memory(), list[str]()
@@ -241,7 +241,9 @@ def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
         (["nowhere", "wandb"], "nowhere is no run that a `train` job made; name a directory of runs/ in the store"),
     ],
 )
-def test_what_cannot_be_sent_afterwards_is_said_in_one_line(run: Run, arguments: list[str], said: str) -> None:
+def test_a_run_that_cannot_be_sent_afterwards_is_reported_in_one_line(
+    run: Run, arguments: list[str], said: str
+) -> None:
     given = [str(run.path) if each == "RUN" else each for each in arguments]
     command = [sys.executable, "-m", "worker.track", *given]
     done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)

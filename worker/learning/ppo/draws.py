@@ -1,7 +1,7 @@
-"""What PPO draws at random, on the device: actions, and which samples each minibatch has.
+"""Random draws of PPO on the device: actions, and the samples of each minibatch.
 
-Every number is a function of (seed, iteration, global index of the world) and of what it is for. So neither the number of ranks nor
-a restart changes any, and no rank draws for worlds that it does not have.
+Every number is a function of (seed, iteration, global index of the world) and its purpose. So neither the number of ranks nor a restart
+changes it, and no rank draws for other ranks' worlds.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ def _draw_order(
 
 
 class Draws:
-    """The draws of one rank. What :meth:`begin` sets is read by the kernels, so that these can be part of a graph.
+    """The draws of one rank. The kernels read what :meth:`begin` sets from the device, so they can be part of a graph.
 
     Args:
-        seed: Of everything.
+        seed: Seed of all draws.
         first: Global index of the rank's first world.
         device: ``"cpu"`` or ``"cuda:<n>"``.
     """
@@ -101,7 +101,7 @@ class Draws:
         self._host = torch.zeros(2, dtype=torch.int32, pin_memory=device.startswith("cuda"))
 
     def begin(self, iteration: int) -> None:
-        """What is drawn from now on is that of ``iteration``."""
+        """Set the iteration of all further draws."""
         for purpose in (_ACTIONS, _ORDER):
             self._host[purpose] = mix_seed(self._seed, iteration, purpose) & 0x7FFFFFFF
         self._key.copy_(self._host, non_blocking=True)
@@ -117,7 +117,7 @@ class Draws:
         return out
 
     def order(self, orders: torch.Tensor, scratch: torch.Tensor) -> None:
-        """Deal out every world's steps to the minibatches, anew in each epoch: each has equally many steps of each world.
+        """Distribute every world's steps over the minibatches, again in each epoch. Each minibatch has equally many steps of each world.
 
         Args:
             orders: Filled with rows of the flattened rollout (step · worlds + world); shape (epochs · minibatches, steps of a world in

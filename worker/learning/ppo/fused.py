@@ -1,12 +1,11 @@
-"""PPO over a gang of ranks that computes what one rank with all the worlds would compute, made for CUDA graphs.
+"""PPO over a gang of ranks, equal to the computation of one rank with all worlds, and made for CUDA graphs.
 
-Networks are rsl-rl's. What differs from rsl-rl 5.5.1, and why:
+Networks are rsl-rl's. Differences from rsl-rl 5.5.1, with reasons:
 
-- Advantage moments, observation moments, gradients, KL and losses are sums over all ranks' samples. A minibatch has equally many
-  steps of every world, and which ones depends on (seed, iteration, epoch, global world index) alone; so does action noise. So the
-  number of ranks changes nothing but rounding. One collective an iteration, one a minibatch; they stand between graphs, where NCCL's
-  watchdog sees them.
-- A time-out bootstraps from the value of the observation *after* the step, before the reset; rsl-rl takes the one before the step.
+- Advantage moments, observation moments, gradients, KL and losses are sums over all ranks' samples. A minibatch has equally many steps of
+  every world. Their choice, and action noise, depend only on (seed, iteration, epoch, global world index), so the number of ranks changes
+  nothing but rounding. There is one collective per iteration and one per minibatch, between graphs, where NCCL's watchdog sees them.
+- A time-out bootstraps from the value of the observation *after* the step, before the reset; rsl-rl uses the observation before the step.
   Images are rendered only after the reset, so image tasks bootstrap from V(s_t), as rsl-rl does.
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws new minibatches (rsl-rl draws once and repeats the same minibatches in all epochs).
@@ -51,7 +50,7 @@ class PPO:
     kernels: ClassVar[tuple[ModuleType, ...]] = (draws, objective)
 
     def __init__(self, config: PPOConfig, setting: Setting, *, plain: bool = False) -> None:
-        """``plain``: the loss in plain torch where there is a kernel for it. Raises ValueError for what it can't do."""
+        """``plain``: compute the loss in plain torch instead of the kernel. Raises ValueError for unsupported settings."""
         self.config, self.setting, self.gang = config, setting, setting.gang
         self.steps, self.device = config.steps, setting.gang.device
         spaces, worlds = setting.spaces, setting.share.count
@@ -84,19 +83,19 @@ class PPO:
             self.gang.broadcast(parameter.data)
 
     def _allocate_sums(self) -> None:
-        """What the ranks add up before the minibatches: moments of the advantages, and the sums of every observation normaliser."""
+        """Buffer summed over the ranks before the minibatches: moments of the advantages, and sums of every observation normaliser."""
         views = self.rollout.views
         sizes = {view.group: 2 * view.latents.shape[-1] if self._is_normalised(view) else 0 for view in views}
         self._sums = Totals({"count": 1, "advantages": 1, "squared_advantages": 1, **sizes}, self.device)
         self._observation_sums = [self._sums[view.group] for view in views]
 
     def _allocate_gradients(self) -> None:
-        """One flat buffer: all gradients, then what else a minibatch shares. The parameters' gradients are views of it.
+        """One flat buffer: all gradients, then the other shared numbers of a minibatch. The parameters' gradients are views of it.
 
         Each begins at a multiple of :data:`worker.learning.ppo.linear.ALIGNED`, with zeros between them.
         """
         actor = list(self.actor.parameters())
-        shared = set(map(id, actor))  # convolutions are the actor's too
+        shared = set(map(id, actor))  # convolutions may be shared with the actor
         critic = [parameter for parameter in self.critic.parameters() if id(parameter) not in shared]
         sizes = [sum(linear.aligned(p.numel()) for p in part) for part in (actor, critic)]
         self._parameters = actor + critic
@@ -117,7 +116,7 @@ class PPO:
         self.optimizer = kind(self._parameters, lr=self._rate, fused=True, **options)
 
     def _allocate_minibatches(self) -> None:
-        """Which samples each minibatch has, and where the numbers of an update are gathered."""
+        """Allocate the samples of each minibatch and the metrics of an update."""
         config, worlds = self.config, self.setting.share.count
         share = self.steps // config.minibatches
         count = config.epochs * config.minibatches
@@ -129,7 +128,7 @@ class PPO:
         self._metrics = torch.zeros(len(METRICS), device=self.device)
 
     def _record(self) -> list[CudaGraphFunction]:
-        """What of learning the device replays as graphs: all of it, or in a gang the parts between the collectives."""
+        """The parts of learning that the device replays as graphs: all of it, or in a gang the parts between the collectives."""
         parts = (self._estimate, self._normalize, self._compute_gradients, self._apply_gradients, self._close)
         if self.gang.size == 1:
             self._parts: tuple[Callable[[], None], ...] = parts
@@ -141,13 +140,13 @@ class PPO:
     # -- collecting ---------------------------------------------------------------------------------------------------
 
     def begin(self, iteration: int) -> None:
-        """What is drawn from now on is that of ``iteration``."""
+        """Set the iteration of all further draws."""
         self._draws.begin(iteration)
         self.rollout.step = 0
 
     @torch.no_grad()
     def act(self, observations: TensorDict) -> torch.Tensor:
-        """Actions, shape (worlds, actions); they and what was seen are recorded."""
+        """Actions, shape (worlds, actions); records them and the observations."""
         rollout, step = self.rollout, self.rollout.step
         if step == 0:
             self._head.begin()
@@ -158,7 +157,7 @@ class PPO:
         return self._head.draw(self._draws, step, outputs, rollout.actions[step])
 
     def record(self, step: Transition) -> None:
-        """Note what the step did."""
+        """Record the result of the step."""
         self.rollout.record(step)
 
     # -- learning -----------------------------------------------------------------------------------------------------
@@ -187,7 +186,7 @@ class PPO:
 
     @torch.no_grad()
     def _estimate(self) -> None:
-        """Values and advantages of this rank's samples, the moments of all that is shared, and the minibatches."""
+        """Compute values, advantages and moments of this rank's samples, and draw the minibatches."""
         rollout = self.rollout
         critic = rollout.critic
         rollout.values.copy_(linear.forward(self.critic.mlp, critic.padded).squeeze(-1))
@@ -206,7 +205,7 @@ class PPO:
 
     @torch.no_grad()
     def _normalize(self) -> None:
-        """Advantages by the moments over all ranks; then all is ready for the minibatches."""
+        """Normalise the advantages with the moments of all ranks."""
         count, total, squares = (self._sums[name][0] for name in ("count", "advantages", "squared_advantages"))
         mean = total / count
         deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
@@ -214,7 +213,7 @@ class PPO:
         self._loss_sums.zero_()
 
     def _compute_gradients(self) -> None:
-        """Of one minibatch, weighted by this rank's part of the samples."""
+        """Gradients and losses of one minibatch, weighted by this rank's share of the samples."""
         self._shared.zero_()
         rollout = self.rollout
         latents = rollout.actor.batch(self._rows)
@@ -236,7 +235,7 @@ class PPO:
 
     @torch.no_grad()
     def _close(self) -> None:
-        """After the last minibatch: the normalisers move on, and the numbers are gathered."""
+        """After the last minibatch: update the normalisers and gather the metrics."""
         for view, sums in zip(self.rollout.views, self._observation_sums, strict=True):
             if len(sums):
                 moments.merge(view.model.obs_normalizer, self._sums["count"][0], sums)
@@ -249,7 +248,8 @@ class PPO:
 
     @contextlib.contextmanager
     def _beside(self) -> Iterator[Callable[[], None]]:
-        """On a GPU, what is in this context runs beside what follows (and so does its backward pass), until what it yields is called."""
+        """On a GPU, run the work in this context (and its backward pass) concurrently with the work after it, until the yielded function
+        is called."""
         if self._side is None:
             yield lambda: None
             return
@@ -286,10 +286,10 @@ class PPO:
     def load_state_dict(
         self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
     ) -> list[str]:
-        """Go on from :meth:`state_dict`; returns a line where another learning rate than the saved one is taken.
+        """Continue from :meth:`state_dict`; returns a line if the learning rate differs from the saved one.
 
-        A fixed rate is always the configured one. An adapted one is where it was configured anew: otherwise the run would not go on
-        as if it had never stopped.
+        A fixed rate is always the configured one. An adaptive rate is the saved one unless this job configures another, so that the run
+        continues as if it had never stopped.
         """
         self._policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
@@ -302,11 +302,11 @@ class PPO:
         return [] if keeps or saved == float(self._rate) else [f"learning rate set to {asked:g}"]
 
     def world_state(self) -> dict[str, torch.Tensor]:
-        """Nothing is kept for a world from iteration to iteration."""
+        """Empty: no state per world outlasts an iteration."""
         return {}
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Nothing to go on from."""
+        """No-op: there is no state per world."""
 
     @classmethod
     def build_policy(cls, config: PPOConfig, spaces: Spaces, device: str) -> ActorPolicy:

@@ -1,4 +1,4 @@
-"""What the outputs of the actor's network mean: how actions are drawn from them, and the gradient of the loss."""
+"""Interpretations of the actor's outputs: how actions are drawn from them, and the gradient of the loss."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from worker.learning.ppo.rollout import Rollout
 
 
 class Head(Protocol):
-    """Of one actor, for minibatches of one size."""
+    """Interpretation of one actor's outputs, for minibatches of one size."""
 
     def begin(self) -> None:
-        """Fix, before the first step of a rollout, what does not change in it."""
+        """Store, before the first step of a rollout, the values that stay constant in it."""
 
     def draw(self, draws: Draws, step: int, outputs: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Fill ``out``, shape (worlds, actions), with actions drawn by the network's ``outputs``."""
 
     def log_prob(self, rollout: Rollout) -> torch.Tensor:
-        """Of the rollout's actions, shape (steps, worlds)."""
+        """Log-probability of the rollout's actions, shape (steps, worlds)."""
 
     def backward(
         self, rows: torch.Tensor, rollout: Rollout, outputs: torch.Tensor, values: torch.Tensor
     ) -> torch.Tensor:
-        """Add the gradient of the loss to that of all that ``outputs`` and ``values`` were computed from.
+        """Add the gradient of the loss to the parameters behind ``outputs`` and ``values``.
 
         Args:
-            rows: Which samples of the flattened rollout the minibatch has, shape (samples,), int64.
-            outputs: Of the actor's network now, shape (samples, outputs).
-            values: Of the critic now, shape (samples, 1).
+            rows: Samples of the minibatch in the flattened rollout, shape (samples,), int64.
+            outputs: Present outputs of the actor's network, shape (samples, outputs).
+            values: Present values of the critic, shape (samples, 1).
 
         Returns:
             The weighted means of :data:`worker.learning.ppo.loss.LOSSES`, shape (4,).
         """
 
     def spread(self) -> torch.Tensor:
-        """Mean deviation of the actions of the last rollout, shape (); 0 of choices."""
+        """Mean standard deviation of the actions of the last rollout, shape (); 0 for choices."""
 
 
 class Gaussian:
-    """Actions are normal around the outputs, with a deviation of their own that is learnt.
+    """Actions are normal around the outputs, with a learnt standard deviation each.
 
-    ``plain`` takes the loss of torch in place of the kernel of :mod:`worker.learning.ppo.objective`, which is the same and faster.
+    ``plain`` uses the loss in torch instead of the equivalent, faster kernel of :mod:`worker.learning.ppo.objective`.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Gaussian:
     ) -> None:
         self._distribution, self._weight, self._settings = actor.distribution, weight, settings
         self.std = torch.zeros(actions, device=device)
-        """The deviation of the rollout."""
+        """The standard deviation of the rollout."""
         self._objective = None if plain else Objective(samples, actions, device, weight=weight, settings=settings)
 
     def begin(self) -> None:

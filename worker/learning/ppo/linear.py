@@ -1,4 +1,4 @@
-"""A multi-layer perceptron whose products keep to the alignment that tensor cores need, and whose gradients are written where they belong."""
+"""A multi-layer perceptron with matrix products aligned for tensor cores, and gradients written in place."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import nn
 from torch.nn import functional
 
 ALIGNED = 8
-"""Columns of an input that is padded come in multiples of this: products over 35 columns take half as long again as over 40."""
+"""Columns of a padded input are a multiple of this: products over 35 columns take 1.5 times as long as over 40."""
 
 
 def padded(columns: int, device: str) -> int:
-    """How many columns a buffer of ``columns`` gets: on a GPU the next multiple of :data:`ALIGNED`."""
+    """Padded number of columns of a buffer of ``columns``: on a GPU the next multiple of :data:`ALIGNED`."""
     return aligned(columns) if device.startswith("cuda") else columns
 
 
@@ -23,11 +23,11 @@ def aligned(count: int) -> int:
 
 
 class _Linear(torch.autograd.Function):
-    """``x @ weight.T + bias``, where columns of ``x`` beyond those of ``weight`` are zeros.
+    """``x @ weight.T + bias``, with zeros in the columns of ``x`` beyond those of ``weight``.
 
-    The backward pass writes ``weight.grad`` and ``bias.grad``, which must be there, in place of adding to them: a minibatch has one
-    such pass. torch would sum a bias's gradient over the samples with a general reduction, which takes longer than the layer's own
-    products; as a matrix-vector product with ones it is bound by memory alone.
+    The backward pass overwrites ``weight.grad`` and ``bias.grad``, which must exist, instead of adding to them: a minibatch has one such
+    pass. torch would sum a bias's gradient over the samples with a general reduction, which takes longer than the layer's own products; a
+    matrix-vector product with ones is bound only by memory.
     """
 
     @staticmethod
@@ -51,12 +51,12 @@ class _Linear(torch.autograd.Function):
 
 
 def forward(mlp: nn.Sequential, x: torch.Tensor, ones: torch.Tensor | None = None) -> torch.Tensor:
-    """What ``mlp`` makes of ``x``, shape (…, outputs).
+    """The output of ``mlp`` for ``x``, shape (…, outputs).
 
     Args:
         mlp: Linear layers and activations.
-        x: Shape (…, inputs or more); what is more must be zeros.
-        ones: Shape (samples,), for an ``x`` of shape (samples, …) whose gradients are wanted; without it there are none on a GPU.
+        x: Shape (…, inputs or more); further columns must be zeros.
+        ones: Shape (samples,), required on a GPU for gradients of an ``x`` of shape (samples, …).
     """
     if not x.is_cuda:
         return mlp(x)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
-"""Names of what is told of every minibatch."""
+"""Names of the metrics of every minibatch."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Clipping:
 
 @dataclass(frozen=True)
 class Samples:
-    """What the rollout knows of the samples of a minibatch, each of shape (samples,)."""
+    """The rollout's values for the samples of a minibatch, each of shape (samples,)."""
 
     log_prob: torch.Tensor
     advantages: torch.Tensor
@@ -43,8 +43,8 @@ def clipped_loss(
     """The clipped objective (Schulman et al. 2017, arXiv:1707.06347, eq. 7 and 9) with rsl-rl's clipped value loss.
 
     Args:
-        samples: Of the rollout.
-        log_prob, entropy, kl, values: Of the policy and critic now, shape (samples,).
+        samples: The rollout's values.
+        log_prob, entropy, kl, values: Of the present policy and critic, shape (samples,).
 
     Returns:
         The loss, shape (), and the means of :data:`LOSSES`, shape (4,), without gradient.

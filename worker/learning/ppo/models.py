@@ -1,4 +1,4 @@
-"""The networks: rsl-rl's models, with the image's bytes made into numbers inside, and the policy that is made of the actor."""
+"""The networks: rsl-rl's models, which also convert image bytes to floats, and the policy made from the actor."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from worker.learning.ppo.settings import PPOConfig
 
 
 class PixelModel(CNNModel):
-    """rsl-rl's CNN model for images of bytes alone."""
+    """rsl-rl's CNN model for byte images only."""
 
     def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
-        """What the convolutions make of images, shape (batch, channels, height, width), uint8: shape (batch, features)."""
-        # the bytes are few: bring them into the order that convolutions are fastest with before they become numbers
+        """Features, shape (batch, features), of images, shape (batch, channels, height, width), uint8."""
+        # bytes are small: bring them into the fastest memory order for convolutions before they become floats
         return self.cnns[POLICY](to_numbers(obs[POLICY].contiguous(memory_format=torch.channels_last)))
 
 
 class ActorPolicy:
-    """The mean action, or of a task with choices the likeliest; made of the actor's network alone."""
+    """The mean action, or for a task with choices the likeliest, from only the actor's network."""
 
     def __init__(self, actor: MLPModel | PixelModel, spaces: Spaces) -> None:
         self.actor, self._spaces = actor, spaces
@@ -57,7 +57,7 @@ class ActorPolicy:
 
 
 class _Network(nn.Module):
-    """The policy as one module with one input, as it is exported: the normaliser, or the making of numbers, is inside."""
+    """The policy as one module with one input for the export; it includes the normaliser, or the conversion to floats."""
 
     def __init__(self, actor: MLPModel | PixelModel, discrete: bool) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class _Numbers(nn.Module):
 
 
 def build_actor(config: PPOConfig, spaces: Spaces) -> MLPModel | PixelModel:
-    """A network that sees the group ``policy``: its outputs are the mean of a Gaussian with its own learnt deviation, or logits."""
+    """A network for the group ``policy``. Its outputs are logits, or the mean of a Gaussian with a learnt standard deviation."""
     example, common = spaces.example(1, "cpu"), _common(config, config.hidden_sizes)
     if not spaces.discrete:
         common["distribution_cfg"] = {"class_name": GaussianDistribution, "init_std": config.init_std}
@@ -94,9 +94,9 @@ def build_actor(config: PPOConfig, spaces: Spaces) -> MLPModel | PixelModel:
 
 
 def build_critic(config: PPOConfig, spaces: Spaces, actor: MLPModel | PixelModel) -> MLPModel | PixelModel:
-    """A network whose output is a value. One that sees what the actor does shares its normaliser, or its convolutions.
+    """A network whose output is a value. With the actor's observations, it shares the actor's normaliser or convolutions.
 
-    Raises ValueError where the task has no such group, or it is one of images.
+    Raises ValueError if the task lacks the group, or if it holds images that the policy does not see.
     """
     group = config.critic_observations
     if group not in spaces.observations:
@@ -106,7 +106,7 @@ def build_critic(config: PPOConfig, spaces: Spaces, actor: MLPModel | PixelModel
     example, common = spaces.example(1, "cpu"), _common(config, config.critic_hidden_sizes or config.hidden_sizes)
     groups = {"critic": [group]}
     if isinstance(actor, PixelModel) and group == POLICY:
-        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl says that they are shared
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints that they are shared
             return PixelModel(example, groups, "critic", 1, cnns=actor.cnns, **common)
     if len(spaces.observations[group]) > 1:
         raise ValueError(
@@ -123,7 +123,7 @@ def _common(config: PPOConfig, sizes: Sequence[int]) -> dict[str, Any]:
 
 
 def _check_layers(config: PPOConfig, shape: Sequence[int]) -> None:
-    """Raises ValueError for a convolution that leaves nothing of an image."""
+    """Raises ValueError for a convolution whose output would be empty."""
     height, width = shape[1:]
     for number, (kernel, stride) in enumerate(zip(config.kernel_sizes, config.strides, strict=True), start=1):
         if kernel > min(height, width):

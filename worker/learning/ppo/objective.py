@@ -1,4 +1,4 @@
-"""PPO's clipped objective and its gradient, worked out in one kernel instead of a hundred small ones."""
+"""PPO's clipped objective and its gradient, computed in one kernel instead of a hundred small ones."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Objective:
         samples: Samples of a minibatch.
         actions: Length of an action.
         device: ``"cpu"`` or ``"cuda:<n>"``.
-        weight: Of the mean over a minibatch, in losses and gradients alike: this rank's part of all ranks' samples.
+        weight: Weight of the mean over a minibatch, in losses and gradients: this rank's share of all ranks' samples.
         settings: The weights of the loss.
     """
 
@@ -108,16 +108,16 @@ class Objective:
         std: torch.Tensor,
         values: torch.Tensor,
     ) -> torch.Tensor:
-        """Add the gradient to that of all that ``mean``, ``std`` and ``values`` were computed from.
+        """Add the gradient to the parameters behind ``mean``, ``std`` and ``values``.
 
         Args:
-            rows: Which samples of the rollout the minibatch has, shape (samples,), int64.
-            rollout: Of all samples: actions and old means, shape (n, actions), old log-probabilities, advantages, returns and
+            rows: Samples of the minibatch in the rollout, shape (samples,), int64.
+            rollout: Values of all samples: actions and old means, shape (n, actions), old log-probabilities, advantages, returns and
                 old values, shape (n,).
-            old_std: The deviation of the rollout, shape (actions,).
-            mean: Of the policy now, for the minibatch, shape (samples, actions).
-            std: Of the policy now, shape (actions,).
-            values: Of the critic now, shape (samples, 1).
+            old_std: The standard deviation of the rollout, shape (actions,).
+            mean: Present mean of the policy for the minibatch, shape (samples, actions).
+            std: Present standard deviation of the policy, shape (actions,).
+            values: Present values of the critic, shape (samples, 1).
 
         Returns:
             The weighted means of :data:`worker.learning.ppo.loss.LOSSES`, shape (4,).

@@ -1,4 +1,4 @@
-"""What one iteration of all worlds leaves behind, in buffers that stay where they are."""
+"""The data of one iteration of all worlds, in buffers with fixed addresses."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class View:
 
     Attributes:
         observations: Shape (steps, worlds, *shape), float32, or uint8 of images.
-        latents: What the network's last part reads: normalised observations, or features; shape (steps, worlds, features).
-        padded: The same with columns of zeros behind them, see :func:`worker.learning.ppo.linear.padded`.
+        latents: Input of the network's last part: normalised observations, or features; shape (steps, worlds, features).
+        padded: The same, padded with columns of zeros, see :func:`worker.learning.ppo.linear.padded`.
         last: The observation after the last step, shape (worlds, *shape).
     """
 
@@ -35,7 +35,7 @@ class View:
         self.last = torch.zeros(worlds, *shape, device=device, dtype=dtype)
 
     def see(self, step: int, observations: TensorDict) -> torch.Tensor:
-        """Note the observations before a step; their latents, shape (worlds, features)."""
+        """Record the observations before a step; returns their latents, shape (worlds, features)."""
         seen = self.observations[step].copy_(observations[self.group])
         return self.latents[step].copy_(self.latent(seen))
 
@@ -44,22 +44,22 @@ class View:
         return self.model.get_latent({self.group: observations})
 
     def batch(self, rows: torch.Tensor) -> torch.Tensor:
-        """Padded latents of the samples ``rows`` of the flattened rollout; of images with the gradient of what makes them."""
+        """Padded latents of the samples ``rows`` of the flattened rollout; for images, with gradients of the convolutions."""
         if self.is_image:
             return self.latent(self.observations.flatten(0, 1)[rows])
         return self.padded.flatten(0, 1)[rows]
 
 
 class Rollout:
-    """What happened in an iteration, each of shape (steps, worlds) with a last dimension of its own.
+    """The record of an iteration; each part has shape (steps, worlds) and its own last dimension.
 
     Attributes:
-        outputs: Of the actor's network: means, or logits.
-        actions: What was done.
+        outputs: Outputs of the actor's network: means, or logits.
+        actions: The actions taken.
         rewards, values, returns, advantages, log_prob: Float32.
         going_on: 1 where the episode went on after the step, 0 where it ended.
         time_outs: 1 where it ended by the clock alone.
-        terminal: Observations of the critic's group before the reset, valid where an episode ended; None where there are none.
+        terminal: Observations of the critic's group before the reset, valid where an episode ended; None for images.
     """
 
     def __init__(self, actor: View, critic: View, outputs: int, actions: int) -> None:
@@ -77,7 +77,7 @@ class Rollout:
         self.terminal = None if critic.is_image else empty(*critic.observations.shape[2:])
 
     def record(self, step: Transition) -> None:
-        """Note what a step did, and go on to the next."""
+        """Record the result of a step, and advance to the next."""
         at = self.step
         if self.terminal is not None:
             self.terminal[at].copy_(step.terminal_observations[self.critic.group])
@@ -101,10 +101,10 @@ class Rollout:
         torch.add(self.advantages, self.values, out=self.returns)
 
     def add_future(self, gamma: float, judge: nn.Module) -> None:
-        """Where an episode was cut by the clock, its future is the value of the observation at which it was cut.
+        """Where the clock cut an episode, its future is the value of the observation at the cut.
 
-        Of images there is none after the step: the value of the one before stands for it, as in rsl-rl. ``judge`` makes values of
-        latents, shape (…, 1).
+        Images are not rendered after the step, so the value of the previous image replaces it, as in rsl-rl. ``judge`` maps latents to
+        values, shape (…, 1).
         """
         if self.terminal is None:
             self.rewards.addcmul_(self.time_outs, self.values, value=gamma)

@@ -1,4 +1,4 @@
-"""Settings of the fused PPO: what a job's YAML may set under ``train.ppo``. Imported without torch."""
+"""Settings of the fused PPO, under ``train.ppo`` in a job's YAML. Imported without torch."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class PPOConfig:
     steps: Count = 32
     """Control steps of every world in one iteration."""
     hidden_sizes: Counts = (64, 64)
-    """Widths of the hidden layers of the actor, and of the critic where it has none of its own."""
+    """Widths of the hidden layers of the actor, and of the critic unless it has its own."""
     critic_hidden_sizes: Counts | None = None
     """Widths of the critic's hidden layers; None: those of the actor."""
     critic_observations: Literal["policy", "critic"] = "policy"
-    """Observation group that the critic sees: the policy's, or what the simulation knows, with a normaliser of its own."""
+    """Observation group of the critic: the policy's, or privileged observations with their own normaliser."""
     channels: Counts = (16, 32, 32)
-    """Channels of the convolutions, where observations are images; a critic that sees them, too, shares them."""
+    """Channels of the convolutions for image observations; a critic that sees the same images shares them."""
     kernel_sizes: Counts = (8, 4, 3)
     """Width and height of their kernels [px]."""
     strides: Counts = (4, 2, 1)
@@ -46,13 +46,13 @@ class PPOConfig:
     minibatches: Count = 4
     """Parts into which each pass splits the batch: each has equally many steps of every world, so there are at most ``steps``."""
     learning_rate: Positive = 1.0e-3
-    """Step size of the optimizer (the first one, where the schedule adapts it)."""
+    """Learning rate of the optimizer (the initial one of an adaptive schedule)."""
     learning_rate_limits: Annotated[tuple[Positive, Positive], Field(strict=False)] = (1.0e-5, 1.0e-2)
     """Least and greatest learning rate of the adaptive schedule."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """``"adaptive"``: the learning rate follows the KL divergence; ``"fixed"``: it stays."""
+    """``"adaptive"``: the learning rate follows the KL divergence; ``"fixed"``: it stays constant."""
     desired_kl: Positive = 0.01
-    """KL divergence between old and new policy that the adaptive schedule aims at [nat]."""
+    """Target of the adaptive schedule for the KL divergence between old and new policy [nat]."""
     optimizer: Literal["adam", "adamw"] = "adam"
     """Adam, or AdamW with :attr:`weight_decay`."""
     weight_decay: Weight = 0.0
@@ -70,9 +70,9 @@ class PPOConfig:
     value_loss_coef: Weight = 1.0
     """Weight of the value loss in the loss."""
     max_grad_norm: Positive = 1.0
-    """Norm to which the gradients of actor and critic are clipped, each by itself."""
+    """Norm to which the gradients of actor and critic are clipped, each separately."""
     init_std: Positive = 1.0
-    """Initial standard deviation of the actions [unit of the action]; without meaning for choices."""
+    """Initial standard deviation of the actions [unit of the action]; unused for choices."""
     normalize_observations: bool = True
     """Whether observations are normalised by their running mean and variance; images never are."""
 
@@ -80,9 +80,9 @@ class PPOConfig:
         *("hidden_sizes", "critic_hidden_sizes", "critic_observations", "activation", "normalize_observations"),
         *("init_std", "channels", "kernel_sizes", "strides", "optimizer"),
     )
-    """What a resumed run can't change: checkpoints hold what became of it."""
+    """Settings that a resumed run can't change, since its checkpoints depend on them."""
     clone_may_change: ClassVar[tuple[str, ...]] = ("optimizer",)
-    """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
+    """Those of :attr:`fixed` that a clone can change, since it takes over only weights and normalisers."""
     elsewhere: ClassVar[dict[str, str]] = {
         **dict.fromkeys(
             ("rnd_cfg", "symmetry_cfg", "rnn_type", "rnn_hidden_dim", "class_name", "distribution_cfg"),
@@ -90,7 +90,7 @@ class PPOConfig:
         ),
         **dict.fromkeys(("replay", "capacity", "batch_size", "tau", "updates"), "algorithm sac has it"),
     }
-    """Settings that people look for here, and where they are."""
+    """Settings of other algorithms that people look for here, and where to find them."""
 
     @model_validator(mode="after")
     def _agree(self) -> PPOConfig:

@@ -1,9 +1,9 @@
-"""rsl_rl's PPO, its Distillation, or a class of one's own of their kind, as an algorithm of Muster.
+"""rsl_rl's PPO, its Distillation, or a user's compatible class, as an algorithm of Muster.
 
-What rsl_rl computes, it computes as in its own runner, with the same draws from torch's generators: on one rank the weights are the
-same, bit for bit. Over several ranks it averages gradients and adapts the learning rate with the KL of all; advantages are normalised on
-each rank by itself. A time-out is valued by the observation before the step. Nothing of it is recorded as a graph, and it asks the
-device for numbers after each minibatch.
+rsl_rl computes as in its own runner, with the same draws from torch's generators: on one rank the weights are the same, bit for bit. Over
+several ranks it averages gradients and adapts the learning rate with the KL of all; each rank normalises its own advantages. A time-out
+is valued by the observation before the step. Nothing of it is captured in a graph, and it reads numbers from the device after each
+minibatch.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RslRl:
     captures_rollout: ClassVar[bool] = False
 
     def __init__(self, config: RslRlConfig, setting: Setting) -> None:
-        """Build what ``config`` names. Raises ValueError, in one line that says where, for what rsl_rl refuses."""
+        """Build the algorithm of ``config``. Raises ValueError, in one line with the key, for settings that rsl_rl refuses."""
         self.steps = config.num_steps_per_env
         self.teacher_checkpoint = config.teacher_checkpoint
         self.graphs: Sequence[CudaGraphFunction] = ()
@@ -54,7 +54,7 @@ class RslRl:
         self._intrinsic = torch.zeros((), device=setting.gang.device)
         self._policy = RslRlPolicy(self.algorithm.get_policy(), seen, setting.spaces)
         if self._distils and setting.rehearsal:
-            self.algorithm.teacher_loaded = True  # any weights take the same memory
+            self.algorithm.teacher_loaded = True  # weights don't affect the memory
         if setting.gang.size > 1:
             self.algorithm.broadcast_parameters()
         self._begin_memories(building.example_of(setting.spaces, self._worlds, setting.gang.device))
@@ -63,7 +63,7 @@ class RslRl:
     # -- an iteration -------------------------------------------------------------------------------------------------
 
     def begin(self, iteration: int) -> None:
-        """Raises ValueError where there is a teacher to imitate whose weights nobody has given."""
+        """Raises ValueError if the teacher's weights were not loaded."""
         if not getattr(self.algorithm, "teacher_loaded", True):
             raise ValueError("rsl_rl.teacher_checkpoint: the teacher's weights were not loaded")
         self._intrinsic.zero_()
@@ -76,7 +76,7 @@ class RslRl:
 
     @torch.no_grad()
     def record(self, step: Transition) -> None:
-        """Copy what the step did."""
+        """Record the result of the step, in copies."""
         self.algorithm.process_env_step(
             as_floats(step.observations, self._groups),
             step.rewards.clone(),
@@ -87,7 +87,7 @@ class RslRl:
             self._intrinsic += self.algorithm.intrinsic_rewards.mean()
 
     def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
-        """What rsl_rl's ``update`` gives, as means over the ranks, ``learning_rate``, and ``action_std`` where the policy draws its actions.
+        """The metrics of rsl_rl's ``update``, as means over the ranks, ``learning_rate``, and for a stochastic policy ``action_std``.
 
         With RND also ``intrinsic_reward``, a mean over the steps, and ``rnd_weight``.
         """
@@ -114,12 +114,13 @@ class RslRl:
     def _share_statistics(self) -> None:
         """Give all ranks the same running statistics.
 
-        rsl_rl's normalisers add up their moments over the ranks themselves; of others, such as a ``BatchNorm2d``, the mean is taken.
+        rsl_rl's normalisers sum their moments over the ranks themselves; statistics of other layers, such as a ``BatchNorm2d``, are
+        averaged.
         """
         if self._gang.size == 1:
             return
         modules = itertools.chain(*(network.modules() for network in self._networks.values()))
-        for module in dict.fromkeys(modules):  # convolutions may be two networks'
+        for module in dict.fromkeys(modules):  # two networks may share convolutions
             if isinstance(module, EmpiricalNormalization):
                 continue
             for statistic in module.buffers(recurse=False):
@@ -128,7 +129,7 @@ class RslRl:
 
     @property
     def learning_rate(self) -> float:
-        """The learning rate now."""
+        """The present learning rate."""
         return float(self.algorithm.optimizer.param_groups[0]["lr"])
 
     @learning_rate.setter
@@ -140,14 +141,14 @@ class RslRl:
     # -- the teacher --------------------------------------------------------------------------------------------------
 
     def load_teacher(self, state: Mapping[str, Any]) -> None:
-        """See :class:`worker.learning.algorithm.Student`. Raises ValueError where there is no teacher, or the weights are not its."""
+        """See :class:`worker.learning.algorithm.Student`. Raises ValueError without a teacher, or if the weights do not fit it."""
         if not self._distils:
             raise ValueError("rsl_rl.teacher_checkpoint: only Distillation has a teacher")
         try:
             self.algorithm.load({"actor_state_dict": state[POLICY]}, {"teacher": True}, True)
         except (RuntimeError, KeyError) as error:
             raise ValueError(
-                "rsl_rl.teacher: the weights do not fit; give teacher and obs_groups.teacher what actor and obs_groups.actor are in "
+                "rsl_rl.teacher: the weights do not fit; set teacher and obs_groups.teacher to the values of actor and obs_groups.actor in "
                 f"the teacher's run: {' '.join(str(error).split())}"
             ) from error
 
@@ -158,7 +159,7 @@ class RslRl:
         return self._policy
 
     def state_dict(self) -> Mapping[str, Any]:
-        """What rsl_rl's ``save`` gives, with the weights of the policy under ``policy``, and how far RND's schedule is."""
+        """The result of rsl_rl's ``save``, with the weights of the policy under ``policy``, and the position in RND's schedule."""
         saved = dict(self.algorithm.save())
         saved.pop(self._acting, None)
         curious = {"rnd_steps": self._curiosity.update_counter} if self._curiosity else {}
@@ -167,10 +168,10 @@ class RslRl:
     def load_state_dict(
         self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
     ) -> list[str]:
-        """Go on from :meth:`state_dict`; ``weights_only``: from the networks that it has, with a fresh optimizer.
+        """Continue from :meth:`state_dict`; ``weights_only``: only from its networks, with a new optimizer.
 
-        A rate that the job gives otherwise than the job before it counts; else the saved one, which may have adapted itself, does.
-        Raises RuntimeError, ValueError or KeyError where it does not fit.
+        A learning rate that this job changes overrides the saved one, which may have adapted. Raises RuntimeError, ValueError or KeyError
+        if the state does not fit.
         """
         asked = self._asked_rate
         saved = {name: value for name, value in state.items() if name not in (POLICY, "rnd_steps", "asked_rate")}
@@ -191,9 +192,9 @@ class RslRl:
         return [f"learning rate set to {asked:g}"]
 
     def _begin_memories(self, example: TensorDict) -> None:
-        """Make what rsl_rl remembers of each world, zeros, at once; it would in the first step.
+        """Allocate rsl_rl's state of each world, zeros, now instead of in the first step.
 
-        A teacher is not among it: rsl_rl lets it begin each iteration without a memory.
+        The teacher's is not included: rsl_rl clears it before each iteration.
         """
         self._recurrent = {
             name: network for name, network in self._networks.items() if network.is_recurrent and name != "teacher"
@@ -218,7 +219,7 @@ class RslRl:
         return {**state, "rnd": self._averages.avg} if self._averages else state
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on from :meth:`world_state`. Raises ValueError where something is missing or has another shape."""
+        """Continue from :meth:`world_state`. Raises ValueError if something is missing or has another shape."""
         expected = self.world_state()
         for name, tensor in expected.items():
             if name not in state or state[name].shape != tensor.shape:
@@ -230,7 +231,7 @@ class RslRl:
             parts = [copies[f"{name}.{index}"] for index, _ in enumerate(_hidden(network))]
             _set_hidden(network, [part.transpose(0, 1).contiguous() for part in parts])
         if "student" in self._recurrent:
-            # an iteration is learnt from the state that the student had at its beginning
+            # an iteration learns from the student's state at its beginning
             self.algorithm.last_hidden_states = (self._recurrent["student"].get_hidden_state(), None)
         if self._averages:
             self._averages.avg = copies["rnd"]
@@ -246,7 +247,8 @@ class RslRl:
 
 
 def _count_on_host(optimizer: torch.optim.Optimizer) -> None:
-    """Bring the counts of steps to the host, where an optimizer makes them: it reads them in each step, and takes over what is loaded."""
+    """Move an optimizer's step counts to the host, where it creates them: it reads them in each step, and would keep loaded ones on the
+    device."""
     if any(optimizer.defaults.get(name) for name in ("fused", "capturable")):
         return
     for state in optimizer.state.values():
@@ -255,7 +257,7 @@ def _count_on_host(optimizer: torch.optim.Optimizer) -> None:
 
 
 def _hidden(network: Any) -> tuple[torch.Tensor, ...]:
-    """The recurrent state, each part of shape (layers, worlds, size): one of a GRU, two of an LSTM."""
+    """The recurrent state, each part of shape (layers, worlds, size): one part for a GRU, two for an LSTM."""
     state = network.get_hidden_state()
     return state if isinstance(state, tuple) else (state,)
 

@@ -1,4 +1,4 @@
-"""Building what a configuration names with rsl_rl's own means, and saying in one line where that can't be done."""
+"""Construction of a configuration's objects by rsl_rl's own functions, with errors in one line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from worker.tasks.rsl_rl_env import as_floats
 
 
 class Surroundings(VecEnv):
-    """What rsl_rl asks of an environment while it builds an algorithm. A symmetry function is given it as ``env``."""
+    """The environment that rsl_rl needs to build an algorithm. A symmetry function receives it as ``env``."""
 
     def __init__(self, setting: Setting, example: TensorDict) -> None:
         self.num_envs, self.num_actions = setting.share.count, setting.spaces.actions
@@ -38,7 +38,7 @@ class Surroundings(VecEnv):
 
     @property
     def unwrapped(self) -> Surroundings:
-        """This object: rsl_rl looks for ``step_dt`` behind wrappers."""
+        """This object, since rsl_rl looks for ``step_dt`` behind wrappers."""
         return self
 
     def get_observations(self) -> TensorDict:
@@ -46,17 +46,17 @@ class Surroundings(VecEnv):
         return self._example
 
     def step(self, actions: torch.Tensor) -> Any:
-        """Not for rsl_rl: Muster steps the worlds."""
+        """Unsupported: Muster steps the worlds."""
         raise RuntimeError("rsl_rl's algorithms do not step Muster's worlds")
 
 
 def example_of(spaces: Spaces, worlds: int, device: str) -> TensorDict:
-    """Zeros as rsl_rl sees the task's observations, batch size (worlds,)."""
+    """Zeros in the form of the task's observations for rsl_rl, batch size (worlds,)."""
     return as_floats(spaces.example(worlds, device), spaces.observations)
 
 
 def algorithm_type(config: RslRlConfig) -> tuple[Any, tuple[str, str]]:
-    """The algorithm's class and its two networks' names, that of the policy first. Raises ValueError where it can't be found."""
+    """The algorithm's class and the names of its two networks, the policy first. Raises ValueError if the class can't be found."""
     name = config.section("algorithm")["class_name"]
     with _refused("algorithm.class_name"):
         found = _find(name)
@@ -72,7 +72,7 @@ def observation_sets(config: RslRlConfig, names: tuple[str, str], example: Tenso
     """The observation groups of each set. Raises ValueError for a group that the task does not have."""
     curious = ["rnd_state"] if config.algorithm.get("rnd_cfg") else []
     with _refused("obs_groups"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of sets that are missing: what then holds is in the settings' description
+        warnings.simplefilter("ignore")  # about missing sets: the settings' description has the defaults
         sets: dict[str, list[str]] = resolve_obs_groups(example, copy.deepcopy(config.obs_groups), [*names, *curious])
     return sets
 
@@ -80,7 +80,7 @@ def observation_sets(config: RslRlConfig, names: tuple[str, str], example: Tenso
 def build_network(
     config: RslRlConfig, name: str, sets: dict[str, list[str]], example: TensorDict, outputs: int
 ) -> nn.Module:
-    """One network. Raises ValueError for what it refuses."""
+    """One network. Raises ValueError for settings that it refuses."""
     section = config.section(name)
     with _refused(f"{name}.class_name"):
         _find(section["class_name"])
@@ -91,7 +91,7 @@ def build_network(
 
 
 def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[str], list[str]]:
-    """rsl_rl's algorithm, the observation groups that its policy sees, and all that it needs. Raises ValueError for what can't be."""
+    """rsl_rl's algorithm, the observation groups of its policy, and all groups that it needs. Raises ValueError for impossible settings."""
     spaces, gang = setting.spaces, setting.gang
     if spaces.discrete:
         raise ValueError("rsl_rl: its distributions are of numbers, and the actions of this task are choices")
@@ -101,7 +101,7 @@ def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[st
     sets = observation_sets(config, names, example)
     groups = list(spaces.observations)
     if found.construct_algorithm in (PPO.construct_algorithm, Distillation.construct_algorithm):
-        # what no set has need not be stored; a class that builds itself otherwise may look for more
+        # store only groups of the sets; a class with its own construction may need more
         groups = [group for group in groups if any(group in each for each in sets.values())]
     example = example.select(*groups)
     place = {"global_rank": gang.rank, "local_rank": gang.placement.local_rank, "world_size": gang.size}
@@ -130,8 +130,7 @@ def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[st
 
 
 def _check_numbers(found: Any, section: dict[str, Any]) -> None:
-    """Refuse what is no number in the place of one, and a fraction in the place of a count: a class of one's own would only notice
-    when it reckons with it."""
+    """Refuse values other than numbers, and fractions for counts, which a user's class would only notice while it computes."""
     for name, parameter in inspect.signature(found).parameters.items():
         default, given = parameter.default, section.get(name, parameter.default)
         if not isinstance(default, int | float) or isinstance(default, bool):
@@ -143,7 +142,7 @@ def _check_numbers(found: Any, section: dict[str, Any]) -> None:
 
 
 def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> None:
-    """Refuse what rsl_rl would only stumble over while it learns."""
+    """Refuse settings on which rsl_rl would only fail while it learns."""
     networks = [getattr(built, name) for name in names if hasattr(built, name)]
     for name, network in zip(names, networks, strict=False):
         if getattr(network, "obs_normalization", False) and not network.obs_groups:
@@ -169,7 +168,7 @@ def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> 
 
 
 def _check_symmetry(function: Any) -> None:
-    """Refuse a function that rsl_rl could not call."""
+    """Refuse a function that rsl_rl can't call."""
     try:
         inspect.signature(function).bind(env=None, obs=None, actions=None)
     except (TypeError, ValueError) as error:
@@ -180,7 +179,7 @@ def _check_symmetry(function: Any) -> None:
 
 
 def _find(name: Any) -> Any:
-    """What ``name`` names, in rsl_rl's ways; a module may lie where the job was submitted, and never hides one of ours."""
+    """The object called ``name``, by rsl_rl's rules. A module may be in the job's directory, and never hides one of ours."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     return resolve_callable(name)
@@ -188,7 +187,7 @@ def _find(name: Any) -> Any:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """rsl_rl prints what it builds; and convolutions that two networks share are theirs twice, which torch's optimizers warn of."""
+    """Silence rsl_rl's prints, and torch's warning about convolutions that two networks share."""
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "optimizer contains a parameter group with duplicate parameters")
         yield
@@ -196,7 +195,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _named() -> Iterator[None]:
-    """In here a refusal begins with ``rsl_rl``."""
+    """Prefix refusals in this context with ``rsl_rl``."""
     try:
         yield
     except Refused as refused:
@@ -205,7 +204,7 @@ def _named() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _refused(where: str) -> Iterator[None]:
-    """In here whatever is raised becomes a ValueError in one line that begins with ``where``; except that memory is short."""
+    """Turn any exception in this context, except out of memory, into a ValueError of one line that begins with ``where``."""
     try:
         with _quiet():
             yield

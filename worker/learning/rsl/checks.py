@@ -1,6 +1,6 @@
-"""What rsl_rl takes in the section ``algorithm`` of its classes: checked beforehand, since rsl_rl stumbles over it while it learns.
+"""Checks of the section ``algorithm`` of rsl_rl's classes beforehand, since rsl_rl would fail on it only while it learns.
 
-Of a class of one's own only what it has in common with them. Imported without torch.
+For a user's class, only the common keys are checked. Imported without torch.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ _SCHEDULES: Mapping[Any, Any] = {
 
 
 def class_of(section: Mapping[str, Any]) -> str | None:
-    """``PPO`` or ``Distillation`` where an ``algorithm`` section names rsl_rl's own; None where it names another class."""
+    """``PPO`` or ``Distillation`` if an ``algorithm`` section names rsl_rl's own class; None for another class."""
     name = section.get("class_name", "PPO")
     if not isinstance(name, str):
         raise Refused(("class_name",), f"expected a text, found {shown(name)}")
@@ -113,7 +113,8 @@ def class_of(section: Mapping[str, Any]) -> str | None:
 
 
 def check_algorithm(section: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The section as it is, None where a job leaves it out. Raises Refused for a value that rsl_rl's own classes can't use, and for a number that is not finite."""
+    """The section unchanged, None if a job omits it. Raises Refused for a value that rsl_rl's own classes can't use, and for a number
+    that is not finite."""
     check_finite(section)
     if section is None:
         return None
@@ -130,7 +131,7 @@ def check_algorithm(section: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def check_finite(value: Any, path: tuple[str | int, ...] = ()) -> Any:
-    """``value``, a document. Raises Refused for a number in it that is not finite: a job that is sent as JSON can't hold it."""
+    """The document ``value``. Raises Refused for a number that is not finite, which a job in JSON can't hold."""
     if isinstance(value, float) and not math.isfinite(value):
         raise Refused(path, f"expected a finite number, found {kind_of(value)}")
     items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
@@ -140,16 +141,16 @@ def check_finite(value: Any, path: tuple[str | int, ...] = ()) -> Any:
 
 
 def check_networks(kind: str, distils: bool, given: Mapping[str, Any], teacher: str | None) -> tuple[str, str]:
-    """The names of an algorithm's two networks, that of the policy first.
+    """The names of an algorithm's two networks, the policy first.
 
     Args:
-        kind: What its class is called.
+        kind: Name of its class.
         distils: Whether it imitates a teacher.
-        given: The sections of networks that a job gives, by name; None where it does not.
+        given: The job's sections of networks, by name; None for omitted ones.
         teacher: The run that trained the teacher.
 
     Raises:
-        Refused: It gives a network that the algorithm does not have, or no teacher, or one too many.
+        Refused: A network is not one of the algorithm's, a teacher is missing, or the algorithm has no teacher.
     """
     names = ("student", "teacher") if distils else ("actor", "critic")
     for other, section in given.items():
@@ -162,7 +163,7 @@ def check_networks(kind: str, distils: bool, given: Mapping[str, Any], teacher: 
 
 
 def check_gradient_length(length: int, epochs: int, steps: int) -> None:
-    """Raises Refused where an iteration of Distillation is too short for a single step of the optimizer."""
+    """Raises Refused if an iteration of Distillation is too short for a single step of the optimizer."""
     if length > epochs * steps:
         raise Refused(
             ("algorithm", "gradient_length"),
@@ -182,7 +183,7 @@ def _check(kind: TypeAdapter[Any], section: Mapping[str, Any], where: tuple[str 
 
 
 def _keys(kind: TypeAdapter[Any], path: tuple[str | int, ...]) -> list[str]:
-    """The keys that are known where ``path`` ends."""
+    """The known keys at ``path``."""
     schema = kind.json_schema()
     found = schema
     for part in path[:-1]:

@@ -1,4 +1,4 @@
-"""A policy of rsl_rl without what learning needs: acting, and the function of tensors that is exported."""
+"""A policy of rsl_rl without the training state: acting, and the function of tensors for the export."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from worker.tasks.rsl_rl_env import as_floats
 
 
 class RslRlPolicy:
-    """rsl_rl's model as a policy; it may be one that is being trained, which is left as it was found.
+    """rsl_rl's model as a policy. A model in training keeps its state.
 
     Args:
-        model: ``MLPModel`` or one of its kind.
-        groups: The observation groups that it sees, in its order.
-        spaces: Of the task.
+        model: ``MLPModel`` or a compatible model.
+        groups: Its observation groups, in its order.
+        spaces: Spaces of the task.
     """
 
     def __init__(self, model: Any, groups: Sequence[str], spaces: Spaces) -> None:
@@ -30,14 +30,14 @@ class RslRlPolicy:
 
     @torch.no_grad()
     def act(self, observations: TensorDict) -> torch.Tensor:
-        """The deterministic output (of a normal distribution its mean), shape (n, actions), float32."""
+        """The deterministic output (for a normal distribution, its mean), shape (n, actions), float32."""
         with self._remembering() as model:
             actions: torch.Tensor = model(as_floats(observations, self._groups))
         return actions
 
     @torch.no_grad()
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """Forget the recurrent state of all worlds, or where ``worlds``, shape (n,), bool, is true."""
+        """Clear the recurrent state of all worlds, or where ``worlds``, shape (n,), bool, is true."""
         if worlds is None:
             self._memory = None
             return
@@ -46,7 +46,7 @@ class RslRlPolicy:
 
     @contextmanager
     def _remembering(self) -> Iterator[Any]:
-        """The model for evaluation with this policy's own recurrent state; that of the training comes back afterwards."""
+        """The model in evaluation mode with this policy's recurrent state; the training's state is restored afterwards."""
         model, training, state = self._model, self._model.training, self._model.get_hidden_state()
         if training:
             model.eval()
@@ -65,11 +65,11 @@ class RslRlPolicy:
         return weights
 
     def load_state_dict(self, state: Mapping[str, Any]) -> Any:
-        """Take over what :meth:`state_dict` gave. Raises RuntimeError where it does not fit."""
+        """Load the result of :meth:`state_dict`. Raises RuntimeError if it does not fit."""
         return self._model.load_state_dict(state)
 
     def module(self) -> ExportedPolicy:
-        """rsl_rl's own export of the model, with one input for each observation group, as the task gives it.
+        """rsl_rl's own export of the model, with one input for each observation group of the task.
 
         The recurrent state is ``h`` (and ``c`` of an LSTM), shape (batch, layers, size), and comes out as ``h_out`` (and ``c_out``);
         an episode begins with zeros.
@@ -103,7 +103,7 @@ class _Exported(nn.Module):
         images = [to_numbers(inputs[index]) for index in self._images]
         states = [state.transpose(0, 1) for state in inputs[len(images) + len(self._vectors) :]]
         vectors = [inputs[index] for index in self._vectors]
-        # of images alone, rsl_rl still joins a vector, of no numbers
+        # with images only, rsl_rl still concatenates an empty vector
         numbers = torch.cat(vectors, dim=-1) if vectors else images[0].flatten(1)[:, :0]
         outputs: Any = self._network(numbers, *images, *states)
         if not states:

@@ -22,10 +22,10 @@ DEFAULTS: Mapping[str, dict[str, Any]] = {
     "student": {**_NETWORK, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.1}},
     "teacher": _ACTOR,
 }
-"""The sections that a job does not give. What is not in them is as in rsl_rl."""
+"""Defaults of the sections that a job omits. Keys without a default here have rsl_rl's."""
 
 NETWORKS = ("actor", "critic", "student", "teacher")
-"""Names of networks, of configuration sections and of observation sets alike."""
+"""Names of networks, which are also those of configuration sections and of observation sets."""
 SETS = (*NETWORKS, "rnd_state")
 """Names of observation sets of rsl_rl's own algorithms."""
 Network = Annotated[dict[str, Any], AfterValidator(check_finite)]
@@ -57,15 +57,15 @@ REFUSED: Mapping[str, str] = {
     "policy": "since version 5 rsl_rl has the sections actor and critic",
     "empirical_normalization": "use obs_normalization in actor and critic",
 }
-"""Keys of rsl_rl's runners for what Muster does itself, and what to use instead."""
+"""Keys of rsl_rl's runners that Muster replaces, and the alternatives."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RslRlConfig:
-    """What rsl_rl's runner takes as its configuration, without what Muster does in the runner's place.
+    """The configuration of rsl_rl's runner, without the parts that Muster does instead.
 
-    A section with a ``class_name`` is taken as it is, as in rsl_rl. One without changes :data:`DEFAULTS`, key by key, and so does a
-    ``distribution_cfg`` in it. Sections may have any key that the class which they name knows.
+    A section with a ``class_name`` is used unchanged, as in rsl_rl. A section without one overrides :data:`DEFAULTS` key by key, and so
+    does a ``distribution_cfg`` in it. Sections may have any key that their class knows.
 
     Raises:
         ValidationError: A key is unknown, or a value has the wrong type or is out of range.
@@ -74,20 +74,20 @@ class RslRlConfig:
     num_steps_per_env: Annotated[int, Field(strict=True, ge=1)] = 24
     """Control steps of every world in one iteration."""
     obs_groups: dict[str, list[str]] = field(default_factory=dict)
-    """Which of the task's observation groups each set has: ``actor``, ``critic``, ``rnd_state``, ``student``, ``teacher``. A set that is
-    missing is the group of the same name, or else ``policy``, which is rsl_rl's rule: the critic sees the group ``critic``."""
+    """The task's observation groups in each set: ``actor``, ``critic``, ``rnd_state``, ``student``, ``teacher``. By rsl_rl's rule, a
+    missing set is the group of the same name, or else ``policy``: the critic sees the group ``critic``."""
     algorithm: Annotated[dict[str, Any], AfterValidator(check_algorithm)] = field(default_factory=dict)
     """``PPO``, ``Distillation`` or ``module:Class``, with ``rnd_cfg``, ``symmetry_cfg`` and the rest."""
     actor: Network | None = None
-    """The policy's network, of PPO."""
+    """The policy's network, for PPO."""
     critic: Network | None = None
-    """The value's network, of PPO."""
+    """The value network, for PPO."""
     student: Network | None = None
-    """The network that learns, of Distillation."""
+    """The learning network, for Distillation."""
     teacher: Network | None = None
-    """The network that is imitated, of Distillation: the ``actor`` of the run that trained it."""
+    """The imitated network, for Distillation: the ``actor`` of the run that trained it."""
     teacher_checkpoint: str | None = None
-    """Where the teacher's weights come from, of Distillation: ``RUN`` or ``RUN@ITERATION``. A key of Muster's, not of rsl_rl's."""
+    """Source of the teacher's weights, for Distillation: ``RUN`` or ``RUN@ITERATION``. A key of Muster, not of rsl_rl."""
     torch_compile_mode: str | None = None
     """Compile the networks with ``torch.compile``: ``default`` or ``max-autotune-no-cudagraphs``."""
 
@@ -98,14 +98,14 @@ class RslRlConfig:
         *(f"algorithm.rnd_cfg.{name}" for name in ("activation", "state_normalization", "reward_normalization")),
         "algorithm.rnd_cfg.learning_rate",
     )
-    """What a resumed run can't change: checkpoints hold what became of it. A dot leads into a section."""
+    """Settings that a resumed run can't change, since its checkpoints depend on them. A dot leads into a section."""
     clone_may_change: ClassVar[tuple[str, ...]] = (
         "teacher_checkpoint",
         *(name for name in fixed if name.startswith("algorithm.")),
     )
-    """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
+    """Those of :attr:`fixed` that a clone can change, since it takes over only weights and normalisers."""
     elsewhere: ClassVar[Mapping[str, str]] = REFUSED
-    """What people look for here, and what to use instead."""
+    """Settings that people look for here, and the alternatives."""
 
     @model_validator(mode="after")
     def _agree(self) -> RslRlConfig:
@@ -122,10 +122,10 @@ class RslRlConfig:
         return self
 
     def check_observations(self, groups: Mapping[str, bool]) -> None:
-        """Raises ValueError where a set names a group that the task does not have.
+        """Raises ValueError if a set names a group that the task does not have.
 
         Args:
-            groups: Those of the task, and of each whether it is of images.
+            groups: The task's groups, and whether each holds images.
         """
         for name, wanted in self.obs_groups.items():
             for group in wanted:
@@ -133,13 +133,18 @@ class RslRlConfig:
                     known = ", ".join(groups)
                     raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; there are {known}")
 
+    def check_actions(self, chooses: bool) -> None:
+        """Raises ValueError for a task whose policy chooses one of several actions."""
+        if chooses:
+            raise ValueError("its distributions are of numbers, and the actions of this task are choices; use ppo")
+
     def section(self, name: str) -> dict[str, Any]:
-        """Section ``name`` as rsl_rl takes it: with its ``class_name``. Nothing of it is shared with these settings."""
+        """Section ``name`` in rsl_rl's form, with its ``class_name``. It is a copy."""
         return _changed(DEFAULTS[name], getattr(self, name) or {})
 
 
 def _changed(default: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of ``given``, or, where it names no class, of ``default`` with what it changes."""
+    """A copy of ``given``, or, if it names no class, of ``default`` with its changes."""
     known: Mapping[str, Any] = {} if "class_name" in given else default
     return {key: _copy(value, known.get(key)) for key, value in {**known, **given}.items()}
 

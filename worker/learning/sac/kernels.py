@@ -1,4 +1,5 @@
-"""What torch would need many launches for, or could not do alike on every number of ranks: exploring, and projecting a distribution."""
+"""Kernels for exploration and for the projection of a distribution. Torch would need many launches, or its result would depend on the
+number of ranks."""
 
 from __future__ import annotations
 
@@ -105,12 +106,12 @@ def explore(
     """Draw an action for each world, into ``actions``.
 
     Args:
-        keys: Of the iteration's steps, the same on all ranks; shape (steps,), int32.
-        step: Which of them.
+        keys: Random keys of the iteration's steps, the same on all ranks; shape (steps,), int32.
+        step: Index of the step.
         first_world: Global index of the first world.
         uniform: Whether to draw uniformly instead of from the policy; shape (1,), int32.
         limit: Actions lie within ± this.
-        mean: Of the policy before squashing, shape (worlds, actions), float32.
+        mean: Mean of the policy before squashing, shape (worlds, actions), float32.
         log_std: Logarithm of its standard deviation, same shape.
         actions: Same shape.
     """
@@ -134,16 +135,16 @@ def look_ahead(
     returns: torch.Tensor,
     discounts: torch.Tensor,
 ) -> None:
-    """What follows the beginnings of transitions, in the replay's ring of steps.
+    """Ends, returns and discounts of transitions, from the replay's ring of steps.
 
     Args:
-        rows: Where they begin, shape (samples,), int64.
-        outcomes: Reward, whether the episode went on, whether anything comes after; shape (steps · worlds, 3), float32.
+        rows: Rows of their first steps, shape (samples,), int64.
+        outcomes: Reward, whether the episode continued, whether a future follows; shape (steps · worlds, 3), float32.
         worlds: Rows of one step.
         powers: Discounts of 0 to n steps, shape (n + 1,), float32.
         last: Filled with the rows of their last steps, shape (samples,), int64.
         returns: Filled with the discounted sums of their rewards, shape (samples,), float32.
-        discounts: Filled with the worth of what comes after, shape (samples,), float32.
+        discounts: Filled with the discount of the future, shape (samples,), float32.
     """
     device = str(outcomes.device)
     with on_torch_stream(device):
@@ -165,13 +166,13 @@ def project(
     greatest: float,
     projected: torch.Tensor,
 ) -> torch.Tensor:
-    """The distribution of ``returns + discounts · (z + bonuses)``, put back on the atoms (arXiv:1707.06887, eq. 7).
+    """The distribution of ``returns + discounts · (z + bonuses)``, projected onto the atoms (arXiv:1707.06887, eq. 7).
 
     Args:
-        probabilities: Of the atoms z, which lie evenly from ``least`` to ``greatest``; shape (samples, atoms), float32.
-        returns: Rewards up to then, shape (samples,), float32.
-        discounts: Of what comes after, 0 or more; shape (samples,), float32.
-        bonuses: Added to what comes after: SAC's entropy term; shape (samples,), float32.
+        probabilities: Probabilities of the atoms z, spaced evenly from ``least`` to ``greatest``; shape (samples, atoms), float32.
+        returns: Discounted sums of the transitions' rewards, shape (samples,), float32.
+        discounts: Discounts of the future, 0 or more; shape (samples,), float32.
+        bonuses: Added to the future: SAC's entropy term; shape (samples,), float32.
         least: The first atom.
         greatest: The last atom.
         projected: Filled, and returned; shape (samples, atoms).
@@ -191,5 +192,5 @@ def project(
 
 
 def _array(tensor: torch.Tensor) -> object:
-    """The same memory as Warp's kernels take it."""
+    """The same memory as an array for Warp's kernels."""
     return wp.from_torch(tensor.detach(), return_ctype=True)

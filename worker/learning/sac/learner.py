@@ -21,21 +21,21 @@ from worker.learning.sac.settings import SACConfig
 BETAS = (0.9, 0.95)
 """Decays of AdamW's moments: shorter than usual, since the targets move (arXiv:2512.01996)."""
 LOSSES = ("actor_loss", "entropy", "critic_loss", "q_mean")
-"""What an update measures; the first two only where the policy learns."""
+"""Metrics of an update; the first two only if the policy learns."""
 
 
 class Learner:
-    """Policy, critics, target critics and temperature; what they need to learn lies at fixed addresses.
+    """Policy, critics, target critics and temperature, with all buffers of learning at fixed addresses.
 
-    An update is :meth:`compute`, the sum of what it gave over the ranks, and :meth:`apply`. All gradients are taken at the same weights
-    and lie in one flat buffer, of which the parameters' gradients are views: the policy's, the temperature's, :data:`LOSSES`, the
-    critics'. An update of the critics alone shares the end of it.
+    An update is :meth:`compute`, the sum of its results over the ranks, and :meth:`apply`. All gradients are taken at the same weights
+    and are in one flat buffer, with the parameters' gradients as views: the policy's, the temperature's, :data:`LOSSES`, the critics'. An
+    update of only the critics sums the end of the buffer.
 
     Args:
         config: Hyperparameters.
-        sizes: Length of one observation of the policy's group and, where it is another one, of the critics' group.
+        sizes: Length of one observation of the policy's group and, if different, of the critics' group.
         actions: Length of an action.
-        gang: The ranks that learn together. The main rank's weights become everyone's.
+        gang: The ranks that learn together. All ranks take the main rank's weights.
     """
 
     def __init__(self, config: SACConfig, sizes: Sequence[int], actions: int, gang: Gang) -> None:
@@ -50,11 +50,11 @@ class Learner:
         """Of each group."""
         ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
         self.columns = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        """Where the groups are in a row of all that is observed."""
+        """Columns of the groups in a row of all observations."""
         self.width = ends[-1]
         self.log_temperature = nn.Parameter(torch.tensor(config.init_temperature, device=device).log())
         self.samples = Share.of(gang.rank, gang.size, config.batch_size).count
-        """This rank's part of a batch."""
+        """This rank's share of a batch."""
         self._projected = torch.zeros(self.samples, config.atoms, device=device)
         self._allocate_gradients(device)
         self._make_optimizers(device.startswith("cuda"))
@@ -98,19 +98,19 @@ class Learner:
 
     @property
     def temperature(self) -> torch.Tensor:
-        """Worth of the policy's entropy [reward per nat], shape (), on the device."""
+        """The temperature, the value of the policy's entropy [reward per nat], shape (), on the device."""
         return self.log_temperature.detach().exp()
 
     def shared(self, improves: bool) -> torch.Tensor:
-        """What the ranks have to add up after :meth:`compute`."""
+        """The buffer to sum over the ranks after :meth:`compute`."""
         return self._shared if improves else self._of_critics
 
     def compute(self, batch: Batch, noise: torch.Tensor, improves: bool) -> None:
-        """This rank's part of the gradients and losses of one update.
+        """This rank's share of the gradients and losses of one update.
 
         Args:
-            batch: What was sampled.
-            noise: Standard normal, of the action after the transition and of that at its beginning; shape (2, samples, actions).
+            batch: The sampled transitions.
+            noise: Standard normal noise of the actions after and at the beginning of the transition; shape (2, samples, actions).
             improves: Whether policy and temperature learn too.
         """
         self.losses.zero_()
@@ -140,17 +140,17 @@ class Learner:
             self.losses[1].copy_(entropy.sum() * share)
 
     def _normalize(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the policy sees and what the critics do, of rows of all that is observed; the same tensor where it is the same group."""
+        """The observations of the policy and of the critics, from rows of all observations; the same tensor if both have the same group."""
         groups = [normalizer(rows[:, at]) for normalizer, at in zip(self.normalizers, self.columns, strict=True)]
         return groups[0], groups[-1]
 
     def target(self, outputs: torch.Tensor, batch: Batch, bonuses: torch.Tensor) -> torch.Tensor:
-        """What the critics should say: a distribution, shape (samples, atoms), or, of one atom, the return, shape (samples, 1).
+        """The critics' targets: a distribution, shape (samples, atoms), or, with one atom, the return, shape (samples, 1).
 
         Args:
-            outputs: Of the target critics for what comes after, shape (critics, samples, atoms).
-            batch: What was sampled.
-            bonuses: −α · log π of the action after, shape (samples,).
+            outputs: Outputs of the target critics after the transition, shape (critics, samples, atoms).
+            batch: The sampled transitions.
+            bonuses: −α · log π of the next action, shape (samples,).
         """
         config = self.config
         if config.atoms == 1:
@@ -194,9 +194,9 @@ class Learner:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], *, weights_only: bool = False) -> None:
-        """Go on from :meth:`state_dict`; ``weights_only``: with fresh optimizers and the temperature of the settings.
+        """Continue from :meth:`state_dict`; ``weights_only``: with new optimizers and the temperature of the settings.
 
-        The temperature weighs entropy against rewards, which may be others now.
+        The temperature weighs entropy against rewards, which may have changed.
         """
         self.actor.load_state_dict(state["policy"])
         self.critics.load_state_dict(state["critics"])

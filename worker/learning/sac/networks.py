@@ -19,11 +19,11 @@ from worker.learning.observations import made_up
 from worker.learning.sac.settings import LOG_STD, SACConfig
 
 HEAD_SCALE = 0.01
-"""First weights of the last layers, as a part of torch's: so the first policy is centred, and the first critics expect nothing."""
+"""Scale of the last layers' initial weights, relative to torch's: the first policy is centred, and the first critics predict 0."""
 
 
 def size_of(spaces: Spaces, group: str) -> int:
-    """Length of one observation of a group. Raises ValueError where there is no such group, or where it is one of images."""
+    """Length of one observation of a group. Raises ValueError for an unknown group or a group of images."""
     if group not in spaces.observations:
         known = ", ".join(spaces.observations)
         raise ValueError(f"sac.critic_group: there is no observation group {group!r}; there are {known}")
@@ -34,7 +34,7 @@ def size_of(spaces: Spaces, group: str) -> int:
 
 
 def hidden_layers(sizes: Sequence[int], layer_norm: bool) -> Iterator[nn.Module]:
-    """Layers from an input of ``sizes[0]`` numbers over widths of ``sizes[1:]``, each normalised where ``layer_norm`` says so."""
+    """Layers from an input of ``sizes[0]`` numbers over widths of ``sizes[1:]``, each normalised if ``layer_norm``."""
     for before, after in itertools.pairwise(sizes):
         yield nn.Linear(before, after)
         if layer_norm:
@@ -61,15 +61,15 @@ class Actor(nn.Module):
         """Mean and logarithm of the standard deviation, before squashing.
 
         Args:
-            observations: As the task gives them, shape (n, observations), float32.
+            observations: Observations of the task, shape (n, observations), float32.
 
         Returns:
-            Two of shape (n, actions).
+            Two tensors of shape (n, actions).
         """
         return self.spread(self.normalizer(observations))
 
     def spread(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What :meth:`forward` gives, for observations that are normalised already."""
+        """As :meth:`forward`, for observations that are already normalised."""
         mean, raw = self.head(self.body(observations)).chunk(2, dim=-1)
         low, high = LOG_STD
         return mean, low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0)
@@ -77,8 +77,8 @@ class Actor(nn.Module):
     def sample(self, observations: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions, and the logarithm of their density in units of the limit.
 
-        The density of a = tanh(u) is that of u over the slope of tanh, 1 − a². Its logarithm is 2·(log 2 − u − softplus(−2u)), which
-        stays finite where a is 1 in float32.
+        The density of a = tanh(u) is that of u over the slope of tanh, 1 − a². The slope's logarithm is 2·(log 2 − u − softplus(−2u)),
+        which stays finite even if a is 1 in float32.
 
         Args:
             observations: Normalised, shape (n, observations).
@@ -94,14 +94,14 @@ class Actor(nn.Module):
         return self.limit * torch.tanh(before), (normal - slope).sum(-1)
 
     def best(self, observations: torch.Tensor) -> torch.Tensor:
-        """The action without noise, shape (n, actions), for observations as the task gives them."""
+        """The action without noise, shape (n, actions), for observations of the task."""
         return self.limit * torch.tanh(self(observations)[0])
 
 
 class Critics(nn.Module):
     """Several critics of one shape.
 
-    A critic gives ``atoms`` numbers: the logits of a distribution of the return; of one atom, its mean.
+    A critic outputs ``atoms`` numbers: the logits of a distribution of the return, or with one atom its mean.
     """
 
     values: torch.Tensor
@@ -124,7 +124,7 @@ class Critics(nn.Module):
         self.register_buffer("values", atoms, persistent=False)
 
     def forward(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """What each critic says.
+        """The output of each critic.
 
         Args:
             observations: Normalised, shape (n, observations).
@@ -137,18 +137,18 @@ class Critics(nn.Module):
         return torch.stack([critic(x) for critic in self.each])
 
     def mean(self, outputs: torch.Tensor) -> torch.Tensor:
-        """The return that each critic expects, shape (critics, n), from what :meth:`forward` gave."""
+        """The return that each critic expects, shape (critics, n), from the result of :meth:`forward`."""
         return outputs[..., 0] if self.atoms == 1 else outputs.softmax(-1) @ self.values
 
     def combined_mean(self, outputs: torch.Tensor) -> torch.Tensor:
-        """The return that they expect together, shape (n,): the mean or the least over the critics."""
+        """The combined expected return, shape (n,): the mean or the least over the critics."""
         means = self.mean(outputs)
         return means.mean(0) if self.combine == "mean" else means.amin(0)
 
     def combined_distribution(self, outputs: torch.Tensor) -> torch.Tensor:
-        """The probabilities of the atoms that they give together, shape (n, atoms).
+        """The combined probabilities of the atoms, shape (n, atoms).
 
-        ``"mean"``: the mean over the critics, whose mean is that of their means; ``"min"``: those of the critic that expects least.
+        ``"mean"``: the mean over the critics; ``"min"``: those of the critic with the least expected return.
         """
         probabilities = outputs.softmax(-1)
         if self.combine == "mean":
@@ -158,7 +158,7 @@ class Critics(nn.Module):
 
 
 class SquashedPolicy:
-    """What SAC learnt: the mean action, squashed."""
+    """The learnt policy of SAC: the squashed mean action."""
 
     def __init__(self, actor: Actor) -> None:
         self.actor = actor
@@ -170,7 +170,7 @@ class SquashedPolicy:
         return best
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """Nothing is remembered of an episode."""
+        """No-op: the policy has no recurrent state."""
 
     def module(self) -> ExportedPolicy:
         """The mean action as a function of ``obs``, shape (batch, observations); the observations are normalised inside."""
@@ -184,12 +184,12 @@ class SquashedPolicy:
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> Any:
-        """Take over what :meth:`state_dict` gave. Raises RuntimeError where it does not fit."""
+        """Load the result of :meth:`state_dict`. Raises RuntimeError if it does not fit."""
         return self.actor.load_state_dict(state)
 
 
 class _Best(nn.Module):
-    """The mean action as a module of its own, on the CPU."""
+    """The mean action as a separate module, on the CPU."""
 
     def __init__(self, actor: Actor) -> None:
         super().__init__()
@@ -201,13 +201,13 @@ class _Best(nn.Module):
 
 
 def make_normalizer(config: SACConfig, size: int) -> nn.Module:
-    """Makes observations, shape (n, size), have mean 0 and deviation 1; or leaves them as they are."""
+    """Normalise observations, shape (n, size), to mean 0 and standard deviation 1; or leave them unchanged."""
     return EmpiricalNormalization(size) if config.normalize_observations else nn.Identity()
 
 
 def check_spaces(spaces: Spaces, groups: Sequence[str]) -> None:
-    """Raises ValueError, in one line, for spaces that SAC can't learn in."""
+    """Raises ValueError, in one line, for spaces that SAC does not support."""
     if spaces.discrete:
-        raise ValueError("sac: its actions are numbers from a range, and this task's are choices; use ppo")
+        raise ValueError("sac: its actions are continuous, and this task's are choices; use ppo")
     for group in groups:
         size_of(spaces, group)

@@ -1,15 +1,15 @@
 """Soft actor-critic (Haarnoja et al. 2018, arXiv:1801.01290 and arXiv:1812.05905) over a gang of ranks, for thousands of worlds.
 
-What makes it fast is from FastTD3 (arXiv:2505.22642), FastSAC (arXiv:2512.01996) and FlashSAC (arXiv:2604.04539): thousands of worlds
-and as large batches, several updates a step, critics that predict a distribution and are normalised layer by layer, targets from their
-mean instead of the least, normalised observations, AdamW with a little weight decay, a small discount, and a target entropy near 0.
+Its speed comes from the methods of FastTD3 (arXiv:2505.22642), FastSAC (arXiv:2512.01996) and FlashSAC (arXiv:2604.04539): thousands of
+worlds and equally large batches, several updates per step, critics that predict a distribution and have layer normalisation, targets from
+their mean instead of the least, normalised observations, AdamW with a little weight decay, a small discount, and a target entropy near 0.
 
 - The gradients of critics, policy and temperature are taken at the same weights, of the same samples, and lie in one buffer: a gang
-  has one collective an update.
-- Each rank samples from the replay of its own worlds, and its part of the batch. Gradients, losses and the moments of observations are
-  those of the whole gang, so the ranks' weights stay the same bits.
-- What is drawn at random is drawn in :meth:`SAC.begin`; action noise depends on (seed, iteration, step, global world index) alone.
-- A time-out is no end: the target takes the critics' word for the observation before the reset. Only a true end counts as one.
+  has one collective per update.
+- Each rank samples its share of the batch from the replay of its own worlds. Gradients, losses and the moments of observations are those
+  of the whole gang, so the ranks' weights stay identical bit for bit.
+- All random draws are made in :meth:`SAC.begin`; action noise depends only on (seed, iteration, step, global world index).
+- A time-out is not a termination: the target bootstraps from the observation before the reset. Only a true termination has no future.
 - On CUDA all updates of an iteration are one graph; in a gang of several ranks the collectives stand between smaller graphs.
 """
 
@@ -33,8 +33,8 @@ from worker.learning.sac.replay import Replay
 from worker.learning.sac.settings import SACConfig
 
 SAVED = {"cpu": 64 << 20, "cuda": 4 << 20}
-"""With ``save_replay: auto``, a rank's replay of up to so many bytes is part of its checkpoints. A GPU's iteration takes milliseconds, and
-so does saving what is allowed it; a resumed run has not the same bits there in any case."""
+"""With ``save_replay: auto``, a rank's replay up to this size [bytes] is part of its checkpoints. A GPU's iteration takes milliseconds,
+and so does a save of this size; a resumed run is not bit-identical there in any case."""
 
 
 class SAC:
@@ -45,7 +45,7 @@ class SAC:
     kernels: ClassVar[tuple[ModuleType, ...]] = (kernels,)
 
     def __init__(self, config: SACConfig, setting: Setting) -> None:
-        """Allocate everything once. Raises ValueError for images, choices, an unknown group, or a batch with no sample for some rank."""
+        """Allocate all buffers once. Raises ValueError for images, choices, an unknown group, or a batch without a sample for some rank."""
         self.gang, self.share, self.seed, spaces = setting.gang, setting.share, setting.seed, setting.spaces
         check_spaces(spaces, (POLICY, config.critic_group))
         if config.batch_size < self.gang.size:
@@ -69,7 +69,7 @@ class SAC:
         self._make_graphs()
 
     def _decide_saving(self, *, tells: bool) -> bool:
-        """Whether checkpoints hold the replay; the same on all ranks. ``tells``: print it where the settings leave it open."""
+        """Whether checkpoints hold the replay; the same on all ranks. ``tells``: print the decision if the settings leave it open."""
         if self.config.save_replay != "auto":
             return self.config.save_replay
         most, ranks = SAVED[self.device.partition(":")[0]], self.gang.size
@@ -102,9 +102,9 @@ class SAC:
         self._rate = torch.tensor(config.critic_learning_rate, device=device)
 
     def _make_graphs(self) -> None:
-        """What the device replays as graphs: in a gang of one two of them, else the parts between which the collectives stand.
+        """The graphs that the device replays: two in a gang of one, otherwise the parts between the collectives.
 
-        Only those that are called: the loop waits for all of them before it tells that they were captured.
+        Only graphs that are called, since the loop waits for all of them before it reports their capture.
         """
         wholes: dict[str, Callable[[], None]] = {}
         parts: dict[str, Callable[[], None]] = {}
@@ -123,7 +123,7 @@ class SAC:
     # -- collecting ---------------------------------------------------------------------------------------------------
 
     def begin(self, iteration: int) -> None:
-        """Draw the keys of this iteration's action noise, alike on all ranks, and this rank's samples and their noise."""
+        """Draw the keys of this iteration's action noise, the same on all ranks, and this rank's samples and their noise."""
         config, replay = self.config, self.replay
         self._step = 0
         self._source.manual_seed(mix_seed(self.seed, iteration, 0))
@@ -148,7 +148,7 @@ class SAC:
 
     @torch.no_grad()
     def record(self, step: Transition) -> None:
-        """Write what the step did into the replay."""
+        """Write the result of the step into the replay."""
         ended = step.dones.unsqueeze(1)
         after = [torch.where(ended, step.terminal_observations[g], step.observations[g]) for g in self._groups]
         goes_on = ~step.dones
@@ -161,10 +161,10 @@ class SAC:
     # -- learning -----------------------------------------------------------------------------------------------------
 
     def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
-        """All updates of the iteration; until the replay holds enough for them, only the normalisers learn.
+        """All updates of the iteration; until the replay holds enough steps, only the normalisers learn.
 
         Args:
-            observations: Not needed: those after the last step were recorded with it.
+            observations: Unused; those after the last step were recorded with it.
 
         Returns:
             Means over the updates of :data:`LOSSES`, the temperature, and the critics' learning rate. Until the first update, losses
@@ -198,7 +198,7 @@ class SAC:
             moments.merge(normalizer, self._moment_sums[0], sums)
 
     def _moments(self) -> list[tuple[torch.nn.Module, slice, torch.Tensor]]:
-        """Of each group: its normaliser, its columns, and the sums of its moments, shape (2 · size,)."""
+        """For each group: its normaliser, its columns, and the sums of its moments, shape (2 · size,)."""
         columns = self.learner.columns
         sums = [self._moment_sums[1 + 2 * each.start : 1 + 2 * each.stop] for each in columns]
         return list(zip(self.learner.normalizers, columns, sums, strict=True))
@@ -225,23 +225,23 @@ class SAC:
     # -- state --------------------------------------------------------------------------------------------------------
 
     def policy(self) -> SquashedPolicy:
-        """What was learnt so far, live."""
+        """A live view of the learnt policy."""
         return SquashedPolicy(self.learner.actor)
 
     @classmethod
     def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedPolicy:
-        """A policy that can take over the ``policy`` of a :meth:`state_dict`."""
+        """A policy that can load the ``policy`` of a :meth:`state_dict`."""
         check_spaces(spaces, (POLICY,))
         return SquashedPolicy(Actor(config, size_of(spaces, POLICY), spaces.actions).to(device))
 
     def state_dict(self) -> Mapping[str, Any]:
-        """Networks, normalisers, temperature, optimizers, and how many updates were done."""
+        """Networks, normalisers, temperature, optimizers, and the number of updates."""
         return {**self.learner.state_dict(), "updates": self._updates}
 
     def load_state_dict(
         self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
     ) -> list[str]:
-        """Go on from :meth:`state_dict`. The replay, which is part of :meth:`world_state`, stays as it is.
+        """Continue from :meth:`state_dict`. The replay, which is part of :meth:`world_state`, stays unchanged.
 
         Rates and decays are always this job's, whatever the checkpoint's were.
         """
@@ -249,16 +249,16 @@ class SAC:
         self.learner.load_state_dict(state, weights_only=weights_only)
         for graph in self.graphs:
             graph.release()
-        self._make_graphs()  # the old ones would go on with the optimizers' old moments
+        self._make_graphs()  # the old graphs would continue with the optimizers' old moments
         rates = [name for name in changed if name.endswith("_rate")]
         return [f"{name} set to {getattr(self.config, name):g}" for name in rates]
 
     def world_state(self) -> Mapping[str, torch.Tensor]:
-        """The replay, where it is to be saved."""
+        """The replay, if checkpoints hold it."""
         return self.replay.world_state() if self._saves_replay else {}
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on with the replay of :meth:`world_state`; where none was saved, with an empty one."""
+        """Continue with the replay of :meth:`world_state`, or with an empty one if none was saved."""
         if state:
             self.replay.load_world_state(state)
         else:

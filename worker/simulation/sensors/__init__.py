@@ -1,1 +1,1 @@
-"""What robots feel: contacts, frames, inertial measurements and momenta of all worlds, measured inside the graph of a step."""
+"""Sensors of robots: contacts, frames, inertial measurements and momenta of all worlds, measured inside the graph of a step."""

@@ -38,21 +38,21 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 GROUND = "ground"
-"""What a segmentation calls the terrain, the plane, and the geoms that a robot's file fixes to the world."""
+"""Name in a segmentation of the terrain, the plane, and geoms that a robot's file fixes to the world."""
 CHANNELS: Mapping[str, tuple[str, ...]] = {"color": ("red", "green", "blue"), "grey": ("grey",), "depth": ("depth",)}
-"""Channels of an image of each kind; those of a segmentation are what it tells apart."""
+"""Channels of an image of each kind; a segmentation has one channel per class."""
 _FIRST_STREAM = 2**21
-"""Cameras draw their poses from streams with numbers below minus this, two each, apart from those of physics, terrain and events."""
+"""Cameras draw their poses from streams below minus this number, two each, separate from those of physics, terrain and events."""
 
 
 @wp.struct
 class CameraArrays:
-    """What a camera saw last: after the last reset, before the last observation. One row a world.
+    """Latest image of a camera, taken after the last reset and before the last observation. One row per world.
 
-    A reward reads the image on which the action was chosen, since the next one is taken only after worlds were placed afresh.
+    A reward reads the image on which the action was based, since the next one is taken only after resets.
 
     Attributes:
-        images: Bytes, the present frame's channels first; shape ``(worlds, channels * frames, height, width)``.
+        images: Bytes, with the present frame's channels first; shape ``(worlds, channels * frames, height, width)``.
         depths: Of the present frame, along the camera's axis, from ``near`` to ``far`` [m]; shape ``(worlds, height, width)``, of other
             kinds than depth ``(worlds, 0, 0)``.
         poses: Of the camera in the world's frame; it looks along its own -z, its +y is up; shape ``(worlds,)``.
@@ -150,36 +150,35 @@ def _stack_masks(
 class CameraSensor:
     """A pinhole camera in every world, on a body, on a site, or fixed in the world.
 
-    What it sees becomes an observation group of images through :class:`worker.tasks.declaration.Image`; terms read
-    :class:`CameraArrays`. Bytes of each kind:
+    :class:`worker.tasks.declaration.Image` makes an observation group of its images; terms read :class:`CameraArrays`. Bytes of each kind:
 
-    - ``color``: red, green and blue in sRGB; where there is nothing a light blue.
-    - ``grey``: the luma of these.
-    - ``depth``: distance along the camera's axis, 0 at ``near`` or nearer to 255 at ``far`` or beyond, or where there is nothing; in
-      metres it stands in ``CameraArrays.depths``.
-    - ``segmentation``: one channel for each name in ``of``, 255 where a pixel shows that, else 0; nothing is 0 in all of them.
+    - ``color``: red, green and blue in sRGB; the background is light blue.
+    - ``grey``: the luma of the colour image.
+    - ``depth``: distance along the camera's axis, from 0 at ``near`` or nearer to 255 at ``far``, beyond it or in the background;
+      ``CameraArrays.depths`` has it in metres.
+    - ``segmentation``: one channel for each name in ``of``: 255 where a pixel shows it, else 0; the background is 0 in all channels.
 
     Attributes:
-        body: The body that it is on, by its name in the file. Without ``body`` and ``site`` it is fixed in the world.
-        site: The site that it is on.
-        robot: Whose body or site that is.
-        position: In the frame of body, site or world [m].
-        target: Point of that frame in the middle of the image [m]; +z of the frame is up.
+        body: Name in the file of the body that carries it. Without ``body`` and ``site`` it is fixed in the world.
+        site: Name of the site that carries it.
+        robot: The robot with that body or site.
+        position: Position in the frame of the body, site or world [m].
+        target: Point in that frame at the centre of the image [m]; +z of the frame is up.
         rotation: From the camera's axes (x to the right, y up, looking along -z) to those of the frame, quaternion xyzw. Without
             ``target`` and ``rotation`` it looks along the frame's +x, with +z up.
-        width: Of an image [px].
-        height: Of an image [px].
+        width: Width of an image [px].
+        height: Height of an image [px].
         fov: Vertical field of view [rad].
         kind: ``"color"``, ``"grey"``, ``"depth"`` or ``"segmentation"``.
         frames: Images of one observation: the present one and those of the control steps before.
-        samples: Rays of each pixel, of colour and grey.
+        samples: Rays per pixel, for colour and grey.
         near: Least depth in an image [m].
         far: Greatest depth in an image [m].
-        of: What a segmentation tells apart: names of robots and objects, and ``"ground"``; None: all of these.
+        of: Classes of a segmentation: names of robots and objects, and ``"ground"``; None: all of them.
         position_range: Each camera is mounted up to this far from its place, along each axis of its body or the world [m]; a number, or
             three.
-        angle_range: It is turned by up to this about each of its own axes [rad]; a number, or three.
-        redraw: Whether every episode draws that anew; otherwise each world has its own for ever.
+        angle_range: Each camera is turned by up to this about each of its own axes [rad]; a number, or three.
+        redraw: Whether every episode draws these offsets again; otherwise each world keeps its own.
 
     Raises:
         ValueError: A number is out of range, or two arguments exclude each other.
@@ -240,10 +239,10 @@ class CameraSensor:
             raise ValueError(f"CameraSensor.rotation: expected a quaternion xyzw, found {list(self.rotation)}")
         if self.samples > 1 and self.kind not in ("color", "grey"):
             raise ValueError(
-                f"CameraSensor.samples: {self.kind} takes one ray a pixel, since between two surfaces there is none"
+                f"CameraSensor.samples: {self.kind} takes one ray per pixel, since it can't be averaged over rays"
             )
         if self.of is not None and self.kind != "segmentation":
-            raise ValueError(f"CameraSensor.of: it is for a segmentation, and kind is {self.kind}")
+            raise ValueError(f"CameraSensor.of: only a segmentation takes it, and kind is {self.kind}")
 
     def channels(self, views: Mapping[str, RobotView]) -> tuple[str, ...]:
         """Names of the channels of one frame, with these robots and objects. Raises ValueError where ``of`` names another."""
@@ -259,7 +258,7 @@ class CameraSensor:
         """Name of each channel of an observation, those of earlier frames ending on ``_1``, ``_2``, …
 
         Raises:
-            ValueError: There is no such body, site, robot or object.
+            ValueError: The body, site, robot or object is unknown.
         """
         if self.body is not None or self.site is not None:
             place_names(views, "CameraSensor", self.robot, bodies=self.body, sites=self.site)
@@ -278,7 +277,7 @@ class CameraSensor:
         """The cameras of these worlds.
 
         Raises:
-            ValueError: There is no such body, site, robot or object, or a pattern matches several.
+            ValueError: The body, site, robot or object is unknown, or a pattern matches several.
         """
         place = Place("world", -1, wp.transform_identity())
         if self.body is not None or self.site is not None:
@@ -294,7 +293,7 @@ class Camera:
 
     Args:
         declared: As a task declares it.
-        place: What it is on.
+        place: The frame that carries it.
         context: The worlds.
 
     Attributes:
@@ -343,7 +342,7 @@ class Camera:
         return np.concatenate([np.tile(one, count), rest])
 
     def begin(self, randomize: Randomization) -> None:
-        """Draw what a world's camera keeps for ever, when random streams are seeded; a second call draws the same.
+        """Draw each camera's permanent offsets after random streams are seeded; a second call draws the same.
 
         Args:
             randomize: How the worlds differ besides: ``camera_position``, ``camera_angle``, ``light``.
@@ -359,10 +358,10 @@ class Camera:
         wp.launch(displace, dim=given.shape, inputs=inputs, outputs=[poses], device=self._device)
 
     def advance(self) -> None:
-        """Nothing: one image a step is taken, after worlds were placed afresh."""
+        """No-op: one image per step is taken, after resets."""
 
     def settle(self) -> None:
-        """Take a picture of every world; an episode's first one stands for those before it."""
+        """Render every world; an episode's first image also fills the earlier frames."""
         declared, count = self.declared, self._mounts.shape
         if declared.redraw:
             ranges = [wp.vec3(*_three(declared.position_range)), wp.vec3(*_three(declared.angle_range))]
@@ -382,7 +381,7 @@ class Camera:
         wp.launch(kernel, dim=self._pixels.shape, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """The images, the depths that rewards may read, and where the running episodes have their cameras."""
+        """The images, the depths that rewards may read, and the camera poses of the running episodes."""
         tensors = views_of(self.arrays, "images", *(("depths",) if self.declared.kind == "depth" else ()))
         return tensors | ({"mounts": wp.to_torch(self._mounts)} if self.declared.redraw else {})
 

@@ -1,4 +1,4 @@
-"""Contacts of bodies or geoms: forces, how long they last, how hard they were within a control step."""
+"""Contacts of bodies or geoms: forces, durations, and peaks within a control step."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
 
 @wp.struct
 class ContactArrays:
-    """What a contact sensor measured last, one row a world, one column a body or geom.
+    """Latest measurements of a contact sensor, one row per world, one column per body or geom.
 
     Attributes:
         found: Contacts in the last physics step, shape ``(worlds, columns)``.
         forces: Sum of the contact forces on the body or geom in the last physics step, in the world frame [N], shape
             ``(worlds, columns)``. Forces between two geoms of one column cancel.
-        air_time: For how long it has been without contact, 0 while it has one [s], shape ``(worlds, columns)``.
-        contact_time: For how long it has been in contact, 0 while it is not [s], shape ``(worlds, columns)``.
-        last_air_time: How long its last time without contact was, up to the end of the step in which contact came [s], shape
-            ``(worlds, columns)``; 0 until there was one in this episode.
-        last_contact_time: The same of its last contact [s], shape ``(worlds, columns)``.
+        air_time: Time since contact was lost, 0 during contact [s], shape ``(worlds, columns)``.
+        contact_time: Time since contact began, 0 without contact [s], shape ``(worlds, columns)``.
+        last_air_time: Duration of the last period without contact, up to the end of the step in which contact began [s], shape ``(worlds,
+            columns)``; 0 before the first one of an episode.
+        last_contact_time: Duration of the last contact [s], shape ``(worlds, columns)``.
         peaks: Greatest norm of ``forces`` in the physics steps of ``history`` [N], shape ``(worlds, columns)``.
         history: Norm of the strongest single contact in each of the last physics steps [N], the last one first, shape
             ``(worlds, columns, steps)``: those of one control step where the sensor is ``fine``, else the last one alone.
@@ -104,7 +104,7 @@ class _Solved:
 
 @wp.struct
 class _Sums:
-    """The contacts of one physics step summed up, shape ``(worlds, columns)``; cleared by the kernel that reads them."""
+    """Sums over the contacts of one physics step, shape ``(worlds, columns)``; cleared by the kernel that reads them."""
 
     found: wp.array2d(dtype=wp.int32)
     forces: wp.array2d(dtype=wp.vec3)
@@ -240,14 +240,14 @@ class ContactSensor:
     """Contacts of bodies or of geoms with the ground, a robot, an object or anything.
 
     Attributes:
-        bodies: Pattern or patterns of the bodies that are measured, each a column; all geoms of a body count. Give this or ``geoms``.
-        geoms: Pattern or patterns of the geoms that are measured, each a column. What can't collide is left out of a pattern.
-        robot: Whose bodies or geoms they are.
-        against: What they must touch to count: ``"ground"`` (what is fixed to the world and belongs to no robot or object, and planes),
-            the name of a robot or object (that of ``robot``: contacts of the robot with itself), or None: anything.
-        fine: Whether every physics step is measured, and not the last of a control step alone: times are exact to a physics step, and
-            ``history`` and ``peaks`` cover a control step. It costs two launches a physics step instead of a control step.
-        together: Whether all that is measured is one column, named after the robot.
+        bodies: Pattern or patterns of the measured bodies, each a column; all geoms of a body count. Give this or ``geoms``.
+        geoms: Pattern or patterns of the measured geoms, each a column. Geoms that can't collide are skipped.
+        robot: The robot with these bodies or geoms.
+        against: The other side of contacts that count: ``"ground"`` (planes, and shapes fixed to the world that belong to no robot or
+            object), the name of a robot or object (the name in ``robot`` means self-contacts), or None: anything.
+        fine: Whether every physics step is measured, not only the last of a control step. Times are then exact to a physics step, and
+            ``history`` and ``peaks`` cover a control step. It costs two launches per physics step instead of per control step.
+        together: Whether all measurements are summed in one column, named after the robot.
     """
 
     bodies: str | Sequence[str] | None = None
@@ -282,7 +282,7 @@ class Contacts:
     """A :class:`ContactSensor` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        rows: Which geoms are measured against which.
+        rows: Measured geoms and their counterparts.
         fine: Whether every physics step is measured.
         context: The worlds.
     """
@@ -319,12 +319,12 @@ class Contacts:
             self._measure()
 
     def settle(self) -> None:
-        """Worlds that were placed afresh have had neither contact nor time in the air."""
+        """Clear contact and air times of worlds that were just reset."""
         inputs = [self._episodes.ages, self.arrays, self._norms]
         wp.launch(_forget, dim=self._shape, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Everything measured: the times go on from it, and what acts before the next physics reads it."""
+        """All measurements: times continue from them, and code before the next physics reads them."""
         times = ("air_time", "contact_time", "last_air_time", "last_contact_time")
         tensors = views_of(self.arrays, "found", "forces", *times, "peaks", "history")
         return tensors | {"norms": wp.to_torch(self._norms)}
@@ -338,7 +338,7 @@ class Contacts:
 
 
 def _solved(solver: Any) -> _Solved:
-    """Views of the solver's own arrays, which stay where they are for ever."""
+    """Views of the solver's own arrays, whose addresses never change."""
     data, solved = solver.mjw_data, _Solved()
     contact = data.contact
     solved.cone, solved.rows = int(solver.mjw_model.opt.cone), int(data.njmax)

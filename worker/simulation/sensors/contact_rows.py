@@ -1,4 +1,4 @@
-"""Which geoms of the solver a contact sensor measures, and which ones they must touch."""
+"""The solver's geoms that a contact sensor measures, and the geoms that they must touch."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from worker.simulation.sensors.contact import ContactSensor
 
 GROUND = "ground"
-"""What is fixed to the world, as ``ContactSensor.against`` names it."""
+"""Name in ``ContactSensor.against`` of everything fixed to the world."""
 
 
 @dataclass(frozen=True)
 class ContactRows:
-    """What a contact sensor measures.
+    """Geoms and columns of a contact sensor.
 
     Attributes:
-        names: Of its columns.
+        names: Names of its columns.
         columns: Column of each geom of the solver, -1 where it is not measured; shape ``(geoms,)``, int32.
         others: Whether touching this geom counts (1 or 0), shape ``(geoms,)``, int32.
     """
@@ -56,7 +56,7 @@ def contact_rows(declared: ContactSensor, context: SensorContext) -> ContactRows
 
 
 def _groups(declared: ContactSensor, view: RobotView, solid: set[int]) -> dict[str, list[int]]:
-    """The shapes of each column, by the column's name. ``solid`` are those that can collide: what has none is left out of a pattern."""
+    """The shapes of each column, by the column's name. ``solid`` are the shapes that can collide; matches without one are skipped."""
     if (declared.bodies is None) == (declared.geoms is None):
         raise ValueError("ContactSensor: give either bodies or geoms, a pattern or several, and not both")
     of_bodies = declared.geoms is None
@@ -65,7 +65,7 @@ def _groups(declared: ContactSensor, view: RobotView, solid: set[int]) -> dict[s
     names = view.body_names if of_bodies else view.geom_names
     find = view.find_bodies if of_bodies else view.find_geoms
     found: dict[int, list[int]] = {}
-    for pattern in patterns or find(patterns):  # none at all is refused there
+    for pattern in patterns or find(patterns):  # it refuses an empty result
         matching = {index: _shapes_on(view, index) if of_bodies else [view.geoms[index]] for index in find(pattern)}
         colliding = {index: measured for index, measured in matching.items() if not solid.isdisjoint(measured)}
         if not colliding:
@@ -89,7 +89,7 @@ def _shapes_of_geoms(context: SensorContext) -> np.ndarray:
 
 
 def _others(declared: ContactSensor, context: SensorContext, shapes: np.ndarray) -> np.ndarray:
-    """Which geoms of the solver the measured ones must touch."""
+    """The solver's geoms that the measured ones must touch."""
     if declared.against is None:
         return np.ones(len(shapes), bool)
     if declared.against != GROUND:

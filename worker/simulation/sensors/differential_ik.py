@@ -19,42 +19,43 @@ from worker.simulation.sensors.places import Place, find_places, only_one, place
 from worker.simulation.sensors.sensor import SensorContext, views_of
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""What of a frame may be moved: along the axes of the root, or of the world [m], and about them [rad]."""
+"""Directions in which a frame may be moved: along the axes of the root or of the world [m], and about them [rad]."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 """The columns of an absolute orientation."""
 FRAMES = ("root", "world")
-"""Whose axes these are."""
+"""Frames whose axes can be used."""
 
 
 @dataclass(frozen=True)
 class DifferentialIK:
-    """Joints that move a frame of a robot: ``terms.move_frame`` says how far, or whereto; damped least squares make position targets of it.
+    """Joints that move a frame of a robot. ``terms.move_frame`` gives a displacement or a pose, and damped least squares computes
+    position targets.
 
-    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx; dx is the movement, or what is
-    left to an absolute target. They hold for a control step; their
-    actuators must be position servos. J and q are those at the step's start: mjlab and Isaac Lab solve anew in every physics step. A joint
-    whose encoder has a bias is moved from where it is, not from where the encoder shows it.
+    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx; dx is the displacement, or the
+    remaining distance to an absolute target. The targets hold for a control step; the joints' actuators must be position servos. J and q
+    are those at the step's start: mjlab and Isaac Lab solve again in every physics step. Encoder bias is ignored: displacements start at
+    the joint's true position.
 
     Attributes:
         body: The body that is moved, by its frame's origin. Give this or ``site``.
         site: The site that is moved.
         joints: Pattern or patterns of the joints that move it. Each turns or slides about one axis, lies between root and frame and has
             an actuator; it belongs to one declaration.
-        robot: Whose they are.
-        axes: The columns, of :data:`AXES`: along and about the axes of ``frame``. What is not named here is left free. Turns about
+        robot: The robot with this frame and these joints.
+        axes: The columns, from :data:`AXES`: along and about the axes of ``frame``. Directions not named here are left free. Turns about
             several axes are one rotation vector. Where it is ``absolute``: some of x, y, z, and for an orientation qx, qy, qz, qw.
         absolute: Whether an action is the frame's position [m] and orientation (quaternion xyzw, which need not have the length 1; of
             length 0: as it is), not a displacement. Then all columns belong to one action.
         frame: ``"root"``: axes, positions and orientations are those in the frame of the robot's root; ``"world"``: in the world's.
-        position_weight: Of errors along x, y and z [1/m].
-        orientation_weight: Of errors about them [1/rad].
-        damping: Weight of the joints' displacements [1/rad, 1/m]: small steps where the arm is stretched, and less than is wanted.
-        max_step: How far a joint's target is from where the joint is, at most [rad, m].
+        position_weight: Weight of errors along x, y and z [1/m].
+        orientation_weight: Weight of errors about them [1/rad].
+        damping: Weight of the joints' displacements [1/rad, 1/m]: it shortens steps, above all near singular poses such as a stretched arm.
+        max_step: Greatest distance of a joint's target from the joint's position [rad, m].
         posture_weight: Draws joints to their default positions [1/rad, 1/m]; 0: not at all.
-        limit_weight: Draws joints that are beyond their limits back [1/rad, 1/m], so that the others do their part; 0: not at all.
-        soft_factor: Targets, and what ``limit_weight`` minds, are within so much of each joint's range about its middle.
-        from_targets: Whether dq is added to the last targets, not to where the joints are: an arm then holds against its weight, and
-            servos catch up with small steps. An episode begins with targets where the joints are.
+        limit_weight: Draws joints back from beyond their limits [1/rad, 1/m], so that the other joints compensate; 0: not at all.
+        soft_factor: Fraction of each joint's range, about its middle, that bounds targets and the limits of ``limit_weight``.
+        from_targets: Whether dq is added to the last targets, not to the joints' positions: an arm then holds its own weight, and servos
+            catch up with small steps. The targets of a new episode start at the joints' positions.
     """
 
     body: str | None = None
@@ -140,7 +141,7 @@ class DifferentialIK:
         return views[self.robot].find_joints(self.joints)
 
     def said(self, views: Mapping[str, RobotView]) -> str:
-        """What becomes of the columns, in words, with every number."""
+        """How the columns are used, in words, with every number."""
         view = views[self.robot]
         joints = ", ".join(view.joint_names[joint] for joint in self.driven(views))
         names = ("position_weight", "orientation_weight", "damping", "max_step", "posture_weight", "limit_weight")
@@ -154,7 +155,7 @@ class DifferentialIK:
         )
 
     def build(self, context: SensorContext) -> IkSolver:
-        """What moves the frame in these worlds.
+        """The solver that moves the frame in these worlds.
 
         Raises:
             ValueError: As :meth:`rows`.
@@ -229,12 +230,12 @@ class IkSolver:
         self._chain.ranges = self._array(ranges.astype(np.float32), wp.vec2)
 
     def act(self) -> None:
-        """Write the joints' targets, when all actions are written. ``Worlds.update_bodies`` must have been called."""
+        """Write the joints' targets after all actions are written. Call ``Worlds.update_bodies`` first."""
         inputs = [self._worlds.arrays, self._bodies, self._robot, self._chain, self.arrays]
         wp.launch(move_frame, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def advance(self) -> None:
-        """Nothing: it acts before the physics."""
+        """No-op: it acts before the physics."""
 
     def settle(self) -> None:
         """Forget the last targets where an episode begins."""
@@ -243,5 +244,5 @@ class IkSolver:
             wp.launch(begin_targets, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """The last targets, where the next ones are counted from them."""
+        """The last targets, if the next ones are relative to them."""
         return views_of(self._chain, "targets") if self._chain.goes_on else {}

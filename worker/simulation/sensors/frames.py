@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class FrameArrays:
-    """Where bodies or sites are and how they move, one row a world, one column a body or site.
+    """Poses and velocities of bodies or sites, one row per world, one column per body or site.
 
     Attributes:
         positions: Of the origins [m], shape ``(worlds, columns)``.
@@ -70,11 +70,10 @@ class Frames:
     Attributes:
         bodies: Pattern or patterns of the bodies, each a column. Give this or ``sites``.
         sites: Pattern or patterns of the sites, each a column.
-        robot: Whose bodies or sites they are.
-        relative_to: Body in whose frame everything is told, seen by one who moves with it; None: the world's, unless
-            ``relative_to_site`` is given.
-        relative_to_site: The same of a site.
-        reference_robot: Whose body or site that is; None: ``robot``'s.
+        robot: The robot with these bodies or sites.
+        relative_to: Body whose moving frame is the frame of reference; None: the world, unless ``relative_to_site`` is given.
+        relative_to_site: Site whose moving frame is the frame of reference.
+        reference_robot: The robot with that body or site; None: ``robot``.
     """
 
     bodies: str | Sequence[str] | None = None
@@ -117,8 +116,8 @@ class FrameSensor:
     """:class:`Frames` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        places: What is measured.
-        reference: In whose frame.
+        places: The measured frames.
+        reference: The frame of reference.
         context: The worlds.
     """
 
@@ -142,9 +141,9 @@ class FrameSensor:
         wp.launch(_measure, dim=self._shape, inputs=inputs, device=self._device)
 
     def settle(self) -> None:
-        """Measure again: worlds that were placed afresh are elsewhere."""
+        """Measure again, since resets moved some worlds."""
         self.advance()
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Everything measured: what acts before the next physics reads it."""
+        """All measurements: code before the next physics reads them."""
         return views_of(self.arrays, "positions", "rotations", "linear", "angular")

@@ -25,12 +25,12 @@ _BASE = wp.constant(ALIGNMENTS.index("base"))
 _WORLD = wp.constant(ALIGNMENTS.index("world"))
 
 FEW_POINTS = 100_000
-"""More points than these are a mistake in the pattern's resolution."""
+"""Most points of a pattern; more suggest a mistaken resolution."""
 
 
 @wp.struct
 class HeightScanArrays:
-    """The ground under the points of a scan, one row a world; all points of the first frame come first.
+    """The ground under the points of a scan, one row per world; all points of the first frame come first.
 
     Attributes:
         heights: Of the sensor's frame above the ground at each point [m], shape ``(worlds, points)``.
@@ -132,9 +132,9 @@ class RingPattern:
     """Points of a circle around the frame, the first ahead, then to the left.
 
     Attributes:
-        radius: Of the circle [m].
+        radius: Radius of the circle [m].
         count: Number of points on it.
-        center: Whether the frame's own place is a point too, the first.
+        center: Whether the frame's own position is added as the first point.
     """
 
     radius: float
@@ -158,20 +158,20 @@ class RingPattern:
 
 @dataclass(frozen=True)
 class HeightScan:
-    """How high frames on a robot are above the ground around them.
+    """Heights of frames on a robot above the ground around them.
 
-    The heights are looked up in those of the terrain, exactly on the triangles that shapes collide with, which is what vertical rays
-    that see nothing but the ground would hit, at a small part of their cost. Without a terrain the ground is the plane z = 0.
+    Heights are looked up in the terrain, exactly on the triangles that shapes collide with. Vertical rays that see only the ground would
+    give the same, at many times the cost. Without a terrain the ground is the plane z = 0.
 
     Attributes:
         bodies: Pattern or patterns of the bodies, each a frame. Give this or ``sites``.
         sites: Pattern or patterns of the sites, each a frame.
-        robot: Whose bodies or sites they are.
+        robot: The robot with these bodies or sites.
         pattern: Points around each frame.
-        alignment: What the pattern turns with: ``yaw``, with the frame about the vertical alone; ``base``, with the frame in all
-            axes, so that each height is from the tilted pattern straight down; ``world``, with nothing.
-        offset: Place of the sensor's frame in that of the body or site [m].
-        max_distance: Heights are at most this [m].
+        alignment: How the pattern turns: ``yaw``, with the frame about the vertical only; ``base``, with the frame in all axes, so that
+            each height is measured straight down from the tilted pattern; ``world``, not at all.
+        offset: Position of the sensor's frame in the frame of the body or site [m].
+        max_distance: Greatest reported height [m].
     """
 
     bodies: str | Sequence[str] | None = None
@@ -192,8 +192,8 @@ class HeightScan:
         """The sensor of these worlds.
 
         Raises:
-            ValueError: Neither or both of ``bodies`` and ``sites`` are given, a pattern matches nothing, the alignment is none, or the
-                points can't be measured.
+            ValueError: Neither or both of ``bodies`` and ``sites`` are given, a pattern matches nothing, the alignment is unknown, or the
+                pattern is invalid.
         """
         if self.alignment not in ALIGNMENTS:
             raise ValueError(f"HeightScan.alignment is {self.alignment!r}; use one of {', '.join(ALIGNMENTS)}")
@@ -207,12 +207,12 @@ class HeightScanSensor:
     """:class:`HeightScan` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        declaration: What is measured.
+        declaration: The declared scan.
         places: Its frames.
         context: The worlds.
 
     Attributes:
-        names: Of each point: body or site, and its place in the pattern [m].
+        names: Name of each point: body or site, and its position in the pattern [m].
     """
 
     needs_bodies = True
@@ -241,7 +241,7 @@ class HeightScanSensor:
         self._launch(False)
 
     def settle(self) -> None:
-        """Measure the worlds that were placed afresh, which are elsewhere."""
+        """Measure again in worlds that were just reset."""
         self._launch(True)
 
     def _launch(self, fresh_only: bool) -> None:
@@ -253,5 +253,5 @@ class HeightScanSensor:
         )
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Everything measured: what acts before the next physics reads it."""
+        """All measurements: code before the next physics reads them."""
         return views_of(self.arrays, "heights", "points")

@@ -15,12 +15,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class IkArrays:
-    """How a frame shall move in the coming control step, one row a world.
+    """Wanted motion of a frame in the coming control step, one row per world.
 
     Attributes:
         wanted: Displacement along and turn about the axes [m, rad]; where the declaration is ``absolute``, position and orientation
             [m, quaternion xyzw of any length]. Shape ``(worlds, columns)``; a column for each of the declared ``axes``. The joints'
-            targets are computed from it when all actions are written; then it is 0 again.
+            targets are computed from it after all actions are written; then it is reset to 0.
     """
 
     wanted: wp.array2d(dtype=wp.float32)
@@ -28,29 +28,30 @@ class IkArrays:
 
 @wp.struct
 class Chain:
-    """The joints and the frame that they move, and room for the equations; a world comes last, so that threads read side by side.
+    """The joints, the frame that they move, and scratch memory for the equations. The world is the last dimension, for coalesced access.
 
     Attributes:
         body, pose: Column of the frame's body, and the frame in it [m, quaternion xyzw].
-        in_world: Whether the axes are the world's, not the root's.
+        in_world: Whether the axes are those of the world, not of the root.
         absolute: Whether positions and orientations are wanted, not displacements.
         turn: First column of the wanted quaternion, -1 where there is none.
-        rows: Of each equation, its index in ``AXES``, shape ``(equations,)``.
-        columns: Of each equation, the column of ``IkArrays.wanted``, shape ``(equations,)``; of no meaning where a quaternion says it.
-        weights: Of each equation, squared, shape ``(equations,)``.
+        rows: Index of each equation in ``AXES``, shape ``(equations,)``.
+        columns: Column of ``IkArrays.wanted`` for each equation, shape ``(equations,)``; unused for a quaternion.
+        weights: Squared weight of each equation, shape ``(equations,)``.
         children: Columns of the bodies that the joints move, shape ``(joints,)``.
-        slides: 1 of a joint that slides, 0 of one that turns, shape ``(joints,)``.
+        slides: 1 for sliding joints, 0 for hinges, shape ``(joints,)``.
         anchors, axes: Of the joints, in the frames of these bodies [m], shape ``(joints,)``.
         joints: Indices of the joints in ``RobotArrays``, shape ``(joints,)``.
         ranges: Least and greatest target of each joint [m, rad], shape ``(joints,)``.
         damping, posture, limits: Squares of these weights.
-        max_step: How far a joint's target is from the joint, at most [m, rad].
+        max_step: Greatest distance of a joint's target from the joint's position [m, rad].
         errors: Displacement that each equation asks for [m, rad], shape ``(equations, worlds)``.
-        jacobian: Movement along and about the axes for one unit of each joint, shape ``(equations, joints, worlds)``.
-        matrix: Of the normal equations, then its Cholesky factor, shape ``(joints, joints, worlds)``; only the lower triangle is used.
-        steps: Their right side, then the joints' displacements [m, rad], shape ``(joints, worlds)``.
-        goes_on: Whether a step goes on from the last targets.
-        targets: Those [m, rad], shape ``(worlds, joints)``.
+        jacobian: Motion along and about the axes per unit of each joint, shape ``(equations, joints, worlds)``.
+        matrix: Matrix of the normal equations, then its Cholesky factor, shape ``(joints, joints, worlds)``; only the lower triangle is
+            used.
+        steps: Right-hand side, then the joints' displacements [m, rad], shape ``(joints, worlds)``.
+        goes_on: Whether a step starts at the last targets.
+        targets: The last targets [m, rad], shape ``(worlds, joints)``.
     """
 
     body: int

@@ -1,4 +1,4 @@
-"""An inertial measurement unit: what gyro, accelerometer and velocimeter on a body say."""
+"""An inertial measurement unit: gyro, accelerometer and velocimeter on a body."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ImuArrays:
-    """What an inertial measurement unit measured last, one row a world, in its own frame.
+    """Latest measurements of an inertial measurement unit, one row per world, in its own frame.
 
     Attributes:
         gyro: Angular velocity [rad/s], shape ``(worlds,)``.
-        accelerometer: Acceleration less gravity, that of the last physics step [m/s^2], shape ``(worlds,)``; at rest it points up. A
-            world that was placed afresh counts as at rest until its first step.
+        accelerometer: Acceleration minus gravity in the last physics step [m/s^2], shape ``(worlds,)``; at rest it points up. A world
+            that was just reset counts as at rest until its first step.
         velocimeter: Linear velocity [m/s], shape ``(worlds,)``.
         rotations: From its frame to the world's [quaternion xyzw], shape ``(worlds,)``.
     """
@@ -153,9 +153,9 @@ class Imu:
     """Gyro, accelerometer, velocimeter and orientation of a site or body, as MuJoCo's sensors define them.
 
     Attributes:
-        site: The site on which it is. Give this or ``body``.
-        body: The body in whose origin it is.
-        robot: Whose site or body that is.
+        site: The site that carries it. Give this or ``body``.
+        body: The body that carries it, at its origin.
+        robot: The robot with that site or body.
     """
 
     site: str | None = None
@@ -171,8 +171,8 @@ class Imu:
         """The sensor of these worlds.
 
         Raises:
-            ValueError: Neither or both of ``site`` and ``body`` are given, a name matches nothing or several, or what is named is fixed
-                to the world.
+            ValueError: Neither or both of ``site`` and ``body`` are given, a name matches nothing or several, or its body is fixed to the
+                world.
         """
         if (self.site is None) == (self.body is None):
             raise ValueError("Imu: give either site or body, and not both")
@@ -184,7 +184,7 @@ class ImuSensor:
     """An :class:`Imu` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        place: Where it is.
+        place: The frame that carries it.
         context: The worlds.
 
     Raises:
@@ -213,13 +213,13 @@ class ImuSensor:
         wp.launch(_accelerate, dim=self._count, inputs=inputs, device=self._device)
 
     def settle(self) -> None:
-        """Measure the velocities again; worlds that were placed afresh are at rest."""
+        """Measure the velocities again; worlds that were just reset are at rest."""
         self._move()
         inputs = [self._episodes.ages, self._dynamics, self.arrays]
         wp.launch(_rest, dim=self._count, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Everything measured: what acts before the next physics reads it."""
+        """All measurements: code before the next physics reads them."""
         return views_of(self.arrays, "gyro", "accelerometer", "velocimeter", "rotations")
 
     def _move(self) -> None:
@@ -228,7 +228,7 @@ class ImuSensor:
 
 
 def _dynamics(solver: Any, timestep: float) -> _Dynamics:
-    """Views of the solver's own arrays, which stay where they are for ever."""
+    """Views of the solver's own arrays, whose addresses never change."""
     model, data, dynamics = solver.mjw_model, solver.mjw_data, _Dynamics()
     dynamics.timestep, dynamics.gravity = timestep, model.opt.gravity
     for name in ("parentid", "rootid", "jntnum", "dofnum", "dofadr"):
@@ -239,10 +239,10 @@ def _dynamics(solver: Any, timestep: float) -> _Dynamics:
 
 
 def _chain(place: Place, solver: Any) -> list[int]:
-    """The solver's bodies from the root of the tree to that of the place."""
+    """The solver's bodies from the root of the tree to the body of the place."""
     columns = solver.mjc_body_to_newton.numpy()[0].tolist()
     if place.body not in columns[1:]:
-        raise ValueError(f"Imu: {place.name} is fixed to the world, so that it never moves; name one on a moving body")
+        raise ValueError(f"Imu: {place.name} is fixed to the world, so it never moves; name one on a moving body")
     body, chain = columns.index(place.body, 1), []
     while body:
         chain.insert(0, body)

@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class MomentumArrays:
-    """Momenta of the bodies of one robot, one row a world, in the world frame.
+    """Momentum of one robot, one row per world, in the world frame.
 
     Attributes:
         angular: Angular momentum about the common centre of mass [kg m^2/s], shape ``(worlds,)``.
@@ -80,8 +80,8 @@ class AngularMomentum:
     """Angular momentum of a robot about its centre of mass: MuJoCo's ``subtreeangmom``, ``subtreelinvel`` and ``subtreecom``.
 
     Attributes:
-        robot: Whose it is.
-        body: Body from which on outwards the robot counts; None: the whole robot.
+        robot: The robot.
+        body: Root of the subtree that counts; None: the whole robot.
     """
 
     robot: str = "robot"
@@ -98,7 +98,7 @@ class AngularMomentum:
         """The sensor of these worlds.
 
         Raises:
-            ValueError: A name matches nothing, ``body`` matches several bodies, or all of it has no mass.
+            ValueError: A name matches nothing, ``body`` matches several bodies, or the subtree has no mass.
         """
         view = context.view(self.robot, "AngularMomentum.robot")
         if self.body is None:
@@ -112,7 +112,7 @@ class AngularMomentum:
 
 
 def _outwards(root: int, model: newton.Model) -> list[int]:
-    """A body of the first world and all that hang on it, directly or not."""
+    """A body of the first world and all its descendants."""
     parents, children = model.joint_parent.numpy(), model.joint_child.numpy()
     found, new = {root}, {root}
     while new:
@@ -125,8 +125,8 @@ class MomentumSensor:
     """:class:`AngularMomentum` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        name: Of the robot or its part.
-        columns: Of its bodies in ``BodyArrays``.
+        name: Name of the robot or its part.
+        columns: Columns of its bodies in ``BodyArrays``.
         context: The worlds.
 
     Raises:
@@ -143,7 +143,7 @@ class MomentumSensor:
         self._masses = model.body_mass.reshape((self._count, -1))
         self._inertias = model.body_inertia.reshape((self._count, -1))
         if not self._masses.numpy()[:, columns].sum(1).all():
-            raise ValueError(f"AngularMomentum: {name} has no mass, so that there is no centre of mass")
+            raise ValueError(f"AngularMomentum: {name} has no mass, so it has no centre of mass")
         self._columns = wp.array(columns, dtype=wp.int32, device=self._device)
         self.arrays = MomentumArrays()
         for field in ("angular", "velocities", "centers"):
@@ -156,9 +156,9 @@ class MomentumSensor:
         wp.launch(_measure, dim=self._count, inputs=inputs, device=self._device)
 
     def settle(self) -> None:
-        """Measure again: worlds that were placed afresh are elsewhere."""
+        """Measure again, since resets moved some worlds."""
         self.advance()
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Everything measured: what acts before the next physics reads it."""
+        """All measurements: code before the next physics reads them."""
         return views_of(self.arrays, "angular", "velocities", "centers", "masses")

@@ -1,4 +1,4 @@
-"""Bodies and sites as frames on bodies: where they are, and how they move."""
+"""Bodies and sites as frames on bodies, with their poses and velocities."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Place:
     """A frame on a body.
 
     Attributes:
-        name: Of the body or site.
+        name: Name of the body or site.
         body: Column of the body in ``BodyArrays``; -1: the frame is fixed to the world.
-        pose: In the body's frame, or the world's [m, quaternion xyzw].
+        pose: Pose in the frame of the body or the world [m, quaternion xyzw].
     """
 
     name: str
@@ -41,8 +41,8 @@ def find_places(
 
     Args:
         context: The worlds.
-        what: Which sensor asks, for errors.
-        robot: Whose they are.
+        what: Name of the sensor, for errors.
+        robot: Name of the robot.
         bodies: Pattern or patterns of the bodies; give this or ``sites``.
         sites: Pattern or patterns of the sites.
 
@@ -72,18 +72,18 @@ def place_names(
     sites: str | Iterable[str] | None = None,
     geoms: str | Iterable[str] | None = None,
 ) -> list[str]:
-    """The names that patterns match, before there are any worlds.
+    """The names that patterns match, before any worlds exist.
 
     Args:
         views: The robots and objects by name.
-        what: Which sensor asks, for errors.
-        robot: Whose they are.
+        what: Name of the sensor, for errors.
+        robot: Name of the robot.
         bodies: Pattern or patterns of bodies; give one of these three.
-        sites: Of sites.
-        geoms: Of geoms.
+        sites: Pattern or patterns of sites.
+        geoms: Pattern or patterns of geoms.
 
     Raises:
-        ValueError: None or several are given, there is no such robot, or a pattern matches nothing.
+        ValueError: None or several are given, the robot is unknown, or a pattern matches nothing.
     """
     if robot not in views:
         raise ValueError(f"{what}.robot: there is no robot {robot!r}; {nearest(robot, views)}")
@@ -98,7 +98,7 @@ def place_names(
 
 
 def only_one(places: list[Place], what: str) -> Place:
-    """The one place there is. Raises ValueError where a pattern matches several."""
+    """The only place. Raises ValueError where a pattern matches several."""
     if len(places) != 1:
         raise ValueError(f"{what}: name one body or site; the pattern matches {', '.join(p.name for p in places)}")
     return places[0]

@@ -1,4 +1,4 @@
-"""Distances along rays from a frame on a robot: what a laser scanner measures, of all that cameras see."""
+"""Distances along rays from a frame on a robot, as of a laser scanner, to everything that cameras see."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _WORLD = wp.constant(ALIGNMENTS.index("world"))
 
 @wp.struct
 class RayArrays:
-    """What rays hit last: after the last reset, before the last observation. One row a world.
+    """Latest distances, measured after the last reset and before the last observation. One row per world.
 
     Attributes:
-        distances: From where each ray begins to what it hits, at most the declared ``max_distance`` [m], shape ``(worlds, rays)``.
+        distances: Distance from each ray's start to its hit, at most the declared ``max_distance`` [m], shape ``(worlds, rays)``.
         directions: Unit vectors of the rays, in their frame, shape ``(rays,)``.
     """
 
@@ -64,12 +64,12 @@ def _measure(farthest: float, pixels: wp.array3d(dtype=wp.float32), arrays: RayA
 
 @dataclass(frozen=True)
 class LidarPattern:
-    """Rays from one point: ``count`` of them evenly around the frame's z axis, in each of the rows.
+    """Rays from one point: in each row, ``count`` rays spaced evenly around the frame's z axis.
 
     Attributes:
         count: Rays of a row, from right to left; each is in the middle of its part of ``angle``.
-        elevations: Of each row above the frame's x-y plane [rad].
-        angle: How much of the circle a row covers, its middle ahead [rad].
+        elevations: Elevation of each row above the frame's x-y plane [rad].
+        angle: Angle that a row covers, centred straight ahead [rad].
     """
 
     count: int = 32
@@ -101,18 +101,17 @@ class LidarPattern:
 
 @dataclass(frozen=True)
 class RayCaster:
-    """Distances along rays to whatever cameras see: the ground, terrain, objects, and robots, its own too.
+    """Distances along rays to everything that cameras see: the ground, terrain, objects and robots, including its own.
 
     Attributes:
-        body: The body that the rays' frame is on. Give this or ``site``.
-        site: The site that it is on.
-        robot: Whose body or site that is.
+        body: The body that carries the rays' frame. Give this or ``site``.
+        site: The site that carries it.
+        robot: The robot with that body or site.
         pattern: A :class:`LidarPattern`, or the points of a ``GridPattern`` or ``RingPattern``, whose rays all go down.
-        position: Of the rays' frame in that of the body or site [m].
-        alignment: What the frame turns with: ``base``, with the body or site; ``yaw``, with it about the vertical alone; ``world``, with
-            nothing.
-        start: How far from its origin each ray begins, such as outside the robot's own shapes [m].
-        max_distance: Distances are at most this [m].
+        position: Position of the rays' frame in the frame of the body or site [m].
+        alignment: How the frame turns: ``base``, with the body or site; ``yaw``, with it about the vertical only; ``world``, not at all.
+        start: Distance from the origin at which each ray starts, for example to clear the robot's own shapes [m].
+        max_distance: Greatest reported distance [m].
     """
 
     body: str | None = None
@@ -139,10 +138,10 @@ class RayCaster:
         return [str(ray) for ray in range(len(self.rays()[0]))]
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the rays begin [m] and their directions (unit vectors) in their frame, each of shape ``(rays, 3)``.
+        """Origins of the rays [m] and their directions (unit vectors) in their frame, each of shape ``(rays, 3)``.
 
         Raises:
-            ValueError: The pattern has a number that is out of range.
+            ValueError: A number of the pattern is out of range.
         """
         if isinstance(self.pattern, LidarPattern):
             origins, directions = self.pattern.rays()
@@ -171,7 +170,7 @@ class RayCasting:
 
     Args:
         declared: As a task declares it.
-        place: What the rays' frame is on.
+        place: The body or site that carries the rays' frame.
         context: The worlds.
     """
 
@@ -196,7 +195,7 @@ class RayCasting:
         self._pixels = context.array((count, 1, rays), wp.float32)
 
     def advance(self) -> None:
-        """Nothing: rays are cast once a step, after worlds were placed afresh."""
+        """No-op: rays are cast once per step, after resets."""
 
     def settle(self) -> None:
         """Cast the rays of every world."""
@@ -207,5 +206,5 @@ class RayCasting:
         wp.launch(_measure, dim=self.arrays.distances.shape, inputs=inputs, device=device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """What was measured last: rewards of the next step read it."""
+        """The latest distances, which rewards of the next step read."""
         return views_of(self.arrays, "distances")

@@ -1,4 +1,4 @@
-"""Several objects, of which each world has one that counts at present. It measures nothing: a command chooses, terms read."""
+"""Selection of one object out of several, in each world. It measures nothing: a command chooses the object, and terms read the choice."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SelectionArrays:
-    """Objects, and which of them counts in each world.
+    """Objects, and the selected one in each world.
 
     Attributes:
-        chosen: 1 of the object that counts, 0 of the others, shape ``(worlds, objects)``.
+        chosen: 1 for the selected object, 0 for the others, shape ``(worlds, objects)``.
         coordinates: First column of each object's root in ``WorldArrays.joint_q`` (position, quaternion xyzw), shape ``(objects,)``.
         dofs: First column of each object's root in ``WorldArrays.joint_qd`` (linear, angular), shape ``(objects,)``.
     """
@@ -53,7 +53,7 @@ def chosen_one(objects: SelectionArrays, world: int) -> RobotArrays:
 
 @dataclass(frozen=True)
 class ObjectSelection:
-    """Objects of which a command chooses one: ``terms.lift_one_command`` draws it, and ``terms.chosen_object_...`` concern it.
+    """Objects from which a command selects one: ``terms.lift_one_command`` draws it, and ``terms.chosen_object_...`` read it.
 
     Attributes:
         objects: Pattern or patterns of names, as the task's ``objects`` gives them. Their roots are free.
@@ -84,7 +84,7 @@ class Selection:
     """:class:`ObjectSelection` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        names: Of the objects.
+        names: Names of the objects.
         context: The worlds.
     """
 
@@ -99,10 +99,10 @@ class Selection:
             setattr(self.arrays, field, wp.array(columns, dtype=wp.int32, device=context.device))
 
     def advance(self) -> None:
-        """Nothing: there is nothing to measure."""
+        """No-op: nothing is measured."""
 
     def settle(self) -> None:
-        """Nothing: the command of a new episode chooses."""
+        """No-op: the command of a new episode selects the object."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """Which object counts."""

@@ -1,4 +1,4 @@
-"""What every sensor has in common: how it is declared, what it is built from, and when its launches run."""
+"""The interface of all sensors: declaration, construction, and the order of their launches."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SensorContext:
-    """What sensors are built from.
+    """Context from which sensors are built.
 
     Attributes:
-        worlds: Whose physics is measured.
-        views: What of a world belongs to each robot or object, by its name.
-        robots: Where each robot is in the rows of a world, by its name.
+        worlds: The measured worlds.
+        views: View of each robot or object, by name.
+        robots: Columns of each robot in the rows of a world, by name.
         bodies: Poses and velocities of the bodies of all worlds.
-        episodes: The task's buffers; ``ages`` says which worlds were placed afresh.
-        terrain: What the worlds stand on, as the task declares it; None where that is a plane or nothing.
+        episodes: The task's buffers; ``ages`` is 0 in worlds that were just reset.
+        terrain: The terrain that the task declares; None for a plane or no ground.
         control_hz: Control steps per simulated second [Hz].
-        name: What the task's declaration calls the sensor.
+        name: Name of the sensor in the task's declaration.
     """
 
     worlds: Worlds
@@ -44,7 +44,7 @@ class SensorContext:
 
     @property
     def device(self) -> str:
-        """Where all arrays are, ``"cpu"`` or ``"cuda:<n>"``."""
+        """Device of all arrays, ``"cpu"`` or ``"cuda:<n>"``."""
         return str(self.worlds.model.device)
 
     def view(self, name: str, what: str) -> RobotView:
@@ -52,10 +52,10 @@ class SensorContext:
 
         Args:
             name: As in the declaration of the robot.
-            what: Which argument of which sensor named it, for the error.
+            what: Sensor and argument that named it, for the error.
 
         Raises:
-            ValueError: There is none of this name.
+            ValueError: No robot or object has this name.
         """
         if name not in self.views:
             raise ValueError(f"{what}: there is no robot {name!r}; {nearest(name, self.views)}")
@@ -70,9 +70,9 @@ class Sensor(Protocol):
     """Measures all worlds; its methods are launches only, so that they can be captured.
 
     Attributes:
-        arrays: An instance of a Warp struct, one row a world. A term reads it through a parameter of the struct's type.
+        arrays: An instance of a Warp struct, one row per world. A term reads it through a parameter of the struct's type.
         needs_bodies: Whether body poses must be current (``Worlds.update_bodies``) when the methods below are called.
-        names: What its rows are: bodies, geoms, sites.
+        names: Names of its columns: bodies, geoms or sites.
     """
 
     arrays: Any
@@ -83,33 +83,33 @@ class Sensor(Protocol):
         """Measure, after the physics of a control step."""
 
     def settle(self) -> None:
-        """After worlds were placed afresh: those with ``episodes.ages[world] == 0`` forget what was before."""
+        """Called after resets: worlds with ``episodes.ages[world] == 0`` forget their past."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Live views of what the next step reads, by name, each with leading dimension ``worlds``."""
+        """Live views of the state that the next step reads, by name, each with leading dimension ``worlds``."""
 
 
 class Declaration(Protocol):
-    """A sensor as a task declares it: an immutable value without any array.
+    """Declaration of a sensor: an immutable value without arrays.
 
     Attributes:
-        arrays_type: Type of the struct that its ``arrays`` are of.
+        arrays_type: Struct type of its ``arrays``.
     """
 
     arrays_type: ClassVar[Any]
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each column, before there are any worlds.
+        """Name of each column, before any worlds exist.
 
         Raises:
-            ValueError: What it names is not there.
+            ValueError: It names something unknown.
         """
 
     def build(self, context: SensorContext) -> Sensor:
         """The sensor of these worlds.
 
         Raises:
-            ValueError: What it names is not there, or can't be measured.
+            ValueError: It names something unknown, or something that can't be measured.
         """
 
 

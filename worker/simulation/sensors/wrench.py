@@ -1,4 +1,5 @@
-"""Forces and torques from outside on bodies of a robot or object: it measures nothing, but keeps and ends what events apply."""
+"""External forces and torques on bodies of a robot or object. It measures nothing: it keeps the wrenches that events apply, and ends
+them."""
 
 from __future__ import annotations
 
@@ -17,19 +18,19 @@ from worker.simulation.sensors.sensor import SensorContext, views_of
 wp.set_module_options({"enable_backward": False})
 
 LASTING = wp.constant(-1.0)
-"""``WrenchArrays.left`` of what acts until the episode ends."""
+"""``WrenchArrays.left`` of a wrench that lasts until the episode ends."""
 LASTING_FROM_NOW = wp.constant(-2.0)
-"""The same, of what was applied after the last physics: where an episode begins, it is the new one's."""
+"""The same for a wrench applied after the last physics: if an episode just began, the wrench belongs to the new one."""
 
 
 @wp.struct
 class WrenchArrays:
-    """What acts on the bodies from outside, one row a world.
+    """External wrenches on the bodies, one row per world.
 
     Attributes:
         wrenches: Force at a body's centre of mass [N] and torque [N m], in the world frame, shape ``(worlds, bodies of a world)``.
-        bodies: Columns of the bodies that are pushed, shape ``(pushed,)``.
-        left: How long they still act [s], 0 where nothing does, :data:`LASTING` or :data:`LASTING_FROM_NOW`; shape ``(worlds,)``.
+        bodies: Columns of the pushed bodies, shape ``(pushed,)``.
+        left: Remaining duration [s], 0 without a wrench, :data:`LASTING` or :data:`LASTING_FROM_NOW`; shape ``(worlds,)``.
     """
 
     wrenches: wp.array2d(dtype=wp.spatial_vector)
@@ -69,8 +70,8 @@ class ExternalWrench:
     """Forces and torques on bodies, which ``terms.apply_wrench`` and ``terms.apply_impulse`` draw. They end with the episode.
 
     Attributes:
-        bodies: Pattern or patterns of the bodies that are pushed. A body belongs to one declaration.
-        robot: Whose bodies they are.
+        bodies: Pattern or patterns of the pushed bodies. A body belongs to at most one declaration.
+        robot: The robot with these bodies.
     """
 
     bodies: str | Sequence[str]
@@ -82,7 +83,7 @@ class ExternalWrench:
         return place_names(views, "ExternalWrench", self.robot, bodies=self.bodies)
 
     def build(self, context: SensorContext) -> WrenchKeeper:
-        """What keeps the forces of these worlds.
+        """The external wrenches of these worlds.
 
         Raises:
             ValueError: A pattern matches nothing, or another declaration pushes one of the bodies.
@@ -102,8 +103,8 @@ class WrenchKeeper:
     """:class:`ExternalWrench` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
 
     Args:
-        names: Of the bodies.
-        columns: Theirs, among all bodies of a world.
+        names: Names of the bodies.
+        columns: Their columns among all bodies of a world.
         context: The worlds.
     """
 
@@ -118,15 +119,15 @@ class WrenchKeeper:
         self.arrays.left = context.array((self._count,), wp.float32)
 
     def advance(self) -> None:
-        """A control step is over: what has acted long enough ends."""
+        """After a control step: end wrenches whose duration is over."""
         inputs = [1.0 / self._context.control_hz, self.arrays]
         wp.launch(_pass_time, dim=self._count, inputs=inputs, device=self._context.device)
 
     def settle(self) -> None:
-        """What acted in the episode before ends."""
+        """End the wrenches of the previous episode."""
         inputs = [self._context.episodes, self.arrays]
         wp.launch(_end_with_the_episode, dim=self._count, inputs=inputs, device=self._context.device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """What acts in the next physics, and for how long."""
+        """Wrenches for the next physics, and their remaining durations."""
         return views_of(self.arrays, "wrenches", "left")

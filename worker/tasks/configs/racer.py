@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from shared_store.file_fields import kept_file
 from worker.learning.ppo.settings import PPOConfig
 from worker.racer.actions import LIDARS, ActionSpace, action_space, read_metadata
-from worker.racer.hyperparameters import plain_settings
+from worker.racer.hyperparameters import KNOWN, plain_settings
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import MOST_OBJECTS
 from worker.tasks.config import (
@@ -108,6 +108,7 @@ class RacerConfig(TaskConfig):
     """
 
     races: ClassVar[bool] = True
+    hyperparameters: ClassVar[tuple[str, ...]] = tuple(KNOWN)
     other_rewards: ClassVar[Mapping[str, float]] = {"reward": 1.0}
     control_hz: Positive = 15.0
     """Control steps per simulated second [Hz]."""
@@ -139,6 +140,9 @@ class RacerConfig(TaskConfig):
     """Factor on the requested steering, uniform, drawn in every episode."""
     steering_offset: Range = (0.0, 0.0)
     """Offset of the requested steering [rad], uniform, drawn in every episode."""
+    friction: Range = (0.0, 0.0)
+    """Coefficient of friction between tyres and road, uniform, drawn in every episode: the car turns no faster than a lateral
+    acceleration of 9.81 m/s² times this allows; [0, 0]: it never slides."""
     start: Literal["round_robin", "random", "line"] = "round_robin"
     """Start of an episode: ``start_step`` of the track farther than the previous one, anywhere, or at the start line."""
     start_step: Annotated[float, Field(ge=0, le=1)] = 0.05
@@ -192,8 +196,13 @@ class RacerConfig(TaskConfig):
         super().__post_init__()
         for name in FACTORS:
             if getattr(self.randomize, name) != (1.0, 1.0):
-                instead = "use speed_factor, steering_factor and steering_offset"
-                raise Refused(("randomize", name), f"the car moves as a kinematic bicycle, which has none; {instead}")
+                instead = "friction" if name == "friction" else "speed_factor, steering_factor and steering_offset"
+                words = (
+                    f"the car moves as a kinematic bicycle, without an engine's contacts; use train.config.{instead}"
+                )
+                raise Refused(("randomize", name), words)
+        if self.friction != (0.0, 0.0) and self.friction[0] <= 0.0:
+            raise Refused(("friction",), f"expected two numbers above 0, or [0, 0], found {list(self.friction)}")
         if self.randomize.push_interval:
             raise Refused(("randomize", "push_interval"), "nothing can push a car that moves as a kinematic bicycle")
         if not isinstance(self.action_space, str):
@@ -230,6 +239,25 @@ class RacerConfig(TaskConfig):
     def plain_settings(cls, train: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         """As :meth:`TaskConfig.plain_settings`, of DeepRacer's hyperparameters."""
         return plain_settings(train, cls())
+
+    @property
+    def chooses(self) -> bool:
+        """As :attr:`TaskConfig.chooses`; False of an action space in a file, which a node reads."""
+        return not isinstance(self.action_space, str) and bool(self.actions().choices)
+
+    @property
+    def policy_sizes(self) -> Mapping[str, str]:
+        """As :attr:`TaskConfig.policy_sizes`."""
+        if isinstance(self.action_space, str):
+            return {}
+        space = self.actions()
+        lidar = self.lidar_of(space)
+        return {
+            "action_space": f"{len(space.choices)} actions to choose from" if space.choices else "ranges of 2 actions",
+            "waypoints": str(self.waypoints),
+            "lidar": f"one of {lidar.size} numbers" if lidar else "none",
+            "obstacles": "some" if self.obstacles else "none",
+        }
 
     @property
     def tracks(self) -> tuple[str, ...]:
@@ -269,6 +297,13 @@ class RacerPixelsConfig(RacerConfig):
         )
     )
     """How the task is trained: the critic also sees the numbers."""
+
+    @property
+    def policy_sizes(self) -> Mapping[str, str]:
+        """As :attr:`TaskConfig.policy_sizes`."""
+        front = self.front
+        image = f"{front.frames} {front.kind} images of {front.width} x {front.height}"
+        return {**super().policy_sizes, "front": image}
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -1,1 +1,1 @@
-"""Real robots that tasks share: files of other packages, with gains, poses and collisions as those packages set them."""
+"""Real robots shared by tasks: files of other packages, with the gains, poses and collisions of those packages."""

@@ -8,10 +8,10 @@ from worker.tasks.robots.mjlab import action_scale, robot_file, servo
 
 
 def planetary(rotors: tuple[float, float, float], second: float, third: float) -> float:
-    """Inertia of a motor with a gearbox of two planetary stages, seen from the joint [kg m^2].
+    """Inertia of a motor with a gearbox of two planetary stages, reflected to the joint [kg m^2].
 
     Args:
-        rotors: Inertias of the rotor, and of what turns behind the first and the second stage [kg m^2], from Unitree.
+        rotors: Inertias of the rotor and of the parts behind the first and the second stage [kg m^2], from Unitree.
         second: Ratio of the first stage.
         third: Ratio of the second stage.
     """
@@ -22,7 +22,7 @@ ROTOR_5020 = planetary((0.139e-4, 0.017e-4, 0.169e-4), 1.0 + 46.0 / 18.0, 1.0 + 
 ROTOR_7520_14 = planetary((0.489e-4, 0.098e-4, 0.533e-4), 4.5, 1.0 + 48.0 / 22.0)
 ROTOR_7520_22 = planetary((0.489e-4, 0.109e-4, 0.738e-4), 4.5, 5.0)
 ROTOR_4010 = planetary((0.068e-4, 0.0, 0.0), 5.0, 5.0)
-"""Of the motors that Unitree calls by these numbers [kg m^2]."""
+"""Inertias of motors, by Unitree's names [kg m^2]."""
 SERVOS = (
     servo(("*_elbow_joint", "*_shoulder_*_joint", "*_wrist_roll_joint"), ROTOR_5020, 25.0),
     servo(("*_hip_pitch_joint", "*_hip_yaw_joint", "waist_yaw_joint"), ROTOR_7520_14, 88.0),
@@ -33,15 +33,15 @@ SERVOS = (
 )
 """All motors of the robot."""
 ACTION_SCALE = action_scale(SERVOS)
-"""How far an action of 1 moves a joint's target [rad], by pattern of joints."""
+"""Displacement of a joint's target for an action of 1 [rad], by joint pattern."""
 FEET = "*_foot[1-7]_collision"
 """Geoms of the feet."""
 COLLISIONS = Collision("*_collision", condim={FEET: 3, "*": 1}, priority={FEET: 1, "*": 0}, friction={FEET: 0.6})
-"""Everything touches everything, itself as well; only feet have friction."""
+"""All geoms collide, also with the robot itself; only feet have friction."""
 
 
 def g1() -> Robot:
-    """The robot as it stands with bent knees, its pelvis 76 cm high.
+    """The robot, standing with bent knees, its pelvis 76 cm high.
 
     Raises:
         ValueError: The package with its file is not installed.

@@ -9,14 +9,14 @@ from worker.tasks.robots.mjlab import action_scale, robot_file, servo
 ROTOR = 0.000111842
 """Inertia of a motor's rotor about its axis [kg m^2], from Unitree's ``go1.urdf``."""
 GEAR = 6.0
-"""Of hips and thighs; that of the knees is 1.5 times as much."""
+"""Gear ratio of hips and thighs; that of the knees is 1.5 times as much."""
 SERVOS = (
     servo(("*_hip_joint", "*_thigh_joint"), ROTOR * GEAR**2, 23.7),
     servo("*_calf_joint", ROTOR * (1.5 * GEAR) ** 2, 35.55),
 )
 """All motors of the robot."""
 ACTION_SCALE = action_scale(SERVOS)
-"""How far an action of 1 moves a joint's target [rad], by pattern of joints."""
+"""Displacement of a joint's target for an action of 1 [rad], by joint pattern."""
 FEET = "*_foot_collision"
 """Geoms of the feet."""
 COLLISIONS = Collision(
@@ -26,11 +26,11 @@ COLLISIONS = Collision(
     friction={FEET: (1.0, 5e-3, 5e-4)},
     solref=(0.01, 1.0),
 )
-"""Everything touches everything; only feet have friction."""
+"""All geoms collide with other objects; only feet have friction."""
 
 
 def go1() -> Robot:
-    """The robot as it stands, 27.8 cm high.
+    """The standing robot, 27.8 cm high.
 
     Raises:
         ValueError: The package with its file is not installed.

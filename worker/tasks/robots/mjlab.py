@@ -9,17 +9,17 @@ from collections.abc import Mapping, Sequence
 from worker.simulation.actuators import PositionActuator
 
 VERSION = "1.6.0"
-"""The release whose numbers these robots and their tasks have."""
+"""The mjlab release whose numbers these robots and their tasks use."""
 NATURAL_FREQUENCY = 20.0 * math.pi
-"""Of the servos [rad/s]: 10 Hz, mjlab's choice for all robots here."""
+"""Natural frequency of the servos [rad/s]: 10 Hz, mjlab's choice for all robots here."""
 DAMPING_RATIO = 2.0
 """Of the servos."""
 ACTION_SHARE = 0.25
-"""What an action of 1 asks for at rest, as a share of a servo's greatest torque."""
+"""Torque of an action of 1 at rest, as a share of a servo's greatest torque."""
 
 
 def robot_file(inside: str) -> str:
-    """A file of the package, as :class:`worker.simulation.robot.Robot` takes it.
+    """A file of the package, in the form that :class:`worker.simulation.robot.Robot` accepts.
 
     Args:
         inside: Its path in the package.
@@ -30,7 +30,7 @@ def robot_file(inside: str) -> str:
     if importlib.util.find_spec("mjlab") is None:
         raise ValueError(
             "the robot's file is in the Python package mjlab, which is not installed; "
-            f"install it without what it needs itself: pip install --no-deps mjlab=={VERSION}"
+            f"install it without its dependencies: pip install --no-deps mjlab=={VERSION}"
         )
     return f"package:mjlab/{inside}"
 
@@ -42,7 +42,7 @@ def servo(joints: str | Sequence[str], rotor: float, effort: float) -> PositionA
 
     Args:
         joints: Patterns of joints.
-        rotor: Inertia of the rotor, seen from the joint [kg m^2].
+        rotor: Inertia of the rotor, reflected to the joint [kg m^2].
         effort: Greatest torque [N m].
     """
     return PositionActuator(
@@ -55,7 +55,7 @@ def servo(joints: str | Sequence[str], rotor: float, effort: float) -> PositionA
 
 
 def action_scale(servos: Sequence[PositionActuator]) -> Mapping[str, float]:
-    """How far an action of 1 moves the target of each joint [rad], by the patterns of the servos' joints."""
+    """Displacement of each joint's target for an action of 1 [rad], by the patterns of the servos' joints."""
     scales: dict[str, float] = {}
     for each in servos:
         assert isinstance(each.effort_limit, float) and isinstance(each.stiffness, float)

@@ -16,7 +16,7 @@ FILE = "package:mjlab/asset_zoo/robots/i2rt_yam/xmls/yam.xml"
 GRASP = "grasp_site"
 """The site between the fingers' tips."""
 GRIPPER = ("link_6", "?f_rot", "?f_down")
-"""The bodies from the wrist on that touch anything."""
+"""The colliding bodies from the wrist on."""
 FINGERTIPS = ("[lr]f_down[6-9]_collision", "[lr]f_down1[01]_collision")
 """The spheres on the inner sides of the fingers."""
 
@@ -38,7 +38,7 @@ EFFECTIVE_INERTIAS = {
     "joint6": 0.002868,
     "left_finger": 2.781624,
 }
-"""What each actuator moves, seen from its joint [kg m^2, kg]."""
+"""Effective inertia that each actuator moves, at its joint [kg m^2, kg]."""
 
 DAMPING_RATIO = 2.0
 _PI = 3.1415926535  # mjlab's
@@ -52,9 +52,9 @@ LARGE_MOTOR = (0.032, 28.0)
 SMALL_MOTOR = (0.0018, 10.0)
 """DM 4310: the same."""
 CRANK = 0.071 / 2.7
-"""What the gripper's crank makes of an angle of its motor [m/rad]: its stroke over the motor's range."""
+"""Transmission of the gripper's crank [m/rad]: its stroke over the motor's range."""
 GRIPPER_SHARE = 0.1
-"""Share of the greatest force of the gripper that is used, here as on the real arm: the simulation stays stable."""
+"""Usable share of the gripper's greatest force, as on the real arm; it keeps the simulation stable."""
 
 _MOTORS = dict.fromkeys(("joint1", "joint2", "joint3"), LARGE_MOTOR)
 _MOTORS |= dict.fromkeys(("joint4", "joint5", "joint6"), SMALL_MOTOR)
@@ -76,13 +76,13 @@ STIFFNESS = {joint: inertia * frequency(joint) ** 2 for joint, inertia in EFFECT
 DAMPING = {joint: 2.0 * DAMPING_RATIO * inertia * frequency(joint) for joint, inertia in EFFECTIVE_INERTIAS.items()}
 """[N m s/rad, N s/m]"""
 ACTION_SCALE = {joint: 0.25 * EFFORTS[joint] / STIFFNESS[joint] for joint in STIFFNESS}
-"""How far an action of 1 moves a joint's target: a quarter of what its servo needs for the greatest force [rad, m]."""
+"""Displacement of a joint's target for an action of 1: a quarter of the servo's error at the greatest force [rad, m]."""
 
 
 def yam() -> Robot:
-    """The arm on its base at the origin, fixed, its gripper 35 cm above the ground.
+    """The arm on its fixed base at the origin, its gripper 35 cm above the ground.
 
-    Of its geoms those of the gripper collide. The right finger follows the left one, as the file couples them.
+    Only geoms of the gripper collide. The right finger follows the left one, as the file couples them.
     """
     tips = dict.fromkeys(FINGERTIPS, 6) | {"*": 3}
     return Robot(

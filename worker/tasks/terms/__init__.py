@@ -1,8 +1,8 @@
 # ruff: noqa: F401
 """Named terms for declared tasks: small Warp functions for actions, observations, rewards, terminations, commands and events.
 
-A task reaches them as ``terms.NAME``. ``docs/tasks/terms.md`` lists them all, ``docs/tasks/porting.md`` says which of mjlab's and
-Isaac Lab's terms each stands for; ``python -m worker.tasks.terms`` writes both from the docstrings.
+A task uses them as ``terms.NAME``. ``docs/tasks/terms.md`` lists them all, and ``docs/tasks/porting.md`` maps mjlab's and Isaac Lab's
+terms to them; ``python -m worker.tasks.terms`` writes both from the docstrings.
 """
 
 from worker.tasks.terms.actions import (

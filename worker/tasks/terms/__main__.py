@@ -1,4 +1,4 @@
-"""``python -m worker.tasks.terms`` writes the page of all terms; with ``porting`` that of mjlab's and Isaac Lab's names."""
+"""``python -m worker.tasks.terms`` writes the page of all terms; with ``porting``, the page of mjlab's and Isaac Lab's names."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Actions: what they do to the actuators, what a policy sees of them, what their changes cost.
+"""Actions: their effect on the actuators, observations of them, and costs of their changes.
 
-A function that acts is called for one joint with ``value``, offset + scale * action, and writes the input of that joint's actuator;
-or for one column of a ``DifferentialIK``, which moves a frame of the robot and writes the inputs of all its joints. It acts once a control step: the input holds for all its physics steps.
+An action function is called for one joint with ``value``, offset + scale * action, and writes the input of that joint's actuator; or for
+one column of a ``DifferentialIK``, which moves a frame of the robot and writes the inputs of all its joints. It runs once per control
+step, and the input holds for all physics steps.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def aim(worlds: WorldArrays, robot: RobotArrays, world: int, joint: int, target: float):
-    """Let the actuator bring a joint to where its encoder shows ``target`` [m, rad]."""
+    """Write a position target, in the encoder's coordinates, to a joint's actuator [m, rad]."""
     worlds.controls[world, robot.actuators[joint]] = target - robot.encoder_bias[world, joint]
 
 
@@ -34,9 +35,9 @@ def effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, valu
 
 @wp.func
 def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
-    """A share of the greatest force or torque on the joint, ``value`` in [-1, 1]; of one without a limit ``value`` itself [N, N m].
+    """A share of the greatest force or torque on the joint, ``value`` in [-1, 1]; without a limit, ``value`` itself [N, N m].
 
-    It is that of a <motor>: its input is the force over its gear and gain.
+    It is for a <motor>, whose input is the force over its gear and gain.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -48,7 +49,7 @@ def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
 
 @wp.func
 def position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
-    """A position that the joint's encoder is to show: the actuator's target is ``value`` less the encoder's bias [m, rad].
+    """A position target in the encoder's coordinates: the actuator's target is ``value`` minus the encoder's bias [m, rad].
 
     mjlab: JointPositionAction. Isaac Lab: JointPositionAction (without a bias).
     """
@@ -72,7 +73,7 @@ def limited_position_target(
 
 @wp.func
 def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
-    """A step from where the joint is: the target is its position at the control step's start + ``value`` [m, rad].
+    """A relative position target: the joint's position at the control step's start + ``value`` [m, rad].
 
     mjlab: RelativeJointPositionAction (which adds to the position in every physics step). Isaac Lab: RelativeJointPositionAction (as
     mjlab's).
@@ -153,10 +154,10 @@ def two_velocities_target(
 
 @wp.func
 def move_frame(world: int, ik: IkArrays, index: int, value: float):
-    """A movement of a body or site by ``value`` along or about one axis [m, rad], or one number of the pose that it shall have.
+    """A displacement of a body or site by ``value`` along or about one axis [m, rad], or one number of its wanted pose.
 
-    Which of both, and which axes, the ``DifferentialIK`` says; it makes position targets of them, once a control step. A movement
-    begins where the body or site is at the control step's start; a pose is a position [m] and a quaternion xyzw.
+    The ``DifferentialIK`` decides which of both and which axes, and computes position targets once per control step. A displacement
+    starts at the pose at the control step's start; a pose is a position [m] and a quaternion xyzw.
 
     mjlab: DifferentialIKAction (which solves in every physics step, and takes quaternions wxyz).
     Isaac Lab: DifferentialInverseKinematicsAction (which solves in every physics step, and takes quaternions wxyz).
@@ -166,7 +167,7 @@ def move_frame(world: int, ik: IkArrays, index: int, value: float):
 
 @wp.func
 def last_action(world: int, episodes: EpisodeArrays, action: int) -> float:
-    """The action that led to what is observed, as the policy asked for it; 0 after a reset.
+    """The action that led to this observation, unclipped; 0 after a reset.
 
     mjlab: last_action. Isaac Lab: last_action.
     """
@@ -175,7 +176,7 @@ def last_action(world: int, episodes: EpisodeArrays, action: int) -> float:
 
 @wp.func
 def clipped_last_action(world: int, episodes: EpisodeArrays, action: int, limit: float = 1.0) -> float:
-    """The action that led to what is observed, within ``limit`` of 0, beyond which the robot felt nothing of it; 0 after a reset.
+    """The action that led to this observation, clipped to +- ``limit``, beyond which it had no effect on the robot; 0 after a reset.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -202,7 +203,7 @@ def action_magnitude(world: int, episodes: EpisodeArrays, action: int) -> float:
 
 @wp.func
 def action_excess(world: int, episodes: EpisodeArrays, action: int, limit: float = 1.0) -> float:
-    """How far an action is beyond ``limit`` on either side, where clipping hides what the policy asks for.
+    """Distance of an action beyond ``limit`` on either side, where clipping hides the policy's output.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -211,7 +212,7 @@ def action_excess(world: int, episodes: EpisodeArrays, action: int, limit: float
 
 @wp.func
 def action_rate_squared(world: int, episodes: EpisodeArrays, action: int) -> float:
-    """Square of an action less the one of the step before, as the policy asked for them.
+    """Square of the change of an action since the previous step, both unclipped.
 
     mjlab: action_rate_l2. Isaac Lab: action_rate_l2.
     """
@@ -221,7 +222,7 @@ def action_rate_squared(world: int, episodes: EpisodeArrays, action: int) -> flo
 
 @wp.func
 def action_acceleration(world: int, episodes: EpisodeArrays, action: int) -> float:
-    """a - 2 b + c of an action, the one of the step before and the one before that.
+    """a - 2 b + c, with an action a, the previous one b and the one before that c.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -231,7 +232,7 @@ def action_acceleration(world: int, episodes: EpisodeArrays, action: int) -> flo
 
 @wp.func
 def action_acceleration_squared(world: int, episodes: EpisodeArrays, action: int) -> float:
-    """Square of a - 2 b + c, an action, the one before and the one before that.
+    """Square of a - 2 b + c, with an action a, the previous one b and the one before that c.
 
     mjlab: action_acc_l2. Isaac Lab: -.
     """
@@ -241,7 +242,7 @@ def action_acceleration_squared(world: int, episodes: EpisodeArrays, action: int
 
 @wp.func
 def mean_action_acceleration(world: int, episodes: EpisodeArrays, action: int) -> float:
-    """|a - 2 b + c| over the number of actions: summed over all, the mean of how much each action jerks.
+    """|a - 2 b + c| over the number of actions: summed over all actions, their mean jerk.
 
     mjlab: mean_action_acc. Isaac Lab: -.
     """

@@ -1,7 +1,7 @@
 """Single bodies of a robot: poses, velocities, heights.
 
-Each function is called for one body; rewards are summed over the bodies of the term. Velocities are those of the origin of the
-body's frame unless a name says that they are of the centre of mass.
+Each function is called for one body; rewards are summed over the bodies of the term. Velocities are those of the origin of the body's
+frame, unless the name says centre of mass.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def body_speed_squared(world: int, bodies: BodyArrays, body: int) -> float:
 
 @wp.func
 def body_height_error_squared(world: int, bodies: BodyArrays, body: int, target: float) -> float:
-    """Square of the height of a body's origin less ``target`` [m^2].
+    """Square of the height of a body's origin minus ``target`` [m^2].
 
     mjlab: -. Isaac Lab: -.
     """

@@ -1,4 +1,4 @@
-"""All terms with their parameters and meanings, as tables, and what mjlab and Isaac Lab call them: read from signatures and docstrings."""
+"""Tables of all terms, with parameters, meanings, and names in mjlab and Isaac Lab, read from signatures and docstrings."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ GROUPS = (
 )
 """Modules of terms, in the order of the page."""
 FILLED = ("world", "stream", "value", "terminated", "seconds")
-"""Parameters that a task fills by itself, which a declaration says nothing of."""
+"""Parameters that the task fills, not the declaration."""
 SHARED = ("WorldArrays", "EpisodeArrays", "BodyArrays", "TerrainArrays")
-"""Structs of which a task has one."""
+"""Structs of which a task has exactly one."""
 _NAMES = re.compile(r"^ *mjlab: (.*?)\.\s+Isaac Lab: (.*)\.$", re.DOTALL | re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A term as its docstring and signature tell it.
+    """A term, read from its docstring and signature.
 
     Attributes:
-        name: As in ``terms.NAME``.
-        group: Its module.
-        given: What a declaration gives it: parameters and their types, with the defaults.
-        returns: Type of its result, empty where there is none.
-        meaning: Formula, unit and what the numbers mean, in Markdown.
-        mjlab: What mjlab calls it, ``-`` if nothing there is the same.
-        isaac_lab: What Isaac Lab calls it.
+        name: Name, as in ``terms.NAME``.
+        group: Name of its module.
+        given: Parameters from the declaration, with types and defaults.
+        returns: Type of its result; empty without one.
+        meaning: Formula, unit and meaning of the numbers, in Markdown.
+        mjlab: Its name in mjlab, ``-`` without an equivalent.
+        isaac_lab: Its name in Isaac Lab, ``-`` without an equivalent.
     """
 
     name: str
@@ -76,7 +76,7 @@ def entries() -> Iterator[Entry]:
 def _entry(name: str, group: str, function: Any) -> Entry | None:
     text = inspect.getdoc(function.func) or ""
     names = _NAMES.search(text)
-    if names is None:  # a function that terms share
+    if names is None:  # a function shared by terms
         return None
     meaning = re.sub(r":func:`(\w+)`", r"``\1``", text[: names.start()].strip()).replace("``", "`")
     mjlab, isaac_lab = (" ".join(each.split()) for each in names.groups())
@@ -92,7 +92,7 @@ def _kind(annotation: Any) -> str:
 
 
 def _shown(parameter: inspect.Parameter) -> str:
-    """A parameter as the declaration gives it, empty where the task fills it."""
+    """A parameter as a declaration gives it; empty if the task fills it."""
     name, kind = parameter.name, _kind(parameter.annotation)
     if name in FILLED or kind in SHARED:
         return ""
@@ -121,14 +121,15 @@ REFERENCE = """\
 # Terms
 
 The functions of `worker.tasks.terms`. A declared task names them, such as
-`Reward(terms.joint_velocity_squared, joints="*_knee")`; [porting.md](porting.md) says which of mjlab's and Isaac Lab's
-terms each stands for. This page is written by `python -m worker.tasks.terms` from the functions' docstrings.
+`Reward(terms.joint_velocity_squared, joints="*_knee")`; [porting.md](porting.md) maps mjlab's and Isaac Lab's terms to
+them. `python -m worker.tasks.terms` writes this page from the functions' docstrings.
 
-- **Given** is what a declaration says: `joints`, `bodies`, `sites` are patterns, and the function is called for each that fits;
-  `size` is how often it is called, with `index` from 0, by default for each column of its sensor; `command` names a command.
-  A parameter with a type of `...Arrays` is given by the name of a sensor or, for `RobotArrays`, of a robot or
-  object; one that fits alone needs no name. All others are numbers in the unit that the meaning says; those with `=` have a default.
-- `robot=` names the robot or object that a function is about, `"robot"` by default.
+- **Given** lists the parameters from the declaration: `joints`, `bodies`, `sites` are patterns, and the function is
+  called for each match; `size` is the number of calls, with `index` from 0, by default one for each column of its
+  sensor; `command` names a command. A parameter of a type `...Arrays` takes the name of a sensor or, for `RobotArrays`,
+  of a robot or object; it may be omitted if only one fits. All others are numbers in the unit that the meaning gives;
+  those with `=` have a default.
+- `robot=` names the robot or object that a function applies to, `"robot"` by default.
 - A function that is called for several elements gives the sum over them as a reward or metric, one column after the other as
   an observation, and ends an episode if it is true for any.
 - Quaternions are xyzw. All units are SI: a policy's scales are in the declaration, not here.
@@ -137,15 +138,15 @@ terms each stands for. This page is written by `python -m worker.tasks.terms` fr
 PORTING = """\
 # Term names of mjlab and Isaac Lab
 
-What each term of mjlab 1.6 and Isaac Lab is called in `worker.tasks.terms`; [terms.md](terms.md) says what it means and what it is
-given, and [ports.md](ports.md) shows a whole task of each beside ours. This page is written by
-`python -m worker.tasks.terms porting` from the functions' docstrings. What randomises physics, mjlab's `dr.*`, is no term here but a
+The names in `worker.tasks.terms` of the terms of mjlab 1.6 and Isaac Lab. [terms.md](terms.md) gives their meanings and
+parameters, and [ports.md](ports.md) compares a whole task of each with ours. `python -m worker.tasks.terms porting`
+writes this page from the functions' docstrings. Randomisation of physics, mjlab's `dr.*`, is not a term here but a
 `Randomize`: [randomization.md](randomization.md). Three differences hold everywhere:
 
 - Quaternions are xyzw here, and wxyz there.
 - A function for one joint, body or foot gives one number, and rewards are summed over them: mjlab's `joint_vel_l2` is
   `joint_velocity_squared` of all joints.
-- Isaac Lab takes velocities of the centre of mass where mjlab takes those of the frame's origin: the table names the term that is the same.
+- Isaac Lab uses velocities of the centre of mass where mjlab uses those of the frame's origin; the table names the exact equivalent.
 """
 
 
@@ -162,7 +163,7 @@ def reference() -> str:
 
 
 def porting() -> str:
-    """The page of mjlab's and Isaac Lab's names, each sorted by theirs."""
+    """The page of mjlab's and Isaac Lab's names, each sorted by their names."""
     parts = [PORTING]
     for title, field in (("mjlab", "mjlab"), ("Isaac Lab", "isaac_lab")):
         rows = []
@@ -171,7 +172,7 @@ def porting() -> str:
                 name, _, note = theirs.partition(" ")
                 rows.append((name, f"| `{name}` | `{entry.name}` | {_cell(note.strip('()'))} |"))
         rows.sort(key=lambda row: row[0].lower())
-        table = ["| theirs | ours | where they differ, whose it is |", "|---|---|---|", *(row for _, row in rows)]
+        table = ["| theirs | ours | differences, owner |", "|---|---|---|", *(row for _, row in rows)]
         parts.append(f"## {title}\n\n" + "\n".join(table) + "\n")
     return "\n".join(parts)
 

@@ -1,7 +1,7 @@
-"""Commands: what a policy is asked to do, how it is drawn, how it follows the robot, how the policy sees it.
+"""Commands: draws, updates in every step, and observations of them.
 
-A function that draws a command is called when an episode begins and when the command's time is over, and writes its numbers into
-``episodes.memory`` from the column ``command`` on. One that steers is the command's ``update``, called in every step.
+A drawing function is called when an episode begins and when the command's time is up. It writes the numbers into ``episodes.memory`` from
+the column ``command`` on. A steering function is the command's ``update``, called in every step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FOLLOWS_HEADING = wp.constant(4)
 STANDS = wp.constant(5)
 IN_WORLD = wp.constant(6)
 WORLD_VELOCITY = wp.constant(7)
-"""Hidden columns of :func:`heading_velocity_command`, the last the first of two, counted from the command's first."""
+"""Hidden columns of :func:`heading_velocity_command`, counted from the command's first; the last is the first of two."""
 TARGET = wp.constant(3)
 """First of three hidden columns of :func:`planar_pose_command`, counted from the command's first."""
 
@@ -92,9 +92,9 @@ def moving_velocity_command(
     moving_share: float,
     standing_share: float = 0.0,
 ):
-    """Draw velocities as :func:`velocity_command`, and let ``moving_share`` of all episodes begin with them; 3 numbers.
+    """Draw velocities as :func:`velocity_command`, and start ``moving_share`` of all episodes at these velocities; 3 numbers.
 
-    There the root's origin has the commanded velocity and the root the commanded turn, in its own frame.
+    In those the root's origin starts with the commanded velocity and the root with the commanded turning velocity, in its own frame.
 
     mjlab: UniformVelocityCommand (init_velocity_prob). Isaac Lab: -.
     """
@@ -127,9 +127,9 @@ def heading_velocity_command(
 ):
     """Draw velocities as :func:`velocity_command`, and a heading in the world [rad]; 3 numbers and 6 hidden ones.
 
-    Give it ``update=Term(terms.steer_velocity_command, ...)``: for ``heading_share`` of all commands that turns the robot to its
-    heading, and for ``world_share`` it keeps the direction fixed in the world. Standing, these two and going straight ahead are drawn
-    independently of one another; ``standing_share`` comes before all.
+    Declare it with ``update=Term(terms.steer_velocity_command, ...)``, which turns the robot to its heading in ``heading_share`` of all
+    commands, and keeps the direction fixed in the world in ``world_share``. Standing, these two and going straight ahead are drawn
+    independently; standing overrides the others.
 
     mjlab: UniformVelocityCommand. Isaac Lab: UniformVelocityCommand.
     """
@@ -198,7 +198,7 @@ def number_command(world: int, episodes: EpisodeArrays, command: int, stream: wp
 def position_command(
     world: int, episodes: EpisodeArrays, command: int, stream: wp.uint32, x: wp.vec2, y: wp.vec2, z: wp.vec2
 ):
-    """Draw a point evenly from a box [m]; 3 numbers. Which frame it is in is up to the terms that read it.
+    """Draw a point evenly from a box [m]; 3 numbers. The terms that read it define its frame.
 
     mjlab: LiftingCommand (the target alone, in the world frame). Isaac Lab: UniformPoseCommand (the position alone).
     """
@@ -224,7 +224,7 @@ def lift_command(
     object_z: wp.vec2,
     object_yaw: wp.vec2,
 ):
-    """Draw a target in the world frame [m], and put the object down at rest elsewhere [m, rad]; 3 numbers.
+    """Draw a target in the world frame [m], and place the object at rest elsewhere [m, rad]; 3 numbers.
 
     ``robot=`` names the object, whose root is free; its ranges are in the world frame.
 
@@ -288,8 +288,8 @@ def planar_pose_command(
 ):
     """Draw a place on the ground around the robot's start [m] and a heading there [rad]; 3 numbers and 3 hidden ones.
 
-    The numbers are forward and left to the place [m] and left to the heading [rad], as the robot stands now. Give it
-    ``update=Term(terms.steer_planar_pose_command)``, which calculates them again in every step.
+    The numbers are the distances forward and left to the place [m] and the left turn to the heading [rad], from the robot's present pose.
+    Declare it with ``update=Term(terms.steer_planar_pose_command)``, which recomputes them in every step.
 
     mjlab: -. Isaac Lab: UniformPose2dCommand.
     """
@@ -305,7 +305,7 @@ def planar_pose_command(
 def steer_planar_pose_command(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, command: int
 ):
-    """Tell the place and heading of :func:`planar_pose_command` as the robot sees them now: forward, left [m], to turn left [rad].
+    """Recompute place and heading of :func:`planar_pose_command` in the robot's present frame: forward, left [m], left turn [rad].
 
     mjlab: -. Isaac Lab: UniformPose2dCommand.
     """
@@ -321,7 +321,7 @@ def steer_planar_pose_command(
 @needs(numbers=True)
 @wp.func
 def command_number(world: int, episodes: EpisodeArrays, command: int, index: int) -> float:
-    """Number ``index`` of a command, by default of all that the policy is told [unit of the command].
+    """Number ``index`` of a command, by default each number that the policy observes [unit of the command].
 
     mjlab: generated_commands. Isaac Lab: generated_commands.
     """
@@ -358,7 +358,7 @@ def command_rotation(world: int, episodes: EpisodeArrays, command: int) -> wp.qu
 @needs(command=3)
 @wp.func
 def command_speed(world: int, episodes: EpisodeArrays, command: int) -> float:
-    """How much a velocity command asks for: speed [m/s] + magnitude of the turning velocity [rad/s].
+    """Magnitude of a velocity command: speed [m/s] + magnitude of the turning velocity [rad/s].
 
     mjlab: total_command (inside of its rewards). Isaac Lab: -.
     """

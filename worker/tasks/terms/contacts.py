@@ -1,8 +1,8 @@
-"""Contacts: what a contact sensor measured, and rewards of feet.
+"""Contacts: measurements of a contact sensor, and rewards of feet.
 
-Each function is called with ``index``, a column of the sensor, by default each. Where it takes frames as well, column
-``index`` of both sensors must be the same foot: name feet in the same order in both. A term with a velocity command counts only
-while the command asks for more than its ``threshold``, speed [m/s] + turning velocity [rad/s].
+Each function is called with ``index``, a column of the sensor, by default for every column. If it takes frames too, column
+``index`` of both sensors must be the same foot: name feet in the same order in both. A term with a velocity command is 0 unless the
+command exceeds its ``threshold``, speed [m/s] + turning velocity [rad/s].
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def contact_force(world: int, contacts: ContactArrays, index: int) -> wp.vec3:
 
 @wp.func
 def contact_force_logarithm(world: int, contacts: ContactArrays, index: int) -> wp.vec3:
-    """sign(f) log(1 + |f|) of each part of the contact force f in the world frame [N]: small forces and blows on one scale.
+    """sign(f) log(1 + |f|) of each component of the contact force f in the world frame [N]: small forces and impacts on one scale.
 
     mjlab: foot_contact_forces. Isaac Lab: -.
     """
@@ -73,7 +73,7 @@ def contact_strength(world: int, contacts: ContactArrays, index: int) -> float:
 
 @wp.func
 def air_time(world: int, contacts: ContactArrays, index: int) -> float:
-    """For how long there has been no contact, 0 while there is one [s].
+    """Time since contact was lost, 0 during contact [s].
 
     mjlab: foot_air_time. Isaac Lab: current_air_time (of a contact sensor's data).
     """
@@ -82,7 +82,7 @@ def air_time(world: int, contacts: ContactArrays, index: int) -> float:
 
 @wp.func
 def contact_time(world: int, contacts: ContactArrays, index: int) -> float:
-    """For how long there has been a contact, 0 while there is none [s].
+    """Time since contact began, 0 without contact [s].
 
     mjlab: current_contact_time (of a contact sensor's data). Isaac Lab: current_contact_time (of a contact sensor's data).
     """
@@ -91,7 +91,7 @@ def contact_time(world: int, contacts: ContactArrays, index: int) -> float:
 
 @wp.func
 def touchdown(world: int, contacts: ContactArrays, index: int) -> float:
-    """1 in the control step in which contact came, else 0.
+    """1 in the control step in which contact began, else 0.
 
     mjlab: compute_first_contact (of a contact sensor). Isaac Lab: compute_first_contact (of a contact sensor).
     """
@@ -147,7 +147,7 @@ def step_time(
     target: float,
     threshold: float = 0.1,
 ) -> float:
-    """At touchdown, how much longer than ``target`` the foot was in the air, negative where it was shorter [s], else 0.
+    """At touchdown, the foot's air time minus ``target`` [s], else 0.
 
     It counts while the command's planar speed is above ``threshold`` [m/s].
 
@@ -325,7 +325,7 @@ def contact_count(world: int, contacts: ContactArrays, index: int) -> float:
 
 @wp.func
 def hard_contact_steps(world: int, contacts: ContactArrays, force: float = 10.0) -> float:
-    """In how many physics steps of the last control step a contact of any column was stronger than ``force`` [N].
+    """Number of physics steps of the last control step in which a contact of any column was stronger than ``force`` [N].
 
     mjlab: self_collision_cost. Isaac Lab: -.
     """
@@ -341,7 +341,7 @@ def hard_contact_steps(world: int, contacts: ContactArrays, force: float = 10.0)
 
 @wp.func
 def column_hard_contact_steps(world: int, contacts: ContactArrays, index: int, force: float = 10.0) -> float:
-    """In how many physics steps of the last control step a contact of this column was stronger than ``force`` [N].
+    """Number of physics steps of the last control step in which a contact of this column was stronger than ``force`` [N].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -371,7 +371,7 @@ def no_contact(world: int, contacts: ContactArrays, force: float = 1.0) -> float
 
 @wp.func
 def contact_force_excess(world: int, contacts: ContactArrays, index: int, force: float) -> float:
-    """How far the greatest net contact force within the last control step is above ``force`` [N].
+    """Excess of the greatest net contact force within the last control step over ``force`` [N].
 
     mjlab: -. Isaac Lab: contact_forces.
     """

@@ -1,4 +1,4 @@
-"""The episode itself: its clock, whether it ended, how hard it is."""
+"""The episode itself: its clock, its end and its difficulty."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def alive(world: int, terminated: bool) -> float:
 
 @wp.func
 def ended(world: int, terminated: bool) -> float:
-    """1 in a step in which a termination ends the episode, else 0; its clock is none.
+    """1 in a step in which a termination ends the episode, else 0; the clock is not a termination.
 
     mjlab: is_terminated. Isaac Lab: is_terminated.
     """
@@ -39,7 +39,7 @@ def elapsed(world: int, episodes: EpisodeArrays, seconds: float) -> float:
 
 @wp.func
 def time_left(world: int, episodes: EpisodeArrays, seconds: float, limit: float) -> float:
-    """Time that is left of ``limit``, the episode's length [s].
+    """Remaining time of the episode, whose length is ``limit`` [s].
 
     mjlab: -. Isaac Lab: remaining_time_s.
     """
@@ -48,7 +48,7 @@ def time_left(world: int, episodes: EpisodeArrays, seconds: float, limit: float)
 
 @wp.func
 def gait_clock(world: int, episodes: EpisodeArrays, seconds: float, period: float) -> wp.vec2:
-    """Sine and cosine of a phase that turns once in ``period`` [s], 0 when the episode begins.
+    """Sine and cosine of a phase with this ``period`` [s], 0 when the episode begins.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -58,7 +58,7 @@ def gait_clock(world: int, episodes: EpisodeArrays, seconds: float, period: floa
 
 @wp.func
 def level(world: int, episodes: EpisodeArrays) -> float:
-    """How hard the task is now, from 0 to 1, as its curriculum says.
+    """Present difficulty of the task from its curriculum, from 0 to 1.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -82,7 +82,7 @@ def not_finite(world: int, worlds: WorldArrays) -> bool:
 
 @wp.func
 def older_than(world: int, episodes: EpisodeArrays, seconds: float, limit: float) -> bool:
-    """Whether the episode has lasted ``limit`` [s] with the step that ends now; the task's own clock needs no term.
+    """Whether the episode has lasted ``limit`` [s], including the present step; the task's own clock needs no term.
 
     mjlab: time_out. Isaac Lab: time_out.
     """

@@ -1,4 +1,4 @@
-"""Events: how a world is placed afresh, pushes, and what a robot gets for life."""
+"""Events: resets of a world, pushes, and properties drawn once at startup."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def reset_root_any_way_up(
     y: wp.vec2 = NONE,
     z: wp.vec2 = NONE,
 ):
-    """Place a free root at its start + offsets [m], turned in any way, all rotations alike, at rest.
+    """Place a free root at rest at its start + offsets [m], with a uniformly random rotation.
 
     mjlab: -. Isaac Lab: reset_root_state_with_random_orientation.
     """
@@ -76,7 +76,7 @@ def reset_root_any_way_up(
 
 @wp.func
 def reset_to_default(world: int, worlds: WorldArrays, robot: RobotArrays, bodies: BodyArrays):
-    """Put a robot or object where it is declared, its joints at their default positions, all at rest.
+    """Put a robot or object at its declared pose, with its joints at their default positions, all at rest.
 
     mjlab: reset_scene_to_default. Isaac Lab: reset_scene_to_default.
     """
@@ -155,7 +155,7 @@ def reset_joints_between_limits(
     soft_factor: float = 1.0,
     velocity: wp.vec2 = NONE,
 ):
-    """Put a joint anywhere within ``soft_factor`` times its range about its middle; one without limits at its default.
+    """Put a joint uniformly within ``soft_factor`` times its range about its middle; a joint without limits goes to its default.
 
     mjlab: -. Isaac Lab: reset_joints_within_limits_range (with scale).
     """
@@ -209,10 +209,10 @@ def _draw_wrenches(world: int, wrench: WrenchArrays, stream: wp.uint32, force: w
 
 @wp.func
 def apply_wrench(world: int, wrench: WrenchArrays, stream: wp.uint32, force: wp.vec2 = NONE, torque: wp.vec2 = NONE):
-    """Pull at each body of an ``ExternalWrench`` from now to the end of the episode, as wind or a load does.
+    """Apply a wrench to each body of an ``ExternalWrench`` until the end of the episode, like wind or a load.
 
     Each component of the force at its centre of mass [N] and of the torque [N m], in the world frame, is drawn evenly from its range.
-    What acted before ends.
+    It replaces earlier wrenches.
 
     mjlab: apply_external_force_torque. Isaac Lab: apply_external_force_torque.
     """
@@ -229,10 +229,10 @@ def apply_impulse(
     force: wp.vec2 = NONE,
     torque: wp.vec2 = NONE,
 ):
-    """Pull at each body of an ``ExternalWrench`` for some time, drawn from ``duration`` [s], as a bump or a gust does.
+    """Apply a wrench to each body of an ``ExternalWrench`` for a time drawn from ``duration`` [s], like a bump or a gust.
 
     Each component of the force at its centre of mass [N] and of the torque [N m], in the world frame, is drawn evenly from its range.
-    Give it to an interval longer than ``duration``.
+    Use it at intervals longer than ``duration``.
 
     mjlab: apply_body_impulse (whose cooldown_s begins when an impulse is over). Isaac Lab: -.
     """

@@ -1,7 +1,7 @@
-"""Tracking, judged: rewards, ends and metrics of a robot that follows a recorded motion.
+"""Tracking rewards: rewards, terminations and metrics for a robot that follows a recorded motion.
 
-As for the terms of tracking, ``command`` is the one that :func:`motion_command` draws. A mean is that over all bodies or joints of
-the motion: to judge some bodies alone, declare the motion a second time with these.
+As in :mod:`worker.tasks.terms.tracking`, :func:`motion_command` draws the ``command``. Means are over all bodies or joints of the motion;
+to judge only some bodies, declare the motion a second time with these.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def anchor_way(episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, world: int, command: int) -> wp.vec3:
-    """Way from the robot's anchor to the motion's, in the world frame [m]."""
+    """Vector from the robot's anchor to the motion's, in the world frame [m]."""
     wanted = wp.transform_get_translation(wanted_anchor(motion, frame_of(episodes, motion, world, command)))
     return wanted - wp.transform_get_translation(anchor_pose(bodies, motion, world))
 
@@ -35,7 +35,7 @@ def anchor_way(episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays
 def body_way(
     episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, world: int, index: int, command: int
 ) -> wp.vec3:
-    """Way from a body to its relative reference, in the world frame [m]."""
+    """Vector from a body to its relative reference, in the world frame [m]."""
     frame = frame_of(episodes, motion, world, command)
     wanted = relative_reference(bodies, motion, world, frame, index)
     return wp.transform_get_translation(wanted) - body_position_of(bodies, world, motion.bodies[index])
@@ -238,7 +238,7 @@ def followed_body_height_off(
 def mean_body_distance(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, command: int
 ) -> float:
-    """Mean distance of the bodies from where the motion has them in the world [m].
+    """Mean distance of the bodies from their positions in the motion, in the world frame [m].
 
     mjlab: compute_mpkpe. Isaac Lab: -.
     """

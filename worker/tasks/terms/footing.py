@@ -1,8 +1,8 @@
-"""Footing: feet and bodies above the ground that a scan saw around them, as mjlab measures it.
+"""Footing: feet and bodies above the scanned ground around them, measured as in mjlab.
 
-A term with ``scan`` reads a :class:`worker.simulation.sensors.height_scan.HeightScan`, with or without a terrain. Of one around feet,
-``points`` is how many points it has for each foot; column ``index`` of every sensor of a term must be the same foot. A term with a
-velocity command counts only while the command asks for more than its ``threshold``, speed [m/s] + turning velocity [rad/s].
+A term with ``scan`` reads a :class:`worker.simulation.sensors.height_scan.HeightScan`, with or without a terrain. In a scan around feet,
+``points`` is the number of points of each foot; column ``index`` of every sensor of a term must be the same foot. A term with a velocity
+command is 0 unless the command exceeds its ``threshold``, speed [m/s] + turning velocity [rad/s].
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from worker.tasks.terms.contacts import planar_speed, swing_error
 wp.set_module_options({"enable_backward": False})
 
 _PLANE = wp.constant(0.1)
-"""Points are near a plane where their least variance is below this times the next."""
+"""Points are near a plane if their least variance is below this times the next."""
 _LINE = wp.constant(1.0e-6)
-"""Points are on a line where their second variance is not above this times the greatest."""
+"""Points are on a line if their second variance is not above this times the greatest."""
 
 
 @needs(points="points")

@@ -1,4 +1,4 @@
-"""Which frames of a motion episodes begin with: more of those behind which robots fall."""
+"""Start frames of episodes in a motion, chosen more often before parts in which robots fall."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from worker.tasks.terms.placing import between
 wp.set_module_options({"enable_backward": False})
 
 _SCALE = wp.constant(1.0e9)
-"""Failures are added up as whole numbers of this fraction, so that the sum does not depend on the order."""
+"""Failures are summed as integer multiples of this fraction, so that the sum does not depend on the order."""
 _UNIT = wp.constant(wp.vec2(0.0, 1.0))
 
 
 @wp.struct
 class SamplingArrays:
-    """How often worlds failed in which part of a motion.
+    """Failures of worlds in each part of a motion.
 
     Attributes:
-        frames: At which each world is, shape ``(worlds,)``.
-        failed: In which part a world has just failed, else -1; shape ``(worlds,)``.
-        failures: Failures of each world in each part, older ones for less, shape ``(worlds, parts)``; no parts: each frame is as likely.
-        likely: How likely it is that an episode begins in a part or an earlier one, shape ``(parts,)``.
+        frames: Present frame of each world, shape ``(worlds,)``.
+        failed: Part in which a world has just failed, else -1; shape ``(worlds,)``.
+        failures: Failures of each world in each part, with less weight for older ones, shape ``(worlds, parts)``; without parts all
+            frames are equally likely.
+        likely: Probability that an episode begins in a part or an earlier one, shape ``(parts,)``.
         evenness: Entropy of these probabilities over that of equal ones, shape ``(1,)``.
     """
 
@@ -38,18 +39,18 @@ class SamplingArrays:
 
 @dataclass(frozen=True)
 class AdaptiveSampling:
-    """Episodes begin more often where they failed of late: the adaptive sampling of BeyondMimic (arXiv 2508.08241), as mjlab has it.
+    """Begin episodes more often where they failed lately: the adaptive sampling of BeyondMimic (arXiv 2508.08241), as in mjlab.
 
-    The motion is cut into parts. A part's probability is proportional to its failures plus ``even`` divided by the number of parts, after
-    which each part takes on those of the next ``reach - 1`` parts, each with ``decay`` times the weight of the one before. The
-    failures are those of all worlds of a rank, each step ``rate`` times those of the step and ``1 - rate`` times those before.
+    The motion is cut into parts. A part's probability is proportional to its failures plus ``even`` divided by the number of parts; each
+    part then also counts those of the next ``reach - 1`` parts, each with ``decay`` times the weight of the one before. Failures are
+    averaged over all worlds of a rank: in each step, ``rate`` times the new failures plus ``1 - rate`` times the old ones.
 
     Attributes:
         seconds: Length of a part [s].
-        even: Failures that are added, spread over all parts.
+        even: Additional failures, spread over all parts.
         rate: Weight of the newest step.
-        reach: How many parts before a failure become likelier, that of the failure counted.
-        decay: Weight of each over that of the next.
+        reach: Number of parts up to a failure that become likelier, including the part of the failure.
+        decay: Weight of each such part relative to the next.
     """
 
     seconds: float = 1.0
@@ -146,10 +147,10 @@ class FrameSampling:
     """The sampling of a motion in some worlds.
 
     Args:
-        declaration: How; None: each frame is as likely.
+        declaration: The adaptive sampling; None: all frames are equally likely.
         seconds: Length of the motion [s].
-        world_count: Of this rank.
-        device: Of its arrays.
+        world_count: Number of worlds of this rank.
+        device: Device of its arrays.
     """
 
     def __init__(self, declaration: AdaptiveSampling | None, seconds: float, world_count: int, device: str) -> None:
@@ -167,7 +168,7 @@ class FrameSampling:
         self._share()
 
     def advance(self) -> None:
-        """Count who failed where in the step before, ahead of the draws of this one. Launches only."""
+        """Count the failures of the previous step, before the draws of this one. Launches only."""
         if self._declaration is None:
             return
         self._sums.zero_()
@@ -176,7 +177,7 @@ class FrameSampling:
         self._share()
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Live views of what the next step reads."""
+        """Live views of the state that the next step reads."""
         if self._declaration is None:
             return {}
         return {name: wp.to_torch(getattr(self.arrays, name)) for name in ("frames", "failed", "failures")}

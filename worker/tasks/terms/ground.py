@@ -1,8 +1,7 @@
-"""The ground: heights above it, placing on a terrain's patches, its levels.
+"""The ground: heights above it, placement on a terrain's patches, and its levels.
 
-A term with ``scan`` reads a :class:`worker.simulation.sensors.height_scan.HeightScan`; one with the terrain itself needs a task that
-stands on one. A term with a velocity command counts only while the command asks for more than its ``threshold``, speed [m/s] +
-turning velocity [rad/s].
+A term with ``scan`` reads a :class:`worker.simulation.sensors.height_scan.HeightScan`; a term with the terrain itself needs a task with
+one. A term with a velocity command is 0 unless the command exceeds its ``threshold``, speed [m/s] + turning velocity [rad/s].
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from worker.tasks.terms.root import root_displacement
 wp.set_module_options({"enable_backward": False})
 
 _FIRST_STEPS = wp.constant(2)
-"""Control steps of an episode in which a robot has not left its patch, whatever its pose says."""
+"""Number of first control steps of an episode in which a robot counts as on its patch, whatever its pose."""
 
 
 @wp.func
@@ -38,7 +37,7 @@ def above_ground(terrain: TerrainArrays, point: wp.vec3) -> float:
 
 @wp.func
 def scanned_height(world: int, scan: HeightScanArrays, index: int, offset: float = 0.0) -> float:
-    """Height of the sensor's frame above the ground at point ``index`` of a scan, less ``offset`` [m].
+    """Height of the sensor's frame above the ground at point ``index`` of a scan, minus ``offset`` [m].
 
     mjlab: height_scan. Isaac Lab: height_scan (whose offset is 0.5 by default).
     """
@@ -59,7 +58,7 @@ def scanned_height_mean(world: int, scan: HeightScanArrays) -> float:
 
 @wp.func
 def scanned_height_error_squared(world: int, scan: HeightScanArrays, target: float) -> float:
-    """Square of the mean height above the ground over a scan less ``target`` [m^2].
+    """Square of the mean height above the ground over a scan minus ``target`` [m^2].
 
     mjlab: -. Isaac Lab: base_height_l2 (with a sensor).
     """
@@ -282,7 +281,7 @@ def planar_pose_command_on_terrain(
 
 @wp.func
 def draw_patch(world: int, terrain: TerrainArrays, stream: wp.uint32):
-    """Put a world on any patch of the terrain, each as likely; place its robot after that.
+    """Put a world on a random patch of the terrain, all equally likely; place its robot after that.
 
     mjlab: randomize_terrain. Isaac Lab: -.
     """
@@ -302,9 +301,9 @@ def walk_to_levels(
     stream: wp.uint32,
     episode_seconds: float,
 ):
-    """One level up where the robot walked farther than half a patch, else one down where it walked less than half of the commanded way.
+    """One level up if the robot walked farther than half a patch, else one down if it walked less than half of the commanded distance.
 
-    ``episode_seconds`` is the length of a whole episode [s]. Beyond the last level comes any.
+    ``episode_seconds`` is the length of a whole episode [s]. After the last level comes a random one.
 
     mjlab: terrain_levels_vel. Isaac Lab: terrain_levels_vel.
     """
@@ -315,7 +314,7 @@ def walk_to_levels(
 def left_terrain(
     world: int, worlds: WorldArrays, robot: RobotArrays, terrain: TerrainArrays, margin: float = 0.0
 ) -> bool:
-    """Whether the root is more than ``margin`` beyond the terrain's patches [m]; negative: while it is still on them.
+    """Whether the root is more than ``margin`` beyond the terrain's patches [m]; a negative margin lies inside them.
 
     mjlab: out_of_terrain_bounds (margin: the border's width less theirs). Isaac Lab: terrain_out_of_bounds (as mjlab's).
     """

@@ -26,7 +26,7 @@ def joint_position(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
 
 @wp.func
 def measured_joint_position(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """Position of a joint as its encoder shows it: position + encoder bias [m, rad].
+    """Position of a joint measured by its encoder: position + encoder bias [m, rad].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -35,7 +35,7 @@ def measured_joint_position(world: int, worlds: WorldArrays, robot: RobotArrays,
 
 @wp.func
 def joint_offset(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """How far a joint is from its default position [m, rad].
+    """Position of a joint relative to its default [m, rad].
 
     mjlab: joint_pos_rel. Isaac Lab: joint_pos_rel.
     """
@@ -44,7 +44,7 @@ def joint_offset(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int
 
 @wp.func
 def measured_joint_offset(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """How far a joint is from its default position as its encoder shows it: with the encoder's bias [m, rad].
+    """Position of a joint relative to its default, measured by its encoder: with the encoder's bias [m, rad].
 
     mjlab: joint_pos_rel(biased=True). Isaac Lab: -.
     """
@@ -62,7 +62,7 @@ def joint_velocity(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
 
 @wp.func
 def joint_share_of_range(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """Where a joint is between its limits: -1 at the lower, 0 in the middle, 1 at the upper; 0 of a joint without limits.
+    """Position of a joint between its limits: -1 at the lower, 0 in the middle, 1 at the upper; 0 for a joint without limits.
 
     mjlab: -. Isaac Lab: joint_pos_limit_normalized.
     """
@@ -76,7 +76,7 @@ def joint_share_of_range(world: int, worlds: WorldArrays, robot: RobotArrays, jo
 def joint_acceleration(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
     """Acceleration of a joint in the last physics step [m/s^2, rad/s^2].
 
-    It is what the solver starts the next step from, so it is of use in rewards; after a reset it is 0.
+    Use it in rewards: the solver starts the next step from it, and a reset sets it to 0.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -94,7 +94,7 @@ def joint_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int
 
 @wp.func
 def joint_effort_share(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """Force or torque of the actuator on a joint over the greatest that it can give, in [-1, 1]; 0 where it is not limited.
+    """Force or torque of the actuator on a joint over its greatest one, in [-1, 1]; 0 without a limit.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -114,7 +114,7 @@ def joint_power(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int)
 def joint_limit_excess(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, soft_factor: float = 0.95
 ) -> float:
-    """How far a joint is beyond its soft limits [m, rad]: those at ``soft_factor`` times the range, about the range's middle.
+    """Distance of a joint beyond its soft limits [m, rad], at ``soft_factor`` times the range about its middle.
 
     mjlab: joint_pos_limits. Isaac Lab: joint_pos_limits.
     """
@@ -147,7 +147,7 @@ def joint_speed(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int)
 
 @wp.func
 def joint_velocity_excess(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, limit: float) -> float:
-    """How much faster a joint is than ``limit``, at most 1 [m/s, rad/s].
+    """Excess of a joint's speed over ``limit``, at most 1 [m/s, rad/s].
 
     mjlab: -. Isaac Lab: joint_vel_limits (limit: soft_ratio times the joint's limit).
     """
@@ -158,7 +158,7 @@ def joint_velocity_excess(world: int, worlds: WorldArrays, robot: RobotArrays, j
 def joint_velocity_excess_squared(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, limit: float
 ) -> float:
-    """Square of how much faster a joint is than ``limit`` [m^2/s^2, rad^2/s^2].
+    """Square of the excess of a joint's speed over ``limit`` [m^2/s^2, rad^2/s^2].
 
     mjlab: joint_velocity_hinge_penalty (limit: max_vel). Isaac Lab: -.
     """
@@ -200,7 +200,7 @@ def joint_effort_magnitude(world: int, worlds: WorldArrays, robot: RobotArrays, 
 def joint_effort_excess(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, soft_factor: float = 0.9
 ) -> float:
-    """How far the actuator's force or torque is beyond ``soft_factor`` times the greatest that it can give [N, N m].
+    """Excess of the actuator's force or torque over ``soft_factor`` times its greatest one [N, N m].
 
     mjlab: -. Isaac Lab: applied_torque_limits (which counts what the actuator cut off).
     """
@@ -209,7 +209,7 @@ def joint_effort_excess(
 
 @wp.func
 def joint_work(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """Mechanical power that an actuator spends on a joint [W]; braking gives nothing back.
+    """Mechanical power that an actuator spends on a joint [W]; braking recovers nothing.
 
     mjlab: electrical_power_cost. Isaac Lab: -.
     """
@@ -218,7 +218,7 @@ def joint_work(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) 
 
 @wp.func
 def joint_power_magnitude(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """Magnitude of the mechanical power between an actuator and its joint [W]; braking costs as driving does.
+    """Magnitude of the mechanical power between an actuator and its joint [W]; braking costs as much as driving.
 
     mjlab: -. Isaac Lab: power_consumption (of the classic tasks, which take the action for the torque).
     """
@@ -290,7 +290,7 @@ def joint_too_fast(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
 def joint_effort_at_limit(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, soft_factor: float = 1.0
 ) -> bool:
-    """Whether the actuator gives a joint ``soft_factor`` times the greatest force or torque that it can, or more.
+    """Whether the actuator's force or torque on a joint is at least ``soft_factor`` times its greatest one.
 
     mjlab: -. Isaac Lab: joint_effort_out_of_limit.
     """

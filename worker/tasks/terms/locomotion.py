@@ -1,4 +1,4 @@
-"""Locomotion: how well a robot follows its velocity command or reaches its place, and in which posture."""
+"""Locomotion: tracking of a velocity command, distance to a commanded place, and posture."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def track_planar_velocity(
 def track_planar_velocity_by_heading(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, command: int, std: float
 ) -> float:
-    """As :func:`track_planar_velocity`, with forward and left as seen from above, however the root leans [m^2/s^2].
+    """As :func:`track_planar_velocity`, with forward and left as seen from above, independent of the root's tilt [m^2/s^2].
 
     mjlab: -. Isaac Lab: track_lin_vel_xy_yaw_frame_exp.
     """
@@ -129,7 +129,8 @@ def turning_velocity_error(
 def velocity_along_command(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, bodies: BodyArrays, command: int
 ) -> float:
-    """Velocity of the root's origin in the commanded direction, forward and left, at most the commanded speed [m/s]; 0 when told to stand.
+    """Velocity of the root's origin in the commanded direction, forward and left, at most the commanded speed [m/s]; 0 for a command to
+    stand.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -193,7 +194,7 @@ def motion_when_standing(
 
 @wp.func
 def heading_error(world: int, episodes: EpisodeArrays, command: int) -> float:
-    """Magnitude of the turn that is left to the heading of a planar pose command [rad].
+    """Remaining angle to the heading of a planar pose command [rad].
 
     mjlab: -. Isaac Lab: heading_command_error_abs (of navigation).
     """
@@ -202,7 +203,7 @@ def heading_error(world: int, episodes: EpisodeArrays, command: int) -> float:
 
 @wp.func
 def distance_left(world: int, episodes: EpisodeArrays, command: int) -> float:
-    """Distance that is left to the place of a planar pose command [m].
+    """Remaining distance to the place of a planar pose command [m].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -211,7 +212,7 @@ def distance_left(world: int, episodes: EpisodeArrays, command: int) -> float:
 
 @wp.func
 def near_place(world: int, episodes: EpisodeArrays, command: int, std: float) -> float:
-    """1 - tanh(d / std), d the distance that is left to the place of a planar pose command [m].
+    """1 - tanh(d / std), d the remaining distance to the place of a planar pose command [m].
 
     mjlab: -. Isaac Lab: position_command_error_tanh (of navigation).
     """

@@ -1,4 +1,4 @@
-"""Manipulation: a hand, an object and where it is to go.
+"""Manipulation: a hand, an object and its target.
 
 The hand is the first column of a frame sensor in the world frame (``Frames(sites="...")`` or ``Frames(bodies="...")``); the object
 is the root of a further robot (``other="cube"``). A target is the first three numbers of a command: in the world frame, unless the
@@ -74,7 +74,7 @@ def object_velocity_in_root(world: int, worlds: WorldArrays, robot: RobotArrays,
 def hand_to_object(
     world: int, worlds: WorldArrays, robot: RobotArrays, other: RobotArrays, hand: FrameArrays
 ) -> wp.vec3:
-    """Way from the hand to an object, along the axes of the robot's root [m].
+    """Vector from the hand to an object, along the axes of the robot's root [m].
 
     mjlab: ee_to_object_distance. Isaac Lab: -.
     """
@@ -86,7 +86,7 @@ def hand_to_object(
 def object_to_target(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, other: RobotArrays, command: int
 ) -> wp.vec3:
-    """Way from an object to its target, along the axes of the robot's root [m].
+    """Vector from an object to its target, along the axes of the robot's root [m].
 
     mjlab: object_to_goal_distance. Isaac Lab: -.
     """
@@ -178,7 +178,7 @@ def reach_and_bring_object(
     reaching_std: float,
     bringing_std: float,
 ) -> float:
-    """r (1 + b), r as :func:`reach_object` and b as :func:`bring_object`, in [0, 2]: bringing counts as far as the hand is there.
+    """r (1 + b), r as :func:`reach_object` and b as :func:`bring_object`, in [0, 2]: bringing counts only near the hand.
 
     mjlab: staged_position_reward. Isaac Lab: -.
     """
@@ -238,9 +238,9 @@ def object_was_at_target(
     memory: int,
     distance: float,
 ) -> float:
-    """1 from the step on in which an object, which ``robot=`` names, was closer to its target than ``distance`` [m].
+    """1 once an object, which ``robot=`` names, was closer to its target than ``distance`` [m].
 
-    It holds until the episode ends, also where a new target is drawn before.
+    It stays 1 until the episode ends, even if a new target is drawn.
 
     mjlab: episode_success (of LiftingCommand, which forgets it when a target is drawn). Isaac Lab: -.
     """

@@ -1,4 +1,4 @@
-"""A recorded motion that a robot is to follow: its file, and its numbers on the device."""
+"""A recorded motion for a robot to follow: its file, and its arrays on the device."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ _WIDTHS = {
     "body_lin_vel_w": 3,
     "body_ang_vel_w": 3,
 }
-"""Arrays of the file and the last dimension of those of bodies."""
+"""Arrays of the file, and the last dimension of arrays with one row per body."""
 
 
 @wp.struct
 class MotionArrays:
-    """A recorded motion, one row a frame; one column a joint of the robot, or a body that is followed.
+    """A recorded motion, one row per frame, one column per joint of the robot or per tracked body.
 
     Attributes:
-        joint_positions: Of all joints of the robot [m, rad], shape ``(frames, joints)``.
-        joint_velocities: The same [m/s, rad/s].
-        positions: Of the bodies' origins, in the world frame [m], shape ``(frames, bodies)``.
-        rotations: Of the bodies [quaternion xyzw], shape ``(frames, bodies)``.
+        joint_positions: Positions of all joints of the robot [m, rad], shape ``(frames, joints)``.
+        joint_velocities: Their velocities [m/s, rad/s], same shape.
+        positions: Positions of the bodies' origins, in the world frame [m], shape ``(frames, bodies)``.
+        rotations: Rotations of the bodies [quaternion xyzw], shape ``(frames, bodies)``.
         linear: Velocities of the bodies' origins, in the world frame [m/s], shape ``(frames, bodies)``.
         angular: Angular velocities, in the world frame [rad/s], shape ``(frames, bodies)``.
         roots: Pose of the root, shape ``(frames,)``.
         root_linear: Velocity of the root's origin, in the world frame [m/s], shape ``(frames,)``.
         root_angular: Angular velocity of the root, in the world frame [rad/s], shape ``(frames,)``.
-        bodies: Columns of ``BodyArrays`` of the bodies that are followed, shape ``(bodies,)``.
-        anchor: Which of these is the anchor, to which the others are seen.
-        rate: Frames of a control step.
-        sampling: With which frames episodes begin.
+        bodies: Columns of the tracked bodies in ``BodyArrays``, shape ``(bodies,)``.
+        anchor: Index among these of the anchor, the frame of reference of the others.
+        rate: Frames per control step.
+        sampling: Sampling of the start frames of episodes.
     """
 
     joint_positions: wp.array2d(dtype=wp.float32)
@@ -68,16 +68,16 @@ class MotionArrays:
 
 @dataclass(frozen=True)
 class Motion:
-    """A recorded motion, declared beside a task's sensors; a term that takes ``motion`` finds it there.
+    """A recorded motion, declared among a task's sensors for terms with a parameter ``motion``.
 
     Attributes:
         file: NumPy archive as mjlab writes it: ``fps``, ``joint_pos`` and ``joint_vel`` (frames, joints), ``body_pos_w``,
             ``body_quat_w`` (wxyz), ``body_lin_vel_w`` (of the bodies' origins) and ``body_ang_vel_w`` (frames, bodies, ...), in the world
             frame, of all joints and bodies of the robot in the model's order, the root first.
-        bodies: Pattern or patterns of the bodies that are followed.
-        anchor: The body to which the others are seen, one of ``bodies``.
-        robot: Who follows it.
-        sampling: With which frames episodes begin; None: each is as likely.
+        bodies: Pattern or patterns of the tracked bodies.
+        anchor: The frame of reference of the others, one of ``bodies``.
+        robot: The robot that follows it.
+        sampling: Sampling of the start frames of episodes; None: all are equally likely.
     """
 
     arrays_type: ClassVar[Any] = MotionArrays
@@ -88,7 +88,7 @@ class Motion:
     sampling: AdaptiveSampling | None = None
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each body that is followed. Raises ValueError where a pattern or a name matches nothing."""
+        """Name of each tracked body. Raises ValueError if a pattern or a name matches nothing."""
         return place_names(views, "Motion", self.robot, bodies=self.bodies)
 
     def build(self, context: SensorContext) -> RecordedMotion:
@@ -134,12 +134,12 @@ class Motion:
 
 
 class RecordedMotion:
-    """A :class:`Motion` of some worlds; it never changes, but with which frames episodes begin may.
+    """A :class:`Motion` of some worlds. The motion never changes; the sampling of start frames may.
 
     Args:
         arrays: The motion.
-        names: Of the bodies that are followed.
-        sampling: With which frames episodes begin.
+        names: Names of the tracked bodies.
+        sampling: Sampling of the start frames of episodes.
     """
 
     needs_bodies = False
@@ -148,19 +148,19 @@ class RecordedMotion:
         self.arrays, self.names, self._sampling = arrays, names, sampling
 
     def advance(self) -> None:
-        """Count who failed where. Where in the motion a world is, is in its command."""
+        """Count the failures. The command of a world is its present frame."""
         self._sampling.advance()
 
     def settle(self) -> None:
-        """Nothing changes at a reset."""
+        """No-op: a reset changes nothing."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """What the sampling of frames remembers."""
+        """State of the sampling."""
         return self._sampling.state_tensors()
 
 
 def _read(file: Path, joints: int, bodies: int) -> dict[str, np.ndarray]:
-    """The arrays of a motion's file, float32, of the robot's shapes."""
+    """The arrays of a motion's file, float32, with the robot's shapes."""
     try:
         with np.load(file) as archive:
             data = {
@@ -178,7 +178,7 @@ def _read(file: Path, joints: int, bodies: int) -> dict[str, np.ndarray]:
         if data[name].shape != wanted or frames == 0:
             raise ValueError(
                 f"Motion.file: {name} of {file} has the shape {data[name].shape}; the robot has {joints} joints and {bodies} bodies, so "
-                f"that it must be {wanted}, with one frame or more"
+                f"it must be {wanted}, with one frame or more"
             )
         if not np.isfinite(data[name]).all():
             raise ValueError(f"Motion.file: {name} of {file} has numbers that are not finite")

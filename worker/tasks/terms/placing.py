@@ -1,4 +1,4 @@
-"""What terms that place robots share: numbers drawn from a stream, roots and joints put somewhere."""
+"""Functions shared by terms that place robots: draws from a stream, and placement of roots and joints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from worker.simulation.worlds import WorldArrays
 wp.set_module_options({"enable_backward": False})
 
 NONE = wp.constant(wp.vec2(0.0, 0.0))
-"""The range of what is not drawn."""
+"""The range of a number that is not drawn."""
 
 
 @wp.func

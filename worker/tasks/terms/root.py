@@ -1,7 +1,7 @@
 """The root of a robot or object: pose, velocities, gravity, heading.
 
-"In its own frame" is the frame of the root's body. The velocity of the frame's origin is what mjlab and Isaac Lab's ``root_link``
-quantities are; the velocity of the centre of mass costs less here and differs where that is away from the origin.
+"In its own frame" is the frame of the root's body. The velocity of the frame's origin corresponds to the ``root_link`` quantities of
+mjlab and Isaac Lab; the velocity of the centre of mass costs less here, and differs if the two points differ.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def root_position(world: int, worlds: WorldArrays, robot: RobotArrays) -> wp.vec
 
 @wp.func
 def root_displacement(world: int, worlds: WorldArrays, robot: RobotArrays) -> wp.vec3:
-    """Way from the root's place at the start, as the robot declares it, to the root, in the world frame [m].
+    """Displacement of the root from its declared start, in the world frame [m].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -267,7 +267,7 @@ def is_upright(world: int, worlds: WorldArrays, robot: RobotArrays, threshold: f
 
 @wp.func
 def height_error_squared(world: int, worlds: WorldArrays, robot: RobotArrays, target: float) -> float:
-    """Square of the root's height less ``target`` [m^2].
+    """Square of the root's height minus ``target`` [m^2].
 
     mjlab: -. Isaac Lab: base_height_l2 (without a sensor).
     """
@@ -277,7 +277,7 @@ def height_error_squared(world: int, worlds: WorldArrays, robot: RobotArrays, ta
 
 @wp.func
 def height_shortfall(world: int, worlds: WorldArrays, robot: RobotArrays, target: float) -> float:
-    """How far the root is below ``target`` [m], 0 above it.
+    """Distance of the root below ``target`` [m], 0 above it.
 
     mjlab: -. Isaac Lab: -.
     """
@@ -313,7 +313,7 @@ def root_too_high(world: int, worlds: WorldArrays, robot: RobotArrays, height: f
 
 @wp.func
 def root_too_far(world: int, worlds: WorldArrays, robot: RobotArrays, distance: float) -> bool:
-    """Whether the root is more than ``distance`` from its place at the start, seen from above [m].
+    """Whether the root is more than ``distance`` from its start, seen from above [m].
 
     mjlab: -. Isaac Lab: terrain_out_of_bounds (on a plane there are no bounds).
     """

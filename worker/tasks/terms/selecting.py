@@ -1,4 +1,4 @@
-"""One of several objects: a selection names them, a command chooses one for each world.
+"""One of several objects: a selection names them, and a command chooses one for each world.
 
 The selection is a sensor, ``ObjectSelection("cube_*")``. The hand and the target are as for manipulation; the target is in the world frame.
 """
@@ -19,7 +19,7 @@ from worker.tasks.terms import manipulation
 wp.set_module_options({"enable_backward": False})
 
 TRIES = wp.constant(16)
-"""How often an object's place is drawn before it is put above the others."""
+"""Number of draws of an object's place before it is put above the others."""
 
 
 @wp.func
@@ -53,10 +53,10 @@ def lift_one_command(
     object_yaw: wp.vec2,
     apart: float = 0.0,
 ):
-    """Draw a target in the world frame [m] and the object that is to go there, and put all objects down at rest elsewhere; 3 numbers.
+    """Draw a target in the world frame [m] and the object to bring there, and place all objects at rest elsewhere; 3 numbers.
 
-    Each object's place and yaw are drawn from the same ranges of the world frame [m, rad], again where it is closer than ``apart`` to one
-    before it, seen from above [m]; after 16 tries it is put above them all.
+    Place and yaw of all objects are drawn from the same ranges of the world frame [m, rad], and drawn again if the object is closer than
+    ``apart`` to an earlier one, seen from above [m]; after 16 tries it is placed above all others.
 
     mjlab: MultiCubeLiftingCommand (whose cubes may be put into one another). Isaac Lab: -.
     """
@@ -88,7 +88,7 @@ def lift_one_command(
 
 @wp.func
 def object_is_chosen(world: int, objects: SelectionArrays, index: int) -> float:
-    """1 of the object that counts, 0 of each other one: called for all, a one-hot vector.
+    """1 for the chosen object, 0 for the others: a one-hot vector over all objects.
 
     mjlab: camera_target_cube_mask (which shows it in an image). Isaac Lab: -.
     """
@@ -100,7 +100,7 @@ def object_is_chosen(world: int, objects: SelectionArrays, index: int) -> float:
 def hand_to_each_object(
     world: int, worlds: WorldArrays, robot: RobotArrays, hand: FrameArrays, objects: SelectionArrays, index: int
 ) -> wp.vec3:
-    """Way from the hand to an object, along the axes of the robot's root [m]; called for each of them.
+    """Vector from the hand to each object, along the axes of the robot's root [m].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -111,7 +111,7 @@ def hand_to_each_object(
 def hand_to_chosen_object(
     world: int, worlds: WorldArrays, robot: RobotArrays, hand: FrameArrays, objects: SelectionArrays
 ) -> wp.vec3:
-    """Way from the hand to the object that counts, along the axes of the robot's root [m].
+    """Vector from the hand to the chosen object, along the axes of the robot's root [m].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -128,7 +128,7 @@ def chosen_object_to_target(
     objects: SelectionArrays,
     command: int,
 ) -> wp.vec3:
-    """Way from the object that counts to its target, along the axes of the robot's root [m].
+    """Vector from the chosen object to its target, along the axes of the robot's root [m].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -137,7 +137,7 @@ def chosen_object_to_target(
 
 @wp.func
 def chosen_object_height(world: int, worlds: WorldArrays, objects: SelectionArrays) -> float:
-    """Height of the object that counts above z = 0 [m].
+    """Height of the chosen object above z = 0 [m].
 
     mjlab: -. Isaac Lab: -.
     """
@@ -149,7 +149,7 @@ def chosen_object_height(world: int, worlds: WorldArrays, objects: SelectionArra
 def chosen_object_target_distance(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int
 ) -> float:
-    """Distance between the object that counts and its target [m].
+    """Distance between the chosen object and its target [m].
 
     mjlab: position_error (of MultiCubeLiftingCommand). Isaac Lab: -.
     """
@@ -161,7 +161,7 @@ def chosen_object_target_distance(
 def bring_chosen_object(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int, std: float
 ) -> float:
-    """exp(-d^2 / std^2), d the distance between the object that counts and its target [m].
+    """exp(-d^2 / std^2), d the distance between the chosen object and its target [m].
 
     mjlab: multi_cube_bring_object_reward. Isaac Lab: -.
     """
@@ -180,7 +180,7 @@ def reach_and_bring_chosen_object(
     reaching_std: float,
     bringing_std: float,
 ) -> float:
-    """r (1 + b), r and b as of ``reach_and_bring_object``, of the object that counts, in [0, 2]; the others earn nothing.
+    """r (1 + b), with r and b of ``reach_and_bring_object`` for the chosen object, in [0, 2]; the others earn nothing.
 
     mjlab: multi_cube_staged_position_reward. Isaac Lab: -.
     """
@@ -194,7 +194,7 @@ def reach_and_bring_chosen_object(
 def chosen_object_at_target(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int, distance: float
 ) -> float:
-    """1 where the object that counts is closer to its target than ``distance`` [m], else 0.
+    """1 while the chosen object is closer to its target than ``distance`` [m], else 0.
 
     mjlab: at_goal (of MultiCubeLiftingCommand). Isaac Lab: -.
     """
@@ -212,7 +212,7 @@ def chosen_object_was_at_target(
     memory: int,
     distance: float,
 ) -> float:
-    """1 from the step on in which the object that counted was closer to its target than ``distance`` [m], until the episode ends.
+    """1 once the chosen object was closer to its target than ``distance`` [m], until the episode ends.
 
     mjlab: episode_success (of MultiCubeLiftingCommand, which forgets it when a target is drawn). Isaac Lab: -.
     """

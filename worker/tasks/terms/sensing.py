@@ -1,4 +1,4 @@
-"""What inertial measurement units, frames and momentum sensors measured."""
+"""Measurements of inertial measurement units, frames, momentum sensors and rays."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def imu_linear_velocity(world: int, imu: ImuArrays) -> wp.vec3:
 
 @wp.func
 def imu_acceleration(world: int, imu: ImuArrays) -> wp.vec3:
-    """Acceleration less gravity, in the unit's own frame [m/s^2]: it points up at rest.
+    """Acceleration minus gravity, in the unit's own frame [m/s^2]; at rest it points up.
 
     mjlab: builtin_sensor (an accelerometer). Isaac Lab: imu_lin_acc.
     """
@@ -61,7 +61,7 @@ def imu_projected_gravity(world: int, imu: ImuArrays) -> wp.vec3:
 
 @wp.func
 def imu_acceleration_squared(world: int, imu: ImuArrays, gravity: float = 9.81) -> float:
-    """Square of the unit's acceleration with ``gravity`` taken out [m^2/s^4]: 0 at rest.
+    """Square of the unit's acceleration without ``gravity`` [m^2/s^4]: 0 at rest.
 
     mjlab: -. Isaac Lab: body_lin_acc_l2 (of the body that it is on).
     """
@@ -180,7 +180,7 @@ def ray_distance(world: int, rays: RayArrays, index: int) -> float:
 
 @wp.func
 def nearest_obstacle(world: int, rays: RayArrays) -> float:
-    """Distance to the nearest that any of the rays hits [m].
+    """Distance to the nearest hit of any ray [m].
 
     mjlab: -. Isaac Lab: -.
     """

@@ -1,7 +1,7 @@
-"""Posture: how far joints may be from their default positions, each within a tolerance of its own.
+"""Posture: distances of joints from their default positions, each relative to its own tolerance.
 
 The tolerances are declared beside a task's sensors, ``sensors={"tolerances": terms.Tolerances(standing={"*_hip": 0.05, "*": 0.1})}``,
-and a term that takes ``tolerances`` finds them there.
+for terms with a parameter ``tolerances``.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ToleranceArrays:
-    """How far each joint may be from its default position: standard deviations [m, rad], shape ``(joints,)`` of ``columns``.
+    """Tolerated distance of each joint from its default position: standard deviations [m, rad], shape ``(joints,)`` of ``columns``.
 
     Attributes:
-        columns: The joints that have one, indices into the arrays of ``RobotArrays``.
-        standing: While the robot is to stand.
-        walking: While it is to walk.
-        running: While it is to run.
+        columns: The joints with a tolerance, as indices into the arrays of ``RobotArrays``.
+        standing: For commands to stand.
+        walking: For commands to walk.
+        running: For commands to run.
     """
 
     columns: wp.array(dtype=wp.int32)
@@ -82,9 +82,9 @@ def commanded_posture(
     walking: float = 0.5,
     running: float = 1.5,
 ) -> float:
-    """As :func:`tolerant_posture`, with the tolerances of what a velocity command asks for.
+    """As :func:`tolerant_posture`, with tolerances chosen by the velocity command.
 
-    ``walking`` holds from that much on, ``running`` from that: speed [m/s] + turning velocity [rad/s].
+    Commands of at least ``walking`` or ``running`` use those tolerances: speed [m/s] + turning velocity [rad/s].
 
     mjlab: variable_posture. Isaac Lab: -.
     """
@@ -98,13 +98,13 @@ def commanded_posture(
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How far each joint may be from its default position, by patterns of joints; the first pattern that fits a joint counts.
+    """Tolerated distance of each joint from its default position, by joint pattern; the first pattern that fits wins.
 
     Attributes:
-        standing: Standard deviation of each joint [m, rad], or one for all. Joints that no pattern fits don't count.
-        walking: The same while the robot is to walk, of the same joints; None: as ``standing``.
-        running: The same while it is to run; None: as ``walking``.
-        robot: Whose joints they are.
+        standing: Standard deviation of each joint [m, rad], or one for all. Joints without a fitting pattern don't count.
+        walking: The same for commands to walk, with the same joints; None: as ``standing``.
+        running: The same for commands to run; None: as ``walking``.
+        robot: The robot with these joints.
     """
 
     arrays_type: ClassVar[Any] = ToleranceArrays
@@ -114,7 +114,7 @@ class Tolerances:
     robot: str = "robot"
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each joint that has a tolerance. Raises ValueError where a pattern or a name matches nothing."""
+        """Name of each joint with a tolerance. Raises ValueError if a pattern or a name matches nothing."""
         if self.robot not in views:
             raise ValueError(f"Tolerances.robot: there is no robot {self.robot!r}; {nearest(self.robot, list(views))}")
         return list(_by_joint("Tolerances.standing", self.standing, views[self.robot].joint_names))
@@ -146,7 +146,7 @@ class JointTolerances:
 
     Args:
         arrays: The tolerances.
-        names: Of the joints, in the order of the arrays.
+        names: Names of the joints, in the order of the arrays.
     """
 
     needs_bodies = False
@@ -155,18 +155,18 @@ class JointTolerances:
         self.arrays, self.names = arrays, names
 
     def advance(self) -> None:
-        """Nothing changes in a step."""
+        """No-op: a step changes nothing."""
 
     def settle(self) -> None:
-        """Nothing changes at a reset."""
+        """No-op: a reset changes nothing."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Nothing outlasts a step."""
+        """Empty: no state persists between steps."""
         return {}
 
 
 def _by_joint(place: str, values: Mapping[str, float] | float, names: list[str]) -> dict[str, float]:
-    """The value of each joint that a pattern fits."""
+    """The value of each joint with a fitting pattern."""
     for pattern, value in values.items() if isinstance(values, Mapping) else (("*", values),):
         if isinstance(value, bool) or not isinstance(value, int | float) or not (0.0 < value < math.inf):
             raise ValueError(f"{place}.{pattern}: a tolerance is a number above 0, found {value!r}")

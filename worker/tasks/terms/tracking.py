@@ -1,8 +1,8 @@
-"""Tracking: how well a robot follows a recorded motion.
+"""Tracking: observations and commands of a robot that follows a recorded motion.
 
-The motion is declared as :class:`worker.tasks.terms.Motion` beside the sensors; ``command`` is the one that :func:`motion_command`
-draws, with one number, the frame. The anchor is one of the bodies that are followed. A body's relative reference is where the motion
-has it, carried over to the robot's anchor: moved along x and y and turned about the vertical, so that neither drift counts.
+The motion is declared as :class:`worker.tasks.terms.Motion` among the sensors. :func:`motion_command` draws the ``command``, one number:
+the frame. The anchor is one of the tracked bodies. A body's relative reference is its pose in the motion, carried over to the robot's
+anchor: moved along x and y and turned about the vertical, so that drift in these doesn't count.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from worker.tasks.terms.placing import between, set_joint, within_limits
 wp.set_module_options({"enable_backward": False})
 
 _NONE = wp.constant(wp.vec3(0.0, 0.0, 0.0))
-"""Half widths of what is not drawn."""
+"""Half widths of numbers that are not drawn."""
 
 
 @wp.func
 def frame_of(episodes: EpisodeArrays, motion: MotionArrays, world: int, command: int) -> int:
-    """The frame at which a world is; behind the last one it stays there."""
+    """Present frame of a world; it stays at the last one."""
     return wp.clamp(int(episodes.memory[world, command]), 0, motion.roots.shape[0] - 1)
 
 
@@ -52,7 +52,7 @@ def wanted_anchor(motion: MotionArrays, frame: int) -> wp.transform:
 
 @wp.func
 def relative_reference(bodies: BodyArrays, motion: MotionArrays, world: int, frame: int, index: int) -> wp.transform:
-    """Where a body is to be as seen from the robot's anchor, in the world frame: the anchor's height is the motion's."""
+    """Relative reference of a body, in the world frame, with the motion's height of the anchor."""
     anchor, wanted = anchor_pose(bodies, motion, world), wanted_anchor(motion, frame)
     between_both = wp.transform_get_rotation(anchor) * wp.quat_inverse(wp.transform_get_rotation(wanted))
     turn = yaw_quaternion(between_both)
@@ -92,11 +92,12 @@ def motion_command(
     joints: float = 0.0,
     soft_factor: float = 1.0,
 ):
-    """Draw a frame of the motion, as its ``sampling`` says, or take the first, and put the robot there; 1 number.
+    """Draw a frame of the motion by its ``sampling``, or take the first, and place the robot accordingly; 1 number.
 
     The pose and velocities of the root and the joints' positions are those of the frame plus numbers drawn evenly from plus and minus
     ``position`` [m], ``turn`` (roll, pitch, yaw, about the world's axes) [rad], ``velocity`` [m/s], ``turning`` [rad/s] and ``joints`` [m, rad]. Joints
-    stay within ``soft_factor`` times their range. Give it ``update=Term(terms.advance_motion)`` and a time longer than an episode.
+    stay within ``soft_factor`` times their range. Declare it with ``update=Term(terms.advance_motion)`` and a duration longer than an
+    episode.
 
     mjlab: MotionCommand (sampling_mode "adaptive", "uniform" or "start"). Isaac Lab: MotionCommand (of BeyondMimic).
     """
@@ -121,7 +122,7 @@ def motion_command(
 @needs(command=1)
 @wp.func
 def advance_motion(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int):
-    """Go on by the frames of one control step; behind the last frame :func:`motion_over` is true.
+    """Advance by the frames of one control step; after the last frame :func:`motion_over` is true.
 
     mjlab: MotionCommand (which starts again elsewhere after the last frame). Isaac Lab: MotionCommand (of BeyondMimic, as mjlab's).
     """
@@ -131,7 +132,7 @@ def advance_motion(world: int, episodes: EpisodeArrays, motion: MotionArrays, co
 
 @wp.func
 def evenness_of_frames(world: int, motion: MotionArrays) -> float:
-    """How evenly episodes begin with all parts of the motion, from 0 to 1: the entropy of the sampling over its greatest.
+    """Evenness of the start parts of episodes, from 0 to 1: the entropy of the sampling over its maximum.
 
     mjlab: MotionCommand (its metric sampling_entropy). Isaac Lab: MotionCommand (of BeyondMimic, its metric sampling_entropy).
     """
@@ -140,7 +141,7 @@ def evenness_of_frames(world: int, motion: MotionArrays) -> float:
 
 @wp.func
 def motion_over(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int) -> bool:
-    """Whether the motion has no further frame: end the episode as a time-out there.
+    """Whether the motion is over; use it as a time-out.
 
     mjlab: -. Isaac Lab: -.
     """

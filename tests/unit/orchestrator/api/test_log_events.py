@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import random
+import re
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from orchestrator.api.logs import events as log_events
 from orchestrator.api.logs.events import LogFile, View
@@ -58,10 +61,72 @@ def test_filter_patterns(pattern: str, matching: Any) -> None:
         assert [i for i, line in enumerate(LINES) if matches(line)] == list(matching)
 
 
-def test_no_regex_can_stop_the_server() -> None:
-    matches = parse("%.*a*a*a*a*a*a*a*b.*c.*d%")  # Python's re needs longer than the universe has
+_ATOMS = [
+    "a",
+    "b",
+    "-",
+    ".",
+    r"\.",
+    r"\d",
+    r"\D",
+    r"\w",
+    r"\W",
+    r"\s",
+    r"\S",
+    "[ab]",
+    "[^a1]",
+    r"[]\]-]",
+    r"[\d_]",
+    "[^-b]",
+]
+_REPEATS = ["", "", "", "*", "+", "?", "{2}", "{1,}", "{0,2}"]
+_BRANCHES = st.tuples(
+    st.sampled_from(["", "", "^"]),
+    st.lists(st.tuples(st.sampled_from(_ATOMS), st.sampled_from(_REPEATS)).map("".join), max_size=4).map("".join),
+    st.sampled_from(["", "", "$"]),
+).map("".join)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(_BRANCHES, min_size=1, max_size=3).map("|".join).filter(bool), st.text("ab1-.] _", max_size=8))
+def test_a_regex_means_what_it_means_in_python(regex: str, line: str) -> None:
+    assert parse(f"%{regex}%")(line) == (re.search(regex, line, re.ASCII | re.DOTALL) is not None)
+
+
+@pytest.mark.parametrize(
+    ("regex", "message"),
+    [
+        ("a**", "can't be read from '*' on"),
+        ("x(?i)", "can't be read from '(?i)' on"),
+        (r"[\pL]", r"can't be read from '[\\pL]' on"),
+        (r"\bword", r"can't be read from '\\bword' on"),
+        ("a$b", "can't be read from 'b' on"),
+        ("[[:alpha:]]", "can't be read from ']' on"),
+        ("a{3,1}", "invalid repetition size: {3,1}"),
+        ("[z-a]", "invalid character class range: z-a"),
+        (".{999}" * 150, "pattern too large"),
+    ],
+)
+def test_a_regex_that_can_not_be_read_is_refused_with_the_reason(regex: str, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        parse(f"%{regex}%")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "regex",
+    [
+        ".*a*a*a*a*a*a*a*b.*c.*d",  # for which Python's re needs longer than the universe has
+        "[ab]*a[ab]{900}c",  # as a deterministic automaton it has 2^900 states
+        "^" + "a?" * 400 + "a{400}b",
+        "|".join(f"a.{{{i}}}b" for i in range(1, 60)),
+    ],
+)
+def test_no_regex_can_stop_the_server(regex: str) -> None:
+    matches, dice = parse(f"%{regex}%"), random.Random(3)
     began = time.monotonic()
     assert not matches("a" * 20_000)
+    matches("".join(dice.choice("ab") for _ in range(20_000)))
     assert time.monotonic() - began < PATIENCE
 
 

@@ -173,7 +173,7 @@ def requests(draw: st.DrawFn) -> Sent:
     Sent("GET", "/a/./b//../c/", "b=2&a=%20&b=1&flag&=", (("x-a", " 1  2\t3 "), ("x-a", "4")), b""),
     ("logs", "us-east-1"),
 )
-def test_what_botocore_signs_is_accepted(store: KeyStore, key: Key, sent: Sent, place: tuple[str, str]) -> None:
+def test_signatures_of_botocore_are_accepted(store: KeyStore, key: Key, sent: Sent, place: tuple[str, str]) -> None:
     assert answer_to(signed(sent, signer_of(key, *place)), store) == ACCEPTED
 
 

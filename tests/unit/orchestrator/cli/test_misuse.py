@@ -51,7 +51,7 @@ def test_wrong_use_is_one_line_that_names_the_nearest(tmp_path: Path, typed: str
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"muster: {line}\n")
 
 
-def test_what_is_typed_reaches_the_terminal_as_text(tmp_path: Path) -> None:
+def test_user_input_reaches_the_terminal_as_text(tmp_path: Path) -> None:
     done = call_muster("list", "--\x1b[2J\nmuster: all is well", home=tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "\x1b" not in done.stderr
 

@@ -38,7 +38,7 @@ def test_files_that_differ_in_their_notes_alone_have_the_same_weights(tmp_path: 
     assert one.read_bytes() != other.read_bytes() and difference(one, other) == ""
 
 
-def test_what_can_t_be_read_here_is_not_compared(tmp_path: Path) -> None:
+def test_unreadable_tables_are_not_compared(tmp_path: Path) -> None:
     one = policy(tmp_path / "one", [[1.0, 2.0]])
     (tmp_path / "broken").write_bytes(b"no model at all")
     assert difference(one, tmp_path / "broken") is None and difference(tmp_path / "absent", one) is None

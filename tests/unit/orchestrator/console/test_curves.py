@@ -74,3 +74,9 @@ def test_names_choose_metrics_and_groups_and_only_numbers_are_drawn() -> None:
         0.333333,
         12345678901,
     )
+
+
+def test_a_metric_with_a_value_for_each_rank_is_a_curve_of_each() -> None:
+    records = [{"iteration": 1, "rank_collect_seconds": [0.1, 0.3]}, {"iteration": 2, "rank_collect_seconds": [0.2]}]
+    expected = {"rank_collect_seconds/0": [0.1, 0.2], "rank_collect_seconds/1": [0.3, None]}
+    assert columns(records, ["rank_*"])["series"] == columns(records, ["*"])["series"] == expected

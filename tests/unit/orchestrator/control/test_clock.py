@@ -85,7 +85,7 @@ def test_after_another_boot_the_wall_clock_says_how_much_time_has_passed(tmp_pat
     database.close()
 
 
-def test_what_a_share_has_used_is_not_multiplied_by_a_clock_that_is_behind(tmp_path: Path) -> None:
+def test_a_clock_that_is_behind_does_not_multiply_the_use_of_a_share(tmp_path: Path) -> None:
     database = Database.at(tmp_path)
     with database.session() as session:
         session.add(ShareUsage(queue="default", share="red", seconds=100.0, as_of=10**12))
@@ -94,7 +94,7 @@ def test_what_a_share_has_used_is_not_multiplied_by_a_clock_that_is_behind(tmp_p
     database.close()
 
 
-def test_a_step_of_the_clock_ends_no_job_also_where_the_controller_starts_again(
+def test_a_step_of_the_clock_ends_no_job_even_across_a_restart_of_the_controller(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     real, step = time.time, [0.0]

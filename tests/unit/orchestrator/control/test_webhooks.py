@@ -23,7 +23,7 @@ def test_a_message_is_signed_as_the_example_of_standard_webhooks() -> None:
     assert headers["webhook-id"] == "msg_p5jXN8AQM9LWM0D4loKWxJek" and headers["webhook-timestamp"] == "1614265330"
 
 
-def test_the_tries_go_on_for_about_eleven_hours() -> None:
+def test_retries_continue_for_about_eleven_hours() -> None:
     assert len(PAUSES) == 7 and 10.5 < sum(PAUSES) / 3600 < 11.5
     assert all(later == 5 * earlier for earlier, later in itertools.pairwise(PAUSES))
 
@@ -61,7 +61,7 @@ def test_a_mistake_is_told_in_one_line_without_a_secret(tmp_path: Path, changes:
         assert secret not in told
 
 
-def test_a_file_that_is_none_or_that_others_can_read_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_publicly_readable_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "hooks.json"
     with pytest.raises(WebhooksError, match=r"webhooks can't be read \(No such file or directory\)$"):
         read_webhooks(str(path))
@@ -83,7 +83,7 @@ def ended(status: str = "FAILED", queue: str = "robots", parent: str | None = No
     return Job(id="j", name="n", queue=queue, status=status, parent=parent, node_properties=properties)
 
 
-def test_a_webhook_is_told_of_the_states_queues_and_kinds_that_it_names_and_of_arrays_as_a_whole() -> None:
+def test_a_webhook_gets_its_states_queues_and_kinds_and_arrays_as_a_whole() -> None:
     webhook = Webhook(url=URL, secret=SECRET, statuses=["FAILED"], queues=["robots"], kinds=["train"])
     train = json.dumps({"train": {"task": "Ant"}})
     assert webhook.wants(ended(spec=train))
@@ -94,5 +94,5 @@ def test_a_webhook_is_told_of_the_states_queues_and_kinds_that_it_names_and_of_a
     assert not everything.wants(ended(parent="array"))
 
 
-def test_what_a_damaged_job_does_is_not_known() -> None:
+def test_a_damaged_job_counts_as_a_command() -> None:
     assert kind_of(ended(spec="{")) == kind_of(Job(id="j", own_node_properties={})) == "command"

@@ -46,7 +46,7 @@ def test_a_job_moves_as_on_aws_and_in_no_other_way(before: Status, after: Status
             check_transition(before, after)
 
 
-def test_a_job_that_is_over_stays_over_and_every_other_one_can_end() -> None:
+def test_an_ended_job_stays_ended_and_every_other_one_can_end() -> None:
     for status in Status:
         assert status.is_terminal == (not TRANSITIONS[status])
         assert status.is_terminal or Status.FAILED in TRANSITIONS[status]
@@ -117,7 +117,7 @@ ASKED = [
 
 
 @pytest.mark.parametrize(("codes", "reason", "certain"), ASKED)
-def test_a_node_that_was_told_to_end_is_not_the_cause(
+def test_a_node_that_was_asked_to_end_is_not_the_cause(
     codes: tuple[tuple[int, float, bool] | tuple[int, float] | int | None, ...], reason: str, certain: bool
 ) -> None:
     found = [

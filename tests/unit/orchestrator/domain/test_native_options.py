@@ -15,7 +15,7 @@ def test_a_node_without_variables_of_muster_has_what_aws_does() -> None:
     assert not options.is_native
 
 
-def test_what_the_job_yaml_says_arrives() -> None:
+def test_settings_of_the_job_yaml_reach_the_training() -> None:
     document = {
         "name": "ant",
         "train": {"task": "Ant", "worlds": 16, "iterations": 3},
@@ -46,5 +46,5 @@ def test_a_malformed_variable_is_refused(name: str, value: str) -> None:
 
 
 @pytest.mark.parametrize("worlds", ["-1", "many", "1" * 10, ""])
-def test_worlds_that_are_no_number_count_as_not_given(worlds: str) -> None:
+def test_an_invalid_number_of_worlds_counts_as_not_given(worlds: str) -> None:
     assert NativeOptions.read({"MUSTER_WORLDS": worlds}).worlds is None

@@ -13,7 +13,7 @@ amounts = st.builds(Resources, st.integers(0, 640).map(lambda n: n / 8), st.inte
 """CPUs in eighths, which floats hold exactly."""
 
 
-def test_amounts_are_added_and_taken_away_kind_by_kind() -> None:
+def test_amounts_are_added_and_subtracted_kind_by_kind() -> None:
     some, more = Resources(1.5, 2, 512), Resources(0.25, 1, 100)
     assert some + more == Resources(1.75, 3, 612)
     assert some - more == Resources(1.25, 1, 412)
@@ -43,7 +43,7 @@ def test_fractions_of_cpus_fit_in_spite_of_rounding() -> None:
 
 
 @given(amounts, amounts)
-def test_what_is_given_and_returned_leaves_what_there_was(there: Resources, taken: Resources) -> None:
+def test_allocating_and_releasing_restores_the_free_resources(there: Resources, taken: Resources) -> None:
     assert there - taken + taken == there
     assert taken <= there + taken
     assert (taken <= there) == (Resources() <= there - taken)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 
+import pytest
+
+from orchestrator.engines.toolkit import backoff as module
 from orchestrator.engines.toolkit.backoff import Backoff
 
 
@@ -15,3 +18,22 @@ def test_what_is_not_tried_any_more_is_forgotten_and_what_still_waits_is_not() -
     for each in (backoff, waiting):
         each.tidy(idle=0.0)
     assert not backoff and waiting.said(("start", "waits")) == "can't start"
+
+
+def test_what_fails_at_every_other_try_is_logged_once_and_waits_longer_and_longer(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    moment = 0.0
+    monkeypatch.setattr(module.time, "monotonic", lambda: moment)
+    backoff = Backoff(logging.getLogger("test"), first=1.0, most=60.0)
+    for pause in (1.0, 2.0, 4.0):
+        backoff.failed("job", "can't end")
+        moment += pause - 0.1
+        assert backoff.waits("job")
+        moment += 0.1
+        assert not backoff.waits("job") and not backoff.worked("job", lasting=True)
+    assert [record.getMessage() for record in caplog.records] == ["can't end"]
+    moment += 3.9
+    assert not backoff.worked("job", lasting=True) and backoff.said("job") == "can't end"
+    moment += 0.1
+    assert backoff.worked("job", lasting=True) and not backoff

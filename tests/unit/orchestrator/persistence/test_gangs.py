@@ -26,7 +26,7 @@ def test_a_definition_is_read_once_however_often_its_row_is_loaded() -> None:
     assert gangs.of("j", properties(3)) is first, "an equal document, decoded anew"
 
 
-def test_a_row_that_says_something_else_is_read_anew() -> None:
+def test_a_changed_row_is_read_again() -> None:
     gangs = Gangs()
     assert len(gangs.of("j", properties(3)).nodes) == 3
     with pytest.raises(ValueError, match="the job's row in the database is damaged"):

@@ -77,7 +77,7 @@ def test_a_call_that_the_database_refuses_fails_alone(crowd: Crowd) -> None:
     assert isinstance(found[0], IntegrityError) != isinstance(found[1], IntegrityError)
 
 
-def test_after_a_commit_that_failed_nothing_is_tried_again(crowd: Crowd) -> None:
+def test_nothing_is_retried_after_a_failed_commit(crowd: Crowd) -> None:
     calls = []
 
     def lost(connection: Any) -> None:

@@ -40,7 +40,7 @@ def known(record: RunRecord | None) -> tuple[str, str | None] | None:
     return (record.queue, record.owner) if record else None
 
 
-def test_a_run_that_nothing_knows_has_no_owner_and_one_that_waits_has_its_jobs(session: Session, run: Run) -> None:
+def test_an_unknown_run_has_no_owner_and_a_waiting_one_has_its_jobs(session: Session, run: Run) -> None:
     assert owner_of(session, run) is None
     submitted(session, "a", "robots", 1)
     submitted(session, "b", "lab", 2)
@@ -55,7 +55,7 @@ def test_a_run_belongs_to_the_job_that_creates_it_not_to_one_that_never_started(
     assert known(owner_of(session, run)) == ("lab", "key lab")  # the database's record comes first
 
 
-def test_a_run_made_anew_under_an_old_name_belongs_to_its_new_creator(session: Session, run: Run) -> None:
+def test_a_recreated_run_of_an_old_name_belongs_to_its_new_creator(session: Session, run: Run) -> None:
     first = submitted(session, "a", "robots", 1)
     record_owner(session, run, first)
     run.create({"run": "r", "queue": "robots"})
@@ -82,14 +82,14 @@ def test_a_run_keeps_its_owner_while_the_volume_of_the_store_is_away(session: Se
     assert known(owner_of(session, run)) == known(record_owner(session, run, later)) == ("robots", "key robots")
 
 
-def test_a_run_that_exists_belongs_to_whom_it_names_whoever_continues_it(session: Session, run: Run) -> None:
+def test_an_existing_run_keeps_its_owner_whichever_job_continues_it(session: Session, run: Run) -> None:
     run.create({"run": "r", "queue": "robots", "owner": "key x"})
     later = submitted(session, "a", "lab", 1)
     assert known(record_owner(session, run, later)) == ("robots", "key x")
 
 
 @pytest.mark.parametrize("content", [b"{}", b"damaged", b'{"queue": 7}', b"[" * 100_000])
-def test_a_run_that_does_not_say_its_queue_exists_and_is_nobodys(session: Session, run: Run, content: bytes) -> None:
+def test_a_run_without_a_queue_exists_and_has_no_owner(session: Session, run: Run, content: bytes) -> None:
     run.path.mkdir()
     (run.path / "run.json").write_bytes(content)
     assert known(owner_of(session, run)) == ("", None)

@@ -30,7 +30,7 @@ from tests.support.orchestrator.scheduling import (
 # -- gangs ------------------------------------------------------------------------------------------------------------
 
 
-def test_where_nothing_waits_nothing_is_decided() -> None:
+def test_without_waiting_jobs_nothing_is_decided() -> None:
     decisions = decide(snapshot([host()], []))
     assert (decisions.starts, decisions.preempts, decisions.cancels) == ((), (), ())
     assert list(decisions.report.order("default")) == []
@@ -74,7 +74,7 @@ def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
     )
 
 
-def test_what_a_vanished_host_held_counts_for_nothing() -> None:
+def test_resources_of_a_vanished_host_are_not_counted() -> None:
     held = [running("lost", on("gone", 4)), running("cart", on("a", 1))]
     assert started(decide(snapshot([host()], [job("ant", gang(node(3)))], held))) == "ant:a"
 
@@ -164,7 +164,7 @@ def test_use_halves_with_every_half_life(age: float, decay: int, left: float) ->
 # -- compute environments ------------------------------------------------------------------------------------------------------------
 
 
-def test_pools_are_tried_in_the_queues_order() -> None:
+def test_compute_environments_are_tried_in_the_queues_order() -> None:
     compute_environments = [
         compute_environment("p", ("a",)),
         compute_environment("q", ("b",)),
@@ -179,7 +179,7 @@ def test_pools_are_tried_in_the_queues_order() -> None:
     assert [start.compute_environment for start in decisions.starts] == ["q", "p", "p"]
 
 
-def test_a_gang_stays_in_one_pool() -> None:
+def test_a_gang_stays_in_one_compute_environment() -> None:
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     decisions = decide(
         snapshot(
@@ -199,7 +199,7 @@ def test_a_gang_stays_in_one_pool() -> None:
     )
 
 
-def test_a_pool_uses_no_more_cpus_than_it_may() -> None:
+def test_a_compute_environment_uses_no_more_cpus_than_it_may() -> None:
     held = [running("cart", on("a", 2)), running("other", on("b", 1), compute_environment="rest")]
     compute_environments = [compute_environment(max_cpus=5), compute_environment("rest")]
     waiting = line(job("x", gang(node(2))), job("y", gang(node(2))))
@@ -211,7 +211,7 @@ def test_a_pool_uses_no_more_cpus_than_it_may() -> None:
     )
 
 
-def test_an_elastic_gang_shrinks_to_what_the_pool_may_use() -> None:
+def test_an_elastic_gang_shrinks_to_the_limit_of_its_compute_environment() -> None:
     waiting = [job("ant", gang(*[node(2)] * 4, minimum=1))]
     assert (
         started(decide(snapshot([host(cpus=16)], waiting, compute_environments=[compute_environment(max_cpus=5)])))
@@ -246,7 +246,7 @@ def test_one_machine_that_two_engines_have_is_not_given_out_twice() -> None:
     assert started(everywhere) == "" and "all hosts together have 4 CPUs, 1 GPU" in reason(everywhere, "both")
 
 
-def test_pools_that_share_a_host_do_not_give_it_out_twice() -> None:
+def test_compute_environments_that_share_a_host_do_not_give_it_out_twice() -> None:
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("a", "b"))]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]
     waiting = [job("x", gang(node(3)), queue="one"), job("y", gang(node(3)), queue="two")]

@@ -86,7 +86,7 @@ def test_a_node_that_takes_nothing_fits_anywhere() -> None:
     assert where(gang(*[Resources(0, 0, 0)] * 3), host(cpus=0, memory=0)) == "a a a"
 
 
-def test_why_a_gang_never_fits_is_told_of_the_nodes_that_it_can_not_do_without() -> None:
+def test_the_reason_why_a_gang_never_fits_covers_only_its_required_nodes() -> None:
     shape = gang(node(1), node(99), node(1), minimum=1)
     assert never_fits(shape, [host()]) is None
     assert never_fits(shape, [host(cpus=0.5)]) == (
@@ -110,16 +110,14 @@ def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Hos
         ),
     ],
 )
-def test_too_few_hosts_that_take_a_node_each_are_counted_in_hosts(
-    nodes: list[Resources], minimum: int, why: str
-) -> None:
+def test_a_lack_of_hosts_for_one_node_each_is_counted_in_hosts(nodes: list[Resources], minimum: int, why: str) -> None:
     hosts = [single("a"), single("b", gpus=1)]
     shape = gang(*nodes, minimum=minimum)
     assert never_fits(shape, hosts) == why
     assert never_fits(shape, hosts, elastic=True) is None, "more may come"
 
 
-def test_where_hosts_come_and_go_only_a_node_that_is_larger_than_any_is_refused() -> None:
+def test_on_elastic_hosts_only_a_node_larger_than_any_host_is_refused() -> None:
     assert never_fits(gang(node(8)), [], elastic=True) is None, "nobody knows what will come"
     assert never_fits(gang(node(8)), [single("a")], elastic=True) == (
         "each node needs 8 CPUs, 0 GPUs, 100 MiB; the largest host has 4 CPUs, 0 GPUs, 8 GiB"
@@ -182,7 +180,7 @@ def test_one_machine_that_two_engines_serve_is_placed_on_once() -> None:
     assert found.allocation is None and found.problem is not None and "all hosts together have 4 CPUs" in found.problem
 
 
-def test_what_has_hosts_still_to_come_is_no_problem_and_has_no_place_yet() -> None:
+def test_a_gang_that_awaits_new_hosts_is_not_a_problem_and_has_no_placement_yet() -> None:
     found = fit(
         gang(*[node(3)] * 3),
         queue(compute_environments=("all",)),
@@ -193,7 +191,7 @@ def test_what_has_hosts_still_to_come_is_no_problem_and_has_no_place_yet() -> No
     assert (found.allocation, found.problem) == (None, None)
 
 
-def test_a_compute_environment_that_is_disabled_is_used_where_no_other_would_do() -> None:
+def test_a_disabled_compute_environment_is_used_if_no_other_is_possible() -> None:
     compute_environments = {
         "off": compute_environment("off", enabled=False),
         "on": compute_environment("on", hosts=("a",)),

@@ -68,7 +68,7 @@ def test_nobody_is_preempted_where_that_would_not_be_enough() -> None:
     assert decisions.preempts == ()
 
 
-def test_the_lowest_queue_then_the_lowest_priority_then_the_youngest_goes() -> None:
+def test_victims_are_ordered_by_queue_then_priority_then_age() -> None:
     held = [
         running("mid", on("a", 1), queue="mid", preemptible=True, for_seconds=1),
         running("old", on("a", 1), queue="low", preemptible=True, for_seconds=900),
@@ -94,7 +94,7 @@ def test_no_more_are_preempted_than_needed() -> None:
     assert preempted(decisions) == "large"
 
 
-def test_while_victims_stop_no_others_are_chosen() -> None:
+def test_no_further_victims_are_chosen_while_some_stop() -> None:
     held = [
         running("first", on("a", 2), queue="low", preemptible=True, ending=True),
         running("second", on("a", 2), queue="low", preemptible=True),
@@ -118,7 +118,7 @@ def test_across_shares_only_one_that_would_be_served_first_preempts() -> None:
         assert preempted(decide(snapshot([host()], waiting, held, queues, usage=usage))) == expected
 
 
-def test_what_is_charged_for_the_jobs_before_it_counts_when_shares_are_compared() -> None:
+def test_charges_for_earlier_jobs_count_when_shares_are_compared() -> None:
     # the share of the head comes first, but the head itself only after one that never fits, for which 120 are charged
     held = [running("cart", on("a", 4), share="t", priority=1, preemptible=True)]
     waiting = [job("huge", gang(node(2, 2)), share="s", priority=9), job("ant", share="s", priority=2)]
@@ -133,7 +133,7 @@ def test_in_a_queue_that_is_first_in_first_out_nobody_is_preempted() -> None:
     assert decide(snapshot([host()], [job("ant", priority=9)], held)).preempts == ()
 
 
-def test_the_cpus_that_a_pool_may_use_are_preempted_for_too() -> None:
+def test_the_cpus_that_a_compute_environment_may_use_are_preempted_for_too() -> None:
     held = [running("cart", on("a", 2), queue="low", preemptible=True)]
     waiting = [job("ant", gang(node(3)), queue="high")]
     assert (
@@ -203,7 +203,7 @@ def test_only_the_time_at_the_head_counts_and_a_pass_tells_the_next_one_since_wh
         assert decide(snapshot([host()], waiting, held, queues, leading=before)).leading == leads("x", CAPACITY, 0)
 
 
-def test_a_job_that_is_cancelled_preempts_nobody() -> None:
+def test_a_cancelled_job_preempts_no_gang() -> None:
     queues = [queue("high", 9, limits=(TimeLimit(CAPACITY, 600),)), queue("low")]
     held = [running("cart", on("a", 4), queue="low", preemptible=True)]
     leading = leads("ant", CAPACITY, 601, "high")
@@ -227,7 +227,7 @@ def test_the_first_of_a_queue_is_stuck_too_where_an_equal_job_of_another_queue_w
     assert names(each.job for each in decisions.cancels) == "cart"
 
 
-def test_a_queue_without_a_usable_pool_cancels_nobody() -> None:
+def test_a_queue_without_a_usable_compute_environment_cancels_no_job() -> None:
     queues = [queue(limits=tuple(TimeLimit(code, 600) for code in (CAPACITY, MAXIMUM, REQUIREMENT)))]
     decisions = decide(
         snapshot(

@@ -158,7 +158,7 @@ some_timeouts = st.one_of(st.none(), st.sampled_from([60, 100, 200, 300, 1000]))
     jobs("w", some_timeouts, 8),
     st.lists(st.integers(0, 200), min_size=6, max_size=6),
 )
-def test_what_passes_the_head_does_not_delay_it(
+def test_jobs_that_pass_the_head_do_not_delay_it(
     hosts: list[Host], earlier: list[Waiting], waiting: list[Waiting], ages: list[int]
 ) -> None:
     first = decide(snapshot_of(hosts, earlier, [], NOW))
@@ -229,7 +229,7 @@ QUEUES = {
     "fair": Queue("fair", 3, ("bc", "ab"), FairShare(100, 40, {"s": 0.5}), ()),
     "low": Queue("low", 1, ("all", "bc"), None, (TimeLimit("CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY", 600),)),
 }
-POOLS = {
+COMPUTE_ENVIRONMENTS = {
     each.name: each
     for each in [
         compute_environment("ab", ("a", "b")),
@@ -245,7 +245,7 @@ class Cluster(RuleBasedStateMachine):
     @initialize()
     def begin(self) -> None:
         self.now = NOW
-        self.hosts, self.compute_environments = dict(HOSTS), dict(POOLS)
+        self.hosts, self.compute_environments = dict(HOSTS), dict(COMPUTE_ENVIRONMENTS)
         self.waiting: dict[str, Waiting] = {}
         self.running: dict[str, Running] = {}
         self.jobs: dict[str, tuple[Waiting, bool]] = {}
@@ -297,7 +297,7 @@ class Cluster(RuleBasedStateMachine):
         del self.running[data.draw(st.sampled_from(sorted(self.running)))]
         self.run_pass()
 
-    @rule(name=st.sampled_from(sorted(POOLS)))
+    @rule(name=st.sampled_from(sorted(COMPUTE_ENVIRONMENTS)))
     def switch_a_pool(self, name: str) -> None:
         self.compute_environments[name] = dataclasses.replace(
             self.compute_environments[name], enabled=not self.compute_environments[name].enabled
@@ -317,13 +317,13 @@ class Cluster(RuleBasedStateMachine):
 
     @invariant()
     def nothing_is_given_out_twice(self) -> None:
-        check_capacity(self.hosts.values(), POOLS, self.running.values())
+        check_capacity(self.hosts.values(), COMPUTE_ENVIRONMENTS, self.running.values())
 
     def teardown(self) -> None:
         """With all compute environments and hosts back, every job runs that can; only what never fits or is kept out remains."""
         if not hasattr(self, "now"):
             return
-        self.hosts, self.compute_environments = dict(HOSTS), dict(POOLS)
+        self.hosts, self.compute_environments = dict(HOSTS), dict(COMPUTE_ENVIRONMENTS)
         for _ in range(10 * len(self.jobs) + 10):
             self.run_pass()
             if ending := [each.job for each in self.running.values() if each.ending]:

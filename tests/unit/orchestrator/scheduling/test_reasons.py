@@ -25,7 +25,7 @@ from tests.support.orchestrator.scheduling import (
 # -- jobs that can never start ----------------------------------------------------------------------------------------
 
 
-def test_a_job_that_can_never_start_says_so_and_holds_up_nobody() -> None:
+def test_a_job_that_can_never_start_says_so_and_delays_no_other() -> None:
     waiting = line(job("huge", gang(node(64, 2))), job("small"))
     decisions = decide(snapshot([host(cpus=4, gpus=1), host("b", 2)], waiting))
     assert started(decisions) == "small:a"
@@ -51,7 +51,7 @@ def test_without_any_host_the_job_says_so() -> None:
     )
 
 
-def test_a_job_with_more_cpus_than_any_pool_may_use_says_so_and_holds_up_nobody() -> None:
+def test_a_job_with_more_cpus_than_any_compute_environment_may_use_says_so_and_holds_up_nobody() -> None:
     waiting = line(job("big", gang(node(2), node(2))), job("small"))
     queues, compute_environments = (
         [queue(compute_environments=("p", "q"))],
@@ -65,7 +65,7 @@ def test_a_job_with_more_cpus_than_any_pool_may_use_says_so_and_holds_up_nobody(
     )
 
 
-def test_a_job_that_each_pool_refuses_for_another_reason_hears_both() -> None:
+def test_the_reasons_of_all_refusing_compute_environments_are_reported() -> None:
     queues, compute_environments = (
         [queue(compute_environments=("p", "q"))],
         [compute_environment("p", max_cpus=1), compute_environment("q", ("b",))],
@@ -91,7 +91,7 @@ def test_a_job_that_each_pool_refuses_for_another_reason_hears_both() -> None:
         ([queue("another")], [compute_environment()]),
     ],
 )
-def test_a_queue_without_a_usable_pool_says_so(
+def test_a_queue_without_a_usable_compute_environment_says_so(
     queues: list[Queue], compute_environments: list[ComputeEnvironment]
 ) -> None:
     decisions = decide(snapshot([host()], [job("x")], queues=queues, compute_environments=compute_environments))

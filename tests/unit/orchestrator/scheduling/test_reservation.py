@@ -65,7 +65,7 @@ def test_no_timeout_is_short_enough_while_nobody_knows_when_the_head_starts() ->
     assert started(decide(snapshot([host()], waiting, held))) == ""
 
 
-def test_a_job_of_any_length_passes_beside_what_is_kept() -> None:
+def test_a_job_of_any_length_may_start_beside_a_reservation() -> None:
     # the head will be on b, from which nothing but its own room is taken; one CPU of b is left over
     held = [running("cart", on("b", 3))]
     waiting = line(
@@ -91,7 +91,7 @@ def test_short_jobs_use_what_is_kept_and_long_ones_what_is_not() -> None:
     assert started(decide(snapshot([host()], waiting, held))) == "short:a long:a"
 
 
-def test_what_long_jobs_take_together_leaves_the_head_its_room() -> None:
+def test_long_jobs_together_leave_the_head_its_resources() -> None:
     held = [running("cart", on("a", 4), timeout=700)]
     waiting = line(job("large", gang(node(5))), *[job(f"j{i}", timeout=9999) for i in range(5)])
     assert started(decide(snapshot([host(cpus=8)], waiting, held))) == "j0:a j1:a j2:a"
@@ -104,7 +104,7 @@ def test_gpus_are_kept_by_number() -> None:
     assert [(names([s.job]), s.placements[0].gpus) for s in decisions.starts] == [("j0", ("a2",))]
 
 
-def test_what_a_pool_may_use_is_kept_too() -> None:
+def test_the_limit_of_a_compute_environment_is_reserved_too() -> None:
     compute_environments = [compute_environment("p", max_cpus=4), compute_environment("q")]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("p",)), queue("three", 0, ("q",))]
     held = [running("cart", on("a", 1), compute_environment="p", timeout=700)]
@@ -156,7 +156,7 @@ def test_gangs_that_this_pass_starts_are_waited_for_like_others() -> None:
     )
 
 
-def test_what_comes_free_at_the_start_of_the_head_and_is_not_needed_is_not_kept() -> None:
+def test_resources_that_the_head_does_not_need_are_not_reserved() -> None:
     held = [running("x", on("a", 1), timeout=700), running("y", on("a", 1), timeout=700)]
     waiting = line(job("large", gang(node(3))), job("long"), job("longer"))
     assert started(decide(snapshot([host()], waiting, held))) == "long:a"
@@ -208,7 +208,7 @@ def test_a_job_that_waits_holds_up_only_the_hosts_it_could_use() -> None:
     assert reason(decisions, "two-next").startswith("2nd in queue two, behind job two-large (two-larg)")
 
 
-def test_a_job_with_several_pools_is_the_head_of_those_that_are_not_kept_yet() -> None:
+def test_a_job_with_several_compute_environments_is_the_head_of_those_that_are_not_kept_yet() -> None:
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     queues = [queue("one", 3, ("p",)), queue("both", 2, ("p", "q")), queue("two", 1, ("q",))]
     held = [
@@ -255,7 +255,7 @@ def test_equal_jobs_with_other_timeouts_are_each_judged_by_their_own() -> None:
     assert started(decisions) == "middle:b short:a"
 
 
-def test_a_job_of_a_lower_queue_may_fill_up_what_the_head_of_a_higher_one_can_not_use() -> None:
+def test_a_job_of_a_lower_queue_may_use_hosts_that_the_head_of_a_higher_one_can_not() -> None:
     queues = [queue("high", 2), queue("low", 1)]
     held = [running("cart", on("a", 2), timeout=700)]
     waiting = [job("large", gang(node(4)), queue="high"), job("short", queue="low", timeout=600, age=99)]
@@ -265,7 +265,7 @@ def test_a_job_of_a_lower_queue_may_fill_up_what_the_head_of_a_higher_one_can_no
 # -- what is kept for shares that are not active ----------------------------------------------------------------------
 
 
-def test_a_queue_keeps_part_of_its_pool_for_shares_that_are_not_active() -> None:
+def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_active() -> None:
     policy = FairShare(600, 50, {})
     waiting = line(*[job(f"j{i}", gang(node(1, 1)), share="s") for i in range(6)])
     decisions = decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=[queue(policy=policy)]))
@@ -288,14 +288,14 @@ def test_a_queue_keeps_part_of_its_pool_for_shares_that_are_not_active() -> None
         ({("default", "t"): 100.0}, [running("cart", queue="elsewhere", share="u")], 6),
     ],
 )
-def test_the_more_shares_are_active_the_less_is_kept(usage, extra, free) -> None:  # type: ignore[no-untyped-def]
+def test_more_active_shares_reduce_the_reservation(usage, extra, free) -> None:  # type: ignore[no-untyped-def]
     waiting = line(*[job(f"j{i}", gang(node(0.1, 1)), share="s") for i in range(9)])
     queues = [queue(policy=FairShare(600, 50, {}))]
     decisions = decide(snapshot([host(cpus=8, gpus=8)], waiting, extra, queues, usage=usage))
     assert len(decisions.starts) == free
 
 
-def test_use_of_the_queues_own_gangs_counts_and_that_of_others_does_not() -> None:
+def test_only_use_of_the_queues_own_gangs_counts() -> None:
     queues = [queue(policy=FairShare(600, 50, {})), queue("other")]
     held = [running("cart", on("a", 1.5), share="s"), running("ant", on("a", 4), queue="other")]
     waiting = line(job("x", gang(node(2)), share="s"), job("y", gang(node(3)), share="s"), job("z", share="s"))
@@ -308,13 +308,13 @@ def test_use_of_the_queues_own_gangs_counts_and_that_of_others_does_not() -> Non
     )
 
 
-def test_an_elastic_gang_shrinks_to_what_its_queue_may_use() -> None:
+def test_an_elastic_gang_shrinks_to_the_limit_of_its_queue() -> None:
     waiting = [job("ant", gang(*[node(1, 1)] * 6, minimum=2), share="s")]
     queues = [queue(policy=FairShare(600, 50, {}))]
     assert started(decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=queues))) == "ant:a+a+a+a"
 
 
-def test_what_is_kept_in_one_pool_may_be_free_in_the_next() -> None:
+def test_a_job_may_start_in_the_next_compute_environment_when_the_first_is_reserved() -> None:
     queues = [queue(compute_environments=("p", "q"), policy=FairShare(600, 50, {}))]
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     waiting = line(*[job(f"j{i}", share="s") for i in range(5)])

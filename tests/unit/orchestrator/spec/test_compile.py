@@ -99,7 +99,7 @@ def test_a_submission_names_job_queue_and_definition() -> None:
     assert compile_submission(spec, "arn:1") == {"jobName": "ant", "jobQueue": "gpu", "jobDefinition": "arn:1"}
 
 
-def test_what_a_submission_adds_is_added_on_every_node() -> None:
+def test_variables_of_a_submission_are_added_on_every_node() -> None:
     spec = validate({"name": "ant", "command": ["x"]}, "s")
     [override] = compile_submission(spec, "arn:1", {"MUSTER_RUN": "old"})["nodeOverrides"]["nodePropertyOverrides"]
     assert override == {
@@ -158,7 +158,7 @@ def test_of_two_equal_ranges_the_later_one_counts() -> None:
     assert {node.command for node in gang_needs(properties(*ranges)).nodes} == {("second",)}
 
 
-def test_a_range_may_reach_beyond_the_nodes_that_there_are() -> None:
+def test_a_range_may_exceed_the_existing_nodes() -> None:
     assert len(gang_needs(properties(("0:9", container()), count=2)).nodes) == 2
 
 
@@ -196,7 +196,7 @@ def test_a_gang_may_start_smaller_but_never_without_its_main_node(minimum: str, 
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(0.01, 64), st.integers(0, 8), st.integers(4, 10**6))
-def test_what_a_spec_asks_for_is_what_its_gang_needs(low: int, more: int, cpus: float, gpus: int, memory: int) -> None:
+def test_a_gang_needs_the_resources_of_its_spec(low: int, more: int, cpus: float, gpus: int, memory: int) -> None:
     cpus = round(cpus, 2)
     resources = {"cpus": cpus, "gpus": gpus, "memory": memory}
     needs = gang_needs(

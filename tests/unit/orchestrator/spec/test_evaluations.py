@@ -44,7 +44,7 @@ def test_every_second_checkpoint_is_due_however_many_retention_has_left() -> Non
     assert (known, found) == (Counted("00000040-e1", 0), 40)
 
 
-def test_while_one_is_evaluated_the_others_wait_and_then_the_newest_is_taken() -> None:
+def test_one_evaluation_runs_at_a_time_and_the_newest_checkpoint_is_next() -> None:
     known, _ = look(saved(10, 20), Counted())
     for iterations in ((10, 20, 30), (30, 40), (40, 50), (50, 60), (60, 70)):
         known, found = look(saved(*iterations), known, busy=True)
@@ -65,7 +65,7 @@ def test_a_later_epoch_is_newer_whatever_its_iteration() -> None:
     assert (known, found) == (Counted("00000040-e2", 0), 40)
 
 
-def test_what_earlier_jobs_of_the_run_have_saved_does_not_count() -> None:
+def test_checkpoints_of_earlier_jobs_do_not_count() -> None:
     assert first_count([*saved(10, 20), *saved(30, epoch=3)], 3) == Counted("00000020-e1")
     assert first_count(saved(30, epoch=3), 3) == first_count([], 1) == Counted()
 

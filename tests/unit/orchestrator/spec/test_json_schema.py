@@ -94,6 +94,6 @@ def test_the_json_schema_knows_the_configuration_of_each_task(task: str, config:
     assert taken == fine, "as the submission does"
 
 
-def test_the_json_schema_is_one() -> None:
+def test_the_json_schema_is_valid() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
     assert not any("PPO" in name for name in schema()["$defs"]), "how a task is trained has a section of its own"

@@ -77,13 +77,13 @@ def test_a_change_of_a_run_has_the_text_of_the_file_whatever_is_in_it() -> None:
 
 
 @pytest.mark.parametrize("train", [_train() | {"task": "elsewhere.mine:Task"}, {"config": 3}, None])
-def test_where_no_field_is_known_to_name_a_file_nothing_is_read(train: Any) -> None:
+def test_no_file_is_read_for_fields_that_name_none(train: Any) -> None:
     if isinstance(train, dict) and "task" in train:
         train["config"] = {"reward_function": "missing.py"}
     assert with_files({"name": "other", "train": train}, "job.yaml") == {"name": "other", "train": train}
 
 
-def test_what_is_wrong_with_a_file_is_told_at_the_line_that_names_it(directory: Path) -> None:
+def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Path) -> None:
     (directory / "mine.py").write_text("import os\n" + GOOD)
     with pytest.raises(SpecError) as refused:
         specfile.load("job.yaml")
@@ -124,3 +124,28 @@ def test_an_action_space_is_checked_when_its_file_is_read(directory: Path, conte
     (directory / "space.json").write_bytes(content)
     with pytest.raises(SpecError, match=said):
         config(["train.config.action_space=space.json"])
+
+
+def in_yaml(code: str) -> str:
+    """The job with a text in the place of its path."""
+    lines = "".join(f"        {line}\n" for line in code.splitlines())
+    return JOB.replace("reward_function: mine.py\n", f"reward_function:\n      file: mine.py\n      text: |\n{lines}")
+
+
+def test_a_request_brings_texts_and_no_path_of_the_servers_files() -> None:
+    code = "def reward_function(params):\n    return params['speed']\n"
+    found = specfile.from_text(in_yaml(code), "job").train
+    assert found is not None and found.config["reward_function"] == {"file": "mine.py", "text": code}
+    with pytest.raises(
+        SpecError, match=r"^job:7: train\.config\.reward_function: found a path; .* \{file: NAME, text: …\}$"
+    ):
+        specfile.from_text(JOB, "job")
+    with pytest.raises(SpecError, match=r"^job:7: train\.config\.action_space: found a path; .* the value in it$"):
+        specfile.from_text(JOB.replace("reward_function: mine.py", "action_space: space.json"), "job")
+
+
+def test_a_text_that_fails_on_a_sample_is_refused_under_the_name_of_its_file_where_it_is_tried() -> None:
+    fails = in_yaml("def reward_function(params):\n    return params['sped']\n")
+    assert specfile.from_text(fails, "job", whole=False).name == "racer"
+    with pytest.raises(SpecError, match=r"^job:7: train\.config\.reward_function: mine\.py:2: TEST_FAILURE: .*sped"):
+        specfile.from_text(fails, "job")

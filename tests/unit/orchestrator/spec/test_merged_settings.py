@@ -74,7 +74,7 @@ def test_rules_over_several_settings_are_refused_with_file_line_and_key(
     assert str(refused.value) == f"{path}:{8 if given else 7}: {key}{said}"
 
 
-def test_what_the_job_gives_goes_before_what_the_task_has(tmp_path: Path) -> None:
+def test_settings_of_the_job_override_those_of_the_task(tmp_path: Path) -> None:
     for task, algorithm, settings in (
         ("Cartpole", "sac", "{policy_delay: 3, updates: 9}"),
         ("CartpolePixels", "ppo", "{channels: [8], kernel_sizes: [3], strides: [1]}"),
@@ -90,7 +90,7 @@ def test_what_the_job_gives_goes_before_what_the_task_has(tmp_path: Path) -> Non
         load(str(file))
 
 
-def test_a_task_that_is_not_known_here_is_left_to_its_rank(tmp_path: Path) -> None:
+def test_an_unknown_task_is_left_to_its_rank(tmp_path: Path) -> None:
     for algorithm, settings in (("ppo", "minibatches: 64"), ("sac", "updates: 3"), ("rsl_rl", "obs_groups: {a: [b]}")):
         load(job(tmp_path, "my_task:Task", algorithm, settings))
 

@@ -80,6 +80,9 @@ MISSING = {
     f"{COMMAND}{TRAIN}\n": (
         "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found train and command"
     ),
+    f"{COMMAND}train: {{task: Ant}}\n": (
+        "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found train and command"
+    ),
     "name: a\ntrain: {worlds: 4, iterations: 2}\n": "job.yaml:2: train.task: is required",
     "name: a\nevaluate: {}\n": "job.yaml:2: evaluate.run: is required",
     "name: a\nrace: {laps: 3}\n": "job.yaml:2: race.laps: unknown key; valid here: "
@@ -200,22 +203,22 @@ NOT_YAML = {
 
 
 @pytest.mark.parametrize("text", WRONG_KEYS)
-def test_a_wrong_key_is_told_with_its_line_and_the_nearest_valid_one(tmp_path: Path, text: str) -> None:
+def test_a_wrong_key_is_reported_with_its_line_and_the_nearest_valid_one(tmp_path: Path, text: str) -> None:
     assert problem(tmp_path, text) == WRONG_KEYS[text]
 
 
 @pytest.mark.parametrize("text", MISSING)
-def test_what_is_missing_is_told(tmp_path: Path, text: str) -> None:
+def test_missing_keys_are_reported(tmp_path: Path, text: str) -> None:
     assert problem(tmp_path, text) == MISSING[text]
 
 
 @pytest.mark.parametrize("text", WRONG_VALUES)
-def test_a_wrong_value_is_told_with_its_line_and_what_was_expected(tmp_path: Path, text: str) -> None:
+def test_a_wrong_value_is_reported_with_its_line_and_the_expected_kind(tmp_path: Path, text: str) -> None:
     assert problem(tmp_path, text) == WRONG_VALUES[text]
 
 
 @pytest.mark.parametrize("text", NOT_YAML)
-def test_what_is_not_yaml_is_told_with_its_line(tmp_path: Path, text: str | bytes) -> None:
+def test_text_that_is_not_yaml_is_reported_with_its_line(tmp_path: Path, text: str | bytes) -> None:
     assert problem(tmp_path, text).startswith(NOT_YAML[text])
 
 
@@ -252,7 +255,7 @@ def test_any_document_is_a_spec_or_refused_in_one_line(document: object) -> None
 # -- overrides --------------------------------------------------------------------------------------------------------
 
 
-def test_a_value_given_on_the_command_line_counts(tmp_path: Path) -> None:
+def test_a_value_on_the_command_line_takes_effect(tmp_path: Path) -> None:
     path = tmp_path / "job.yaml"
     path.write_text(f"name: a\n{TRAIN}\n")
     spec = load(str(path), ["train.iterations=9", "train.ppo.clip=0.3", "nodes={min: 1, max: 2}", "name=b"])
@@ -294,7 +297,7 @@ def test_overriding_leaves_the_document_as_it_was() -> None:
         ("train.ppo.clp=0.3", "--set: train.ppo.clp: unknown key; did you mean clip?"),
     ],
 )
-def test_a_wrong_override_is_told(tmp_path: Path, assignment: str, said: str) -> None:
+def test_a_wrong_override_is_reported(tmp_path: Path, assignment: str, said: str) -> None:
     assert problem(tmp_path, f"name: a\n{TRAIN}\n", assignment) == said
 
 
@@ -327,7 +330,7 @@ def test_a_node_has_one_rank_a_gpu_and_at_least_one(gpus: int, ranks: int) -> No
     assert validate({"name": "a", "command": ["x"], "resources": {"gpus": gpus}}, "s").ranks_per_node == ranks
 
 
-def test_a_task_of_one_s_own_is_taken_by_module_and_class() -> None:
+def test_a_users_task_is_named_by_module_and_class() -> None:
     document = {"name": "a", "train": {"task": "my_robot.tasks:Walker", "worlds": 1, "iterations": 1}}
     assert validate(document, "s").train.task == "my_robot.tasks:Walker"  # type: ignore[union-attr]
 
@@ -336,7 +339,7 @@ def test_the_known_tasks_are_the_installed_ones() -> None:
     assert known_tasks() == TASKS.split(", ")
 
 
-def test_there_is_a_spec_to_copy() -> None:
+def test_example_specs_are_shipped() -> None:
     assert {path.name for path in SHIPPED} >= {"ant.yaml", "cartpole.yaml", "all-reduce.yaml"}
 
 

@@ -264,7 +264,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("key", [key for key in ALGORITHMS["rsl_rl"].fixed if "." in key])
-def test_what_is_fixed_inside_a_section_is_refused_by_its_whole_name(key: str) -> None:
+def test_a_fixed_setting_inside_a_section_is_refused_by_its_full_name(key: str) -> None:
     required = {"num_outputs": 4, "weight": 1.0, "predictor_hidden_dims": [8], "target_hidden_dims": [8]}
     curious = {"algorithm": {"rnd_cfg": required}} if "rnd_cfg" in key else {}
     value = VALUES.get(key.rpartition(".")[2], "other")
@@ -319,7 +319,7 @@ def test_a_learning_rate_that_takes_effect_or_is_in_effect_is_accepted(tmp_path:
     _check_rate(RUN, saved_with(tmp_path / "fixed", 0.0010000000474974513, name, form), after, [form])
 
 
-def test_two_options_that_say_the_same_are_refused() -> None:
+def test_two_options_for_the_same_setting_are_refused() -> None:
     assert Changes(assignments=("train.iterations=3",), nodes=4).all() == ["train.iterations=3", "nodes=4"]
     assert Changes(assignments=("nodes=2",)).all() == ["nodes=2"]
     for assignment in ("nodes=2", "nodes.max=2"):

@@ -211,7 +211,7 @@ def test_a_task_of_an_installed_package_is_checked_by_the_class_that_it_names() 
 
 
 @pytest.mark.usefixtures("reach")
-def test_what_can_not_be_checked_here_is_left_to_the_rank() -> None:
+def test_settings_that_need_the_task_are_left_to_the_rank() -> None:
     submit("Broken", {"anything": 1})
     submit("Careless", {"reach": 2})
     submit("job_specs.my_task:Pendulum", {"anything": 1})

@@ -94,7 +94,7 @@ def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, k
         ({"secrets": {"KEY": 3}}, "job.yaml: secrets.KEY: expected a text, found a whole number (3)"),
     ],
 )
-def test_what_cannot_be_tracked_or_given_is_refused_in_one_line(changes: dict[str, Any], said: str) -> None:
+def test_invalid_tracking_and_secrets_are_refused_in_one_line(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(SpecError) as refused:
         validate(spec(**changes), "job.yaml")
     assert str(refused.value) == said and "word@" not in str(refused.value)

@@ -23,7 +23,7 @@ def heard(main: MainEnd) -> Loss:
     return found
 
 
-def test_a_child_s_last_word_counts_and_a_cut_line_is_a_death() -> None:
+def test_a_childs_last_message_counts_and_a_cut_connection_is_a_death() -> None:
     main = MainEnd(contract(0, 4, "127.91.0.1"))
     children = [ChildEnd(contract(node, 4, "127.91.0.1")) for node in (1, 2, 3)]
     for child in children:
@@ -40,7 +40,7 @@ def test_a_child_s_last_word_counts_and_a_cut_line_is_a_death() -> None:
     assert main.lost() is None, "told once"
 
 
-def test_a_death_without_a_word_and_a_stranger() -> None:
+def test_a_cut_connection_is_a_death_and_that_of_a_stranger_is_not() -> None:
     main = MainEnd(contract(0, 2, "127.91.0.2"))
     stranger = socket.create_connection(("127.91.0.2", lifeline.PORT))
     stranger.sendall(b"GET / HTTP/1.0\r\n\r\n[1]\n{}\n")
@@ -52,7 +52,7 @@ def test_a_death_without_a_word_and_a_stranger() -> None:
     assert heard(main).reason == "node 1 vanished: its supervisor or its host died"
 
 
-def test_what_no_child_would_say_is_passed_over() -> None:
+def test_messages_that_no_child_sends_are_ignored() -> None:
     main, ours = MainEnd(contract(0, 2, "127.91.0.4")), contract(0, 2, "127.91.0.4").gang
     strangers = [
         *({"gang": ours}, {"gang": ours, "node": "1"}, {"gang": ours, "node": None, "code": 3}),

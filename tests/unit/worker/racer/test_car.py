@@ -67,7 +67,7 @@ def _drive(starts: wp.array(dtype=Motion), asked: wp.array(dtype=wp.vec2), lags:
     car = wp.tid()
     motion = starts[car]
     for _ in range(15):
-        motion = drive(motion, asked[car][0], asked[car][1], lags[0], lags[1], 1.0 / 15.0, 4)
+        motion = drive(motion, asked[car][0], asked[car][1], 0.0, lags[0], lags[1], 1.0 / 15.0, 4)
     ends[car] = motion
 
 

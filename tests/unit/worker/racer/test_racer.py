@@ -187,6 +187,24 @@ def test_factors_say_how_the_car_obeys() -> None:
     assert 0.1 + 1.2 * 0.2618 <= steerings.min() < steerings.max() <= 0.2 + 1.4 * 0.2618 + 1e-4
 
 
+def test_friction_bounds_how_fast_the_car_turns() -> None:
+    """At 2 m/s and 30 degrees a car that never slides turns by 7.0 rad/s; tyres of 0.4 to 0.6 bear half of that, and are drawn for each episode."""
+    turned = []
+    for friction in ((0.0, 0.0), (0.4, 0.6)):
+        task = racer(64, track="oval", speed_lag=0.0, steering_lag=0.0, friction=friction)
+        before = known(task, "poses")[:, 2]
+        task.step(torch.tensor([[1.0, 1.0]] * 64))
+        turned.append((known(task, "poses")[:, 2] - before) * 15.0)
+    np.testing.assert_allclose(turned[0], 2.0 * math.tan(math.pi / 6) / 0.164, rtol=1e-4)
+    bounds = [9.81 * coefficient / 2.0 for coefficient in (0.4, 0.6)]
+    assert bounds[0] - 1e-3 <= turned[1].min() < 2.1 and 2.8 < turned[1].max() <= bounds[1] + 1e-3
+    slow = racer(1, track="oval", speed_lag=0.0, steering_lag=0.0, friction=(0.5, 0.5))
+    slow.step(torch.tensor([[0.2, -1.0]]))  # 0.5 m/s and 6 degrees: nothing slides
+    free = racer(1, track="oval", speed_lag=0.0, steering_lag=0.0)
+    free.step(torch.tensor([[0.2, -1.0]]))
+    np.testing.assert_array_equal(known(slow, "poses"), known(free, "poses"))
+
+
 def test_choices_are_those_of_the_metadata() -> None:
     task = racer(5, track="oval", action_space=DISCRETE)
     assert task.discrete and task.action_names[0] == "0: 30 degrees, 0.6 m/s" and task.actions.shape == (5, 1)
@@ -250,8 +268,8 @@ REFUSED = {
     ),
     "mass": (
         {"randomize": {"mass": [0.5, 2]}},
-        "config.randomize.mass: the car moves as a kinematic bicycle, which has none; "
-        "use speed_factor, steering_factor and steering_offset",
+        "config.randomize.mass: the car moves as a kinematic bicycle, without an engine's contacts; use "
+        "train.config.speed_factor, steering_factor and steering_offset",
     ),
     "a push": (
         {"randomize": {"push_interval": 1.0, "push_velocity": 1.0}},

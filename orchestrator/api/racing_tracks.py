@@ -1,0 +1,38 @@
+"""The tracks that a racer's job names: there before the job is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from orchestrator.api.errors import ClientError
+from orchestrator.spec.settings import task_config
+from shared_store.layout import Store
+from shared_store.leagues import LeagueError, digest_of_track
+
+
+def check_tracks(store: Store, spec: Mapping[str, Any] | None) -> None:
+    """Raise ClientError where a training of an installed racer's task names a track that does not exist or is damaged."""
+    train = (spec or {}).get("train")
+    task = train.get("task") if isinstance(train, Mapping) else None
+    if not isinstance(train, Mapping) or not isinstance(task, str):
+        return
+    kind, config = task_config(task), train.get("config")
+    if kind is not None and kind.races and isinstance(config, Mapping):
+        check_names(store, config.get("track"), "train.config.track")
+
+
+def check_names(store: Store, named: Any, key: str) -> None:
+    """Raise ClientError where a track does not exist or is damaged.
+
+    Args:
+        store: Where tracks lie.
+        named: One name, or a list of them; anything else is the schema's matter.
+        key: Of the spec, which names them.
+    """
+    for name in [named] if isinstance(named, str) else named if isinstance(named, list | tuple) else []:
+        if isinstance(name, str):
+            try:
+                digest_of_track(store, name)
+            except LeagueError as error:
+                raise ClientError(f"{key}: {error}") from None

@@ -1,0 +1,142 @@
+"""The model registry: where each policy comes from, how it was evaluated, and whether it is as it was registered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import Query, Request, Response
+
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.model_routes import list_models, read_model
+from orchestrator.api.native.run_routes import run_detail
+from orchestrator.console.lineage import drawing
+from orchestrator.console.pages import render
+from orchestrator.console.routing import page_router
+from orchestrator.console.submit_fields import written
+from shared_store.files import DamagedFile
+
+router = page_router()
+
+_MOST_VERSIONS = 30
+"""Versions of a model that its graph shows: the newest, and the one that is looked at."""
+
+
+@router.get("/models")
+def models(request: Request) -> Response:
+    """The newest version of each model."""
+    return render(request, "models.html", models=[_row(each) for each in list_models(request)])
+
+
+@router.get("/models/{name}")
+def model(
+    request: Request, name: str, version: int | None = Query(default=None, ge=1), verify: bool = Query(default=False)
+) -> Response:
+    """A version of a model; with ``verify`` every file of it is read."""
+    found = read_model(request, name, version, verify)
+    chosen = found["version"]
+    shown = sorted({*found["versions"][-_MOST_VERSIONS:], chosen})
+    versions = [found if each == chosen else _version(request, name, each) for each in shown]
+    graph = drawing([each for each in versions if each], chosen, lambda run: _parent(request, run), _link)
+    evaluations = [_evaluation(each) for each in found.get("evaluations") or []]
+    facts = {
+        "Task": found.get("task"),
+        "Algorithm": found.get("algorithm"),
+        "Run": f"{found.get('run')}@{found.get('iteration')}",
+        "Score": _number(found.get("score")),
+        "Return of the bundle": _number(((found.get("judged") or {}).get("bundle") or {}).get("mean_return")),
+        "Made with": ", ".join(f"{key} {value}" for key, value in (found.get("made_with") or {}).items()),
+        "Registered by": found.get("registered_by"),
+        "Queue": found.get("queue"),
+        "Weights (SHA-256)": found.get("weights"),
+        "Directory": found.get("path"),
+    }
+    return render(
+        request,
+        "model.html",
+        model=found,
+        row=_row(found),
+        facts=list(facts.items()),
+        graph=graph,
+        evaluations=evaluations,
+        problem=found.get("problem", ""),
+        verified=found.get("verified", False),
+        spec=written(found["spec"]) if isinstance(found.get("spec"), dict) else "",
+        contract=_contract(found.get("contract")),
+    )
+
+
+def _link(run: str) -> str:
+    return f"/runs/{run}"
+
+
+def _version(request: Request, name: str, version: int) -> Mapping[str, Any] | None:
+    """Another version of the model; None of one that the caller may not see or that is damaged."""
+    try:
+        found: Mapping[str, Any] = read_model(request, name, version, False)
+        return found if found.get("run") else None
+    except (ClientError, DamagedFile):
+        return None
+
+
+def _parent(request: Request, run: str) -> Mapping[str, Any] | None:
+    """What a run is a clone of, where the caller may know it."""
+    try:
+        parent = run_detail(request, run).get("parent")
+    except (ClientError, DamagedFile, OSError):
+        return None
+    return parent if isinstance(parent, Mapping) else None
+
+
+def _row(model: Mapping[str, Any]) -> dict[str, Any]:
+    registered = model.get("registered")
+    own = [each for each in model.get("evaluations") or [] if not each.get("config")]
+    best = max(own, key=lambda each: each["episodes"], default=None)
+    return {
+        "name": model["name"],
+        "version": model["version"],
+        "task": model.get("task") or "",
+        "run": model.get("run") or "",
+        "iteration": model.get("iteration", ""),
+        "return": _number(best["mean_return"] if best else model.get("score")),
+        "registered": int(registered * 1000) if isinstance(registered, int | float) else None,
+        "problem": model.get("problem", ""),
+    }
+
+
+def _evaluation(each: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "name": each.get("name"),
+        "return": _number(each["mean_return"]),
+        "length": f"{each['mean_length']:.1f} of {each['max_length']}",
+        "episodes": each["episodes"],
+        "seed": each.get("seed"),
+        "changes": written(each["config"]).strip() if each.get("config") else "",
+        "time": int(each["time"] * 1000),
+    }
+
+
+def _contract(contract: Any) -> list[tuple[str, str]]:
+    """What goes in and out of the policy, in a few words."""
+    if not isinstance(contract, Mapping):
+        return []
+    seen = {
+        f"Observations: {group['name']}": _named(group.get("terms")) or " × ".join(map(str, group["shape"]))
+        for group in contract.get("groups") or ()
+    }
+    facts = {
+        "Control rate": f"{contract.get('control_hz'):g} Hz",
+        **seen,
+        "Actions": ", ".join(map(str, contract.get("action_names") or ())),
+        "Commands": _named(contract.get("commands")),
+        "Recurrent state": _named(contract.get("states")),
+    }
+    return list(facts.items())
+
+
+def _named(parts: Any) -> str:
+    return ", ".join(str(each["name"]) for each in parts or ())
+
+
+def _number(value: Any) -> str:
+    return f"{value:.2f}" if isinstance(value, int | float) else ""

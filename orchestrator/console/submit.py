@@ -1,0 +1,226 @@
+"""Submitting a job: a wizard for a task or the racer, plain YAML, and a look at both before anything is submitted."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import Depends, Query, Request, Response
+from fastapi.responses import JSONResponse
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.context import queue_names, reconciler_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native import routes
+from orchestrator.api.native.routes import PlanRequest
+from orchestrator.api.permissions import Operation
+from orchestrator.console.forms import TOKEN, Form, done, sent_form
+from orchestrator.console.pages import render
+from orchestrator.console.routing import page_router
+from orchestrator.console.submit_fields import Group, document, filled, groups, races, tasks, written
+from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
+from orchestrator.console.tracks import track_names
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.file import from_text
+from orchestrator.spec.model import Spec
+from shared_store.wording import nearest
+
+router = page_router()
+
+BEGINNING = """\
+name: my-job
+queue: default
+nodes: 1
+resources: {cpus: 1, gpus: 0, memory: 2GiB}
+train:
+  task: Cartpole
+  worlds: 128
+  iterations: 100
+"""
+_AT_ONCE, _PATIENCE = threading.BoundedSemaphore(2), 20.0
+"""Reward functions that are tried at once, each in a process of its own; and seconds for which the others wait."""
+
+
+@router.get("/submit")
+def choose(request: Request) -> Response:
+    """What is to be trained."""
+    permissions.check(Operation.SUBMIT_JOB)
+    racers = {name: about for name, about in tasks().items() if races(name)}
+    others = {name: about for name, about in tasks().items() if name not in racers}
+    return render(request, "submit.html", racers=racers, tasks=others)
+
+
+@router.get("/submit/task/{task}")
+def wizard(request: Request, task: str) -> Response:
+    """The wizard for a task."""
+    return _wizard(request, task, _groups(request, task), None)
+
+
+@router.post("/submit/task/{task}")
+def wizard_again(request: Request, task: str, form: Form = Depends(sent_form)) -> Response:
+    """The wizard with what was filled in before."""
+    return _wizard(request, task, filled(form, _groups(request, task)), None)
+
+
+@router.get("/submit/yaml")
+def plain(request: Request, job: str = Query(default="", max_length=200)) -> Response:
+    """The YAML editor; with ``job`` the spec of that job, to submit a changed one."""
+    text = BEGINNING
+    if job:
+        spec = routes.job_detail(request, job)["spec"]
+        if not spec:
+            raise ClientError(f"job {job} was not submitted with a job YAML")
+        text = written(spec)
+    return _editor(request, text, None)
+
+
+@router.post("/submit/yaml")
+def plain_again(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """The YAML editor with a text: the wizard's, or what was written before."""
+    return _editor(request, _text(request, form)[0], None)
+
+
+@router.post("/submit/check")
+def check(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """The YAML of what is filled in, what is wrong with it, and help for a line; ``whole`` also tries a reward function."""
+    permissions.check(Operation.SUBMIT_JOB)
+    text, _ = _text(request, form)
+    spec, problem = _checked(text, form.one("whole") == "yes")
+    line = form.one("line")
+    return JSONResponse(
+        {
+            "yaml": text,
+            "problem": problem and problem.document(),
+            "notes": list(spec.notes) if spec else [],
+            "help": help_at(text, int(line)) if line.isascii() and line.isdigit() and len(line) < 7 else None,
+        }
+    )
+
+
+@router.post("/submit/review")
+def review(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """The YAML and what would start where; or the form again, with what is wrong."""
+    permissions.check(Operation.SUBMIT_JOB)
+    text, task = _text(request, form)
+    spec, problem = _checked(text, whole=True)
+    plan: dict[str, Any] = {}
+    unplanned = ""
+    if spec is not None:
+        body = PlanRequest(definition=compile_definition(spec, ""), queue=spec.queue)
+        problem = _unfit(request, spec, body)
+        try:
+            plan = {} if problem else routes.plan(request, body)
+        except ClientError as error:
+            unplanned = str(error)
+    if spec is None or problem is not None:
+        if task:
+            return _wizard(request, task, filled(form, _groups(request, task)), problem, 400)
+        return _editor(request, text, problem, 400)
+    fields = [(name, value) for name, values in form.fields.items() for value in values if name != TOKEN]
+    return render(
+        request, "submit_review.html", spec=spec, text=text, plan=plan, unplanned=unplanned, task=task, fields=fields
+    )
+
+
+@router.post("/submit")
+def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """Submit the job of a YAML, as ``muster submit`` does."""
+    permissions.check(Operation.SUBMIT_JOB)
+    text = _lines(form.one("yaml"))
+    spec, problem = _checked(text, whole=True)
+    if spec is None:
+        assert problem is not None
+        raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
+    reconciler = reconciler_of(request)
+    definition = compile_definition(spec, "")
+    if unfit := _unfit(request, spec, PlanRequest(definition=definition, queue=spec.queue)):
+        raise ClientError(unfit.message)
+    registered = batch.call(reconciler, "RegisterJobDefinition", definition)
+    answer = batch.call(reconciler, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
+    return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']} as {answer['jobId'][:8]}")
+
+
+def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
+    """Why the job could never start."""
+    try:
+        problem = routes.fits(request, body)["problem"]
+    except permissions.Refusal:
+        raise
+    except ClientError as error:
+        return Problem(str(error), "queue" if "queue" in str(error) else "")
+    if problem and problem.startswith("evaluation: "):
+        return Problem(problem.removeprefix("evaluation: "), "evaluation")
+    return Problem(problem, "resources.cpus") if problem else None
+
+
+def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
+    """The spec of a text, or what is wrong with it.
+
+    A learner's code runs here for keys with all queues alone, since what guards it is no sandbox: of others, the text of a reward
+    function is checked here, and the job's ranks try it.
+    """
+    tries = whole and permissions.current_identity.get().queues is None
+    if tries and not _AT_ONCE.acquire(timeout=_PATIENCE):
+        raise ClientError("other reward functions are being tried; try again in a moment", 429)
+    try:
+        return from_text(text, SOURCE, whole=tries), None
+    except SpecError as error:
+        return None, problem_of(str(error), text)
+    finally:
+        if tries:
+            _AT_ONCE.release()
+
+
+def _text(request: Request, form: Form) -> tuple[str, str]:
+    """The YAML of a form, and the wizard's task; that is empty where the form has the YAML itself."""
+    if not (task := form.one("task")):
+        return _lines(form.one("yaml")), ""
+    return written(document(task, filled(form, _groups(request, task)))), task
+
+
+def _lines(text: str) -> str:
+    """As it was written: a form sends lines that end with CR and LF."""
+    return text.replace("\r\n", "\n")
+
+
+def _groups(request: Request, task: str) -> list[Group]:
+    permissions.check(Operation.SUBMIT_JOB)
+    if task not in tasks():
+        raise ClientError(f"no task is called {task[:100]!r}; {nearest(task, list(tasks()))}", 404)
+    with reconciler_of(request).database.session() as session:
+        return groups(task, queue_names(session))
+
+
+def _wizard(
+    request: Request, task: str, found: Sequence[Group], problem: Problem | None, status: int = 200
+) -> Response:
+    text = written(document(task, found))
+    there, missing = track_names(request) if races(task) else ([], "")
+    names = [each.name for group in found for each in group.fields]
+    return render(
+        request,
+        "submit_task.html",
+        status,
+        task=task,
+        about=tasks()[task],
+        groups=found,
+        text=text,
+        tracks=there,
+        no_tracks=missing,
+        problem=problem,
+        wrong_name=_nearest_field(problem.key, names) if problem else "",
+        tries=permissions.current_identity.get().queues is None,
+    )
+
+
+def _nearest_field(key: str, names: Sequence[str]) -> str:
+    """The field in which a key of the YAML stands; empty where none is."""
+    return max((name for name in names if f"{key}.".startswith(f"{name}.")), key=len, default="")
+
+
+def _editor(request: Request, text: str, problem: Problem | None, status: int = 200) -> Response:
+    permissions.check(Operation.SUBMIT_JOB)
+    return render(request, "submit_yaml.html", status, text=text, problem=problem, help=help_at(text, 1))

@@ -1,0 +1,303 @@
+"""The wizard's fields, made of the published schema; and the YAML that the filled fields are."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, Literal
+
+import yaml
+
+from orchestrator.console.forms import Form
+from orchestrator.spec import strict_yaml
+from orchestrator.spec.json_schema import schema
+from orchestrator.spec.model import ALGORITHMS
+from orchestrator.spec.settings import task_config
+from orchestrator.spec.values import known_tasks
+from shared_store.file_fields import kept_files
+
+CODE = "reward_function.py"
+"""What messages call the code of the wizard's editor."""
+EXAMPLE = '''def reward_function(params):
+    """Keep to the middle of the road, and drive fast."""
+    if not params["all_wheels_on_track"]:
+        return 1e-3
+    middle = 1.0 - (2.0 * params["distance_from_center"] / params["track_width"]) ** 2
+    return max(1e-3, middle) * params["speed"]
+'''
+_JOB = ("name", "queue", "nodes", "resources.cpus", "resources.gpus", "resources.memory")
+_TRAINING = ("train.worlds", "train.iterations", "train.seed", "train.algorithm")
+_MORE = (
+    *("checkpoint.every", "checkpoint.keep", "evaluation.every", "evaluation.episodes", "retry.attempts"),
+    *("on_child_failure", "timeout", "stall_timeout", "priority", "share", "preemptible", "image"),
+)
+_FIRST = {"nodes": "1", "resources.cpus": "1", "train.worlds": "128", "train.iterations": "100"}
+"""Values with which the wizard begins."""
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
+"""A number that YAML takes for a text."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of the wizard; what is left empty is not in the YAML."""
+
+    name: str
+    """The key path in the YAML."""
+    kind: Literal["text", "value", "choice", "code", "tracks"] = "value"
+    """``text``: as it stands; ``value``: read as YAML; ``choice``: one of the options; ``code``: a file's text; ``tracks``: names."""
+    options: tuple[str, ...] = ()
+    value: str = ""
+    placeholder: str = ""
+    hint: str = ""
+    required: bool = False
+    is_text: bool = False
+    """Whether an option is a text, and not a value of YAML."""
+
+    @property
+    def label(self) -> str:
+        return self.name.rpartition(".")[2]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Fields under one heading."""
+
+    title: str
+    fields: tuple[Field, ...]
+    is_open: bool = False
+    algorithm: str = ""
+    """The algorithm without which the group is left out; empty for all."""
+    hint: str = ""
+
+
+@cache
+def job_schema() -> dict[str, Any]:
+    """The schema that the installation publishes."""
+    return schema()
+
+
+def plain(about: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A part of the schema without references, and without the null of what may be absent."""
+    while True:
+        kinds = [each for each in about.get("anyOf", ()) if each.get("type") != "null"]
+        if "$ref" in about:
+            named = job_schema()["$defs"][about["$ref"].rpartition("/")[2]]
+            about = {**named, **{key: value for key, value in about.items() if key != "$ref"}}
+        elif len(kinds) == 1:
+            about = {**kinds[0], **{key: value for key, value in about.items() if key != "anyOf"}}
+        else:
+            return about
+
+
+def config_schema(task: str) -> Mapping[str, Any] | None:
+    """What ``train.config`` may hold of a task; None of one that does not say it."""
+    for each in job_schema()["$defs"]["Train"]["allOf"]:
+        if each["if"]["properties"]["task"]["const"] == task:
+            found: Mapping[str, Any] = each["then"]["properties"]["config"]
+            return found
+    return None
+
+
+@cache
+def tasks() -> Mapping[str, str]:
+    """The installed tasks, and a sentence about each."""
+    about = {name: (config_schema(name) or {}).get("description", "") for name in known_tasks()}
+    return {name: _sentence(text) for name, text in about.items()}
+
+
+def _sentence(text: str) -> str:
+    """The first line of a docstring, without its markup."""
+    line = re.sub(r":\w+:|`|(?<=\w)Config\b", "", text.partition("\n")[0])
+    return line.partition(" Rewards: see")[0]
+
+
+@cache
+def races(task: str) -> bool:
+    """Whether a task drives on tracks."""
+    kind = task_config(task)
+    return kind is not None and bool(kind.races)
+
+
+def groups(task: str, queues: Sequence[str]) -> list[Group]:
+    """The wizard's fields for a task. ``queues``: those to which the caller may submit."""
+    named = {"name": re.sub(r"[^A-Za-z0-9_-]", "-", task).strip("-").lower(), **_FIRST}
+    own = {"queue": tuple(queues), "train.algorithm": tuple(ALGORITHMS)}
+    chosen = {"queue": "default" if "default" in queues else next(iter(queues), ""), "train.algorithm": "ppo"}
+
+    def job(*names: str) -> tuple[Field, ...]:
+        found = [_field(name, _at(name)) for name in names]
+        return tuple(
+            replace(each, kind="choice", options=own[each.name], is_text=True, value=chosen[each.name], required=True)
+            if each.name in own
+            else replace(each, value=named.get(each.name, ""), required=each.name in named)
+            for each in found
+        )
+
+    found = [Group("Job", job(*_JOB), True), Group("Training", job(*_TRAINING), True)]
+    found += _racer(task) if races(task) else []
+    config = config_schema(task)
+    if config is None:
+        hint = "What this task accepts is not published here; its ranks check it."
+        found.append(Group("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
+    else:
+        left_out = {*kept_files(task_config(task)), *(("track",) if races(task) else ())}
+        found += _groups("Task", config["properties"], "train.config", left_out)
+    for name in ALGORITHMS:
+        section = job_schema()["$defs"][f"Settings_{name}"]
+        hint = "What is left empty stays as the task has it."
+        found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", (), name, hint)
+    return [*found, Group("More", job(*_MORE))]
+
+
+def _racer(task: str) -> list[Group]:
+    """What is asked of a racer's task besides: track, action space, reward function, hyperparameters."""
+    kind = task_config(task)
+    assert kind is not None
+    space = json.dumps(kind().action_space, indent=1, default=dict)
+    hint = (
+        "In degrees and m/s, as in DeepRacer's model_metadata.json: continuous ranges, or a list of discrete actions."
+    )
+    tracks = Field("train.config.track", "tracks", value="oval", hint="With several, the worlds take turns.")
+    reward = Field("train.config.reward_function", "code", value=EXAMPLE)
+    names = [Field(f"train.hyperparameters.{each}") for each in kind.hyperparameters]
+    theirs = "DeepRacer's names; they become settings of the algorithm, so give each in one place."
+    told = "Python, as DeepRacer has it: def reward_function(params). Empty: the rewards of the task."
+    return [
+        Group("Track", (tracks,), True),
+        Group("Action space", (Field("train.config.action_space", "code", value=space),), True, hint=hint),
+        Group("Reward function", (reward,), True, hint=told),
+        Group("Hyperparameters", tuple(names), hint=theirs),
+    ]
+
+
+def _at(path: str) -> Mapping[str, Any]:
+    """The part of the schema for a key path of sections."""
+    about: Mapping[str, Any] = job_schema()
+    for key in path.split("."):
+        about = plain(about)["properties"][key]
+    return about
+
+
+def _groups(
+    title: str, properties: Mapping[str, Any], prefix: str, without: Any, algorithm: str = "", hint: str = ""
+) -> Iterator[Group]:
+    """A group of the plain fields of a section, then one for each section in it."""
+    own: list[Field] = []
+    inner: list[Group] = []
+    for key, about in properties.items():
+        if key in without:
+            continue
+        if sections := plain(about).get("properties"):
+            inner += _groups(f"{title}: {key}", sections, f"{prefix}.{key}", (), algorithm)
+        else:
+            own.append(_field(f"{prefix}.{key}", about))
+    if own:
+        yield Group(title, tuple(own), algorithm=algorithm, hint=hint)
+    yield from inner
+
+
+def _field(name: str, about: Mapping[str, Any]) -> Field:
+    about = plain(about)
+    default = about.get("default")
+    placeholder = "" if default is None else default if isinstance(default, str) else json.dumps(default)
+    hint = "; ".join(filter(None, (about.get("description", ""), bounds(about))))
+    if about.get("type") == "boolean" or "enum" in about:
+        values = about.get("enum", [True, False])
+        options = tuple(each if isinstance(each, str) else json.dumps(each) for each in values)
+        is_text = all(isinstance(each, str) for each in values)
+        return Field(name, "choice", options, "", placeholder, hint, is_text=is_text)
+    kind: Literal["text", "value"] = "text" if about.get("type") == "string" else "value"
+    return Field(name, kind, (), "", placeholder, hint)
+
+
+def bounds(about: Mapping[str, Any]) -> str:
+    """The type of a value and its limits, in words."""
+    words = {"integer": "whole number", "number": "number", "array": "list, such as [1, 2]", "object": "mapping"}
+    limits = {
+        "minimum": "from {}",
+        "exclusiveMinimum": "above {}",
+        "maximum": "up to {}",
+        "exclusiveMaximum": "below {}",
+    }
+    told = [text.format(str(about[key])) for key, text in limits.items() if key in about]
+    return " ".join(filter(None, (words.get(str(about.get("type")), ""), *told)))
+
+
+def filled(form: Form, found: Sequence[Group]) -> list[Group]:
+    """The groups with the values of a form that was sent."""
+    return [
+        replace(
+            group,
+            fields=tuple(
+                replace(each, value="\n".join(form.every(each.name)) if each.kind == "tracks" else _given(form, each))
+                for each in group.fields
+            ),
+        )
+        for group in found
+    ]
+
+
+def _given(form: Form, field: Field) -> str:
+    return form.one(field.name).replace("\r\n", "\n")
+
+
+def document(task: str, found: Sequence[Group]) -> dict[str, Any]:
+    """The job that filled groups are."""
+    result: dict[str, Any] = {}
+    algorithm = next((each.value for group in found for each in group.fields if each.name == "train.algorithm"), "")
+    for group in found:
+        for field in group.fields:
+            if field.value.strip() and group.algorithm in ("", algorithm):
+                _put(result, field.name.split("."), _value(field))
+    train = result.pop("train", {})
+    more = {key: result.pop(key) for key in list(result) if key not in ("name", "queue", "nodes", "resources")}
+    return {**result, "train": {"task": task, **train}, **more}
+
+
+def _value(field: Field) -> Any:
+    text = field.value
+    if field.kind == "tracks":
+        names = [line.strip() for line in text.splitlines() if line.strip()]
+        return names[0] if len(names) == 1 else names
+    if field.kind == "code" and field.name.endswith("reward_function"):
+        return {"file": CODE, "text": text if text.endswith("\n") else text + "\n"}
+    if field.kind == "text" or field.is_text:
+        return text.strip()
+    if _NUMBER.fullmatch(text.strip()):
+        return float(text)
+    try:
+        return strict_yaml.load(text)[0]
+    except strict_yaml.YamlError:
+        return text.strip()  # the spec's own check says what was expected
+
+
+def _put(target: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    for key in path[:-1]:
+        target = target.setdefault(key, {})
+    target[path[-1]] = value
+
+
+class _Dumper(yaml.SafeDumper):
+    """Texts of several lines as they are, and short lists on one line."""
+
+
+def _text(dumper: yaml.SafeDumper, value: str) -> yaml.Node:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, "|" if "\n" in value else None)
+
+
+def _list(dumper: yaml.SafeDumper, value: list[Any]) -> yaml.Node:
+    is_flat = not any(isinstance(each, dict) for each in value)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=is_flat)
+
+
+_Dumper.add_representer(str, _text)
+_Dumper.add_representer(list, _list)
+
+
+def written(job: Mapping[str, Any]) -> str:
+    """A job as YAML."""
+    text: str = yaml.dump(dict(job), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    return text

@@ -1,0 +1,430 @@
+"""An attempt as a state machine: from a state and an event to instructions. No I/O, no clock, no database.
+
+:func:`step` and the three tables below it hold every rule. :mod:`orchestrator.control.attempts` gathers facts into events, carries the
+instructions out and reads the state anew from the database; :func:`after` says what it finds there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.domain.native_options import NativeOptions
+from orchestrator.domain.retry import retries
+from shared_store.wording import counted
+
+LOST = 20.0
+"""Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
+CAUSE_PATIENCE = 90_000
+"""For so long [ms] a gang that has lost nodes which were told to end waits for the end of the node that is the cause."""
+FINISHING = 10_000
+"""Children of a native job get so long [ms] to end by themselves after the main node is done. On AWS the main node's end cuts them off; a
+rank that prints its last line or closes a file deserves better."""
+SHORTEST_REQUEUE = 10_000
+"""An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
+_FAILED_GRACE = 5.0
+"""Seconds from SIGTERM to SIGKILL for a gang whose collectives are broken: there is nothing left to save."""
+_MARGIN = 5.0
+"""Seconds that an engine waits beyond the grace time: supervisors count it too, and record what did not leave in time."""
+
+
+class Phase(StrEnum):
+    """How far an attempt is."""
+
+    LAUNCHING = "launching"
+    """Recorded; no handle of its gang is known."""
+    STARTING = "starting"
+    """Launched; its main node has not been seen to run."""
+    RUNNING = "running"
+    ENDING = "ending"
+    """Its end is decided; something of the gang may still run."""
+    CLOSED = "closed"
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What an attempt consists of, and what its job allows."""
+
+    number: int
+    hosts: Sequence[str]
+    """Of the nodes, by index."""
+    whole: int
+    """How many nodes the gang has where there is room for all."""
+    main: int
+    """Index of the main node."""
+    options: NativeOptions
+    grace: float
+    """Seconds from SIGTERM to SIGKILL."""
+    timeout: int | None = None
+    """Of the attempt [s]."""
+    allowed: int = 1
+    """How many attempts the job may spend."""
+    spent: int = 0
+    """How many of them the attempts before this one have spent."""
+    conditions: Sequence[Mapping[str, str]] = ()
+    """``evaluateOnExit`` of the job."""
+
+    @property
+    def size(self) -> str:
+        """How many nodes the attempt has, and of how many, where there was no room for all."""
+        if (nodes := len(self.hosts)) < self.whole:
+            return f"{nodes} of {self.whole} nodes: there is no room for more"
+        return counted(nodes, "node")
+
+
+@dataclass(frozen=True)
+class State:
+    """An attempt as it is known. Times are steady time [ms]."""
+
+    terms: Terms
+    launched: bool = False
+    """Whether the handle of its gang is known."""
+    started: bool = False
+    """Whether its main node was seen to run, or to have run."""
+    running_since: int | None = None
+    verdict: Verdict | None = None
+    """From the moment that the end was decided."""
+    stop_reason: str | None = None
+    """Set once the job was asked to end."""
+    cause_since: int | None = None
+    """Since when only nodes have ended that were told to."""
+    done_since: int | None = None
+    """Since when the main node is done and children still run."""
+    closed: bool = False
+
+    @property
+    def phase(self) -> Phase:
+        if self.closed:
+            return Phase.CLOSED
+        if not self.launched:
+            return Phase.LAUNCHING
+        if self.verdict is not None:
+            return Phase.ENDING
+        return Phase.RUNNING if self.started else Phase.STARTING
+
+
+# -- events ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Due:
+    """It is time for a look at the attempt."""
+
+
+@dataclass(frozen=True)
+class Launched:
+    handle: str
+
+
+@dataclass(frozen=True)
+class LaunchDelayed:
+    """The launch has to wait."""
+
+    reason: str
+    """Empty where there is nothing to say yet."""
+    unknown: bool
+    """Whether something of the gang may run already."""
+
+
+@dataclass(frozen=True)
+class LaunchRefused:
+    """The engine refuses the gang for good."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Preempted:
+    """The scheduler needs the resources for another job."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A look at the gang."""
+
+    moment: int
+    """Steady time [ms]."""
+    ends: Sequence[NodeEnd | None]
+    """By node index; None for a node that has not ended."""
+    silences: Sequence[float | None]
+    """By node index: for how many seconds the bus has missed a node that it knew; None where it does not."""
+    waits: str = ""
+    """Why the main node does not run yet or can't be seen; empty once it runs or has ended."""
+    words: str = ""
+    """What the engine says of a main node that runs."""
+    stale: str = ""
+    """Why this is an older picture, where it is."""
+
+
+@dataclass(frozen=True)
+class StopDelayed:
+    """The gang can't be stopped now; the engine is asked again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Gone:
+    """Nothing of the gang runs any more."""
+
+    moment: int
+    """Steady time [ms]."""
+    ends: Sequence[NodeEnd | None]
+    """By node index; empty for a gang that was never launched."""
+    progress: str
+    """The last checkpoint, as a part of a reason; empty where there is none."""
+
+
+Event = Due | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | StopDelayed | Gone
+
+
+# -- instructions ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Launch:
+    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, LaunchDelayed or LaunchRefused."""
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Note the handle of the gang."""
+
+    handle: str
+
+
+@dataclass(frozen=True)
+class Observe:
+    """Look at the gang: → Observed, or nothing before the engine's first look."""
+
+
+@dataclass(frozen=True)
+class Explain:
+    """Give the job this reason."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class MarkRunning:
+    """The job is RUNNING, for this reason, since this moment (steady time [ms])."""
+
+    reason: str
+    moment: int
+
+
+@dataclass(frozen=True)
+class AwaitCause:
+    """Wait for the node that was the cause, since this moment (steady time [ms])."""
+
+    since: int
+
+
+@dataclass(frozen=True)
+class AwaitChildren:
+    """Wait for the children of a main node that is done, since this moment (steady time [ms])."""
+
+    since: int
+
+
+@dataclass(frozen=True)
+class Decide:
+    """Note how the attempt ends."""
+
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Save:
+    """Make what was noted durable before anything else is done."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Have the gang stopped, with this grace time [s], unless that is under way: → StopDelayed, Gone, or nothing yet."""
+
+    grace: float
+
+
+@dataclass(frozen=True)
+class WindUp:
+    """There is nothing to stop: → Gone."""
+
+
+@dataclass(frozen=True)
+class Close:
+    """Close the attempt: account for it and move the job on."""
+
+    moment: int
+    """Steady time [ms]."""
+    spent: bool
+    """Whether it counts against the job's attempts."""
+    status: Status
+    reason: str
+
+
+Instruction = (
+    Launch | Keep | Observe | Explain | MarkRunning | AwaitCause | AwaitChildren | Decide | Save | Stop | WindUp | Close
+)
+Instructions = tuple[Instruction, ...]
+
+
+# -- the tables -----------------------------------------------------------------------------------------------------------
+
+
+def step(state: State, event: Event) -> Instructions:
+    """What is to be done, in this order. An event that means nothing in a state is passed over."""
+    match state.phase, event:
+        case Phase.CLOSED, _:
+            return ()
+        case Phase.LAUNCHING, Due():
+            return (Launch(),)
+        case Phase.LAUNCHING, Launched(handle):
+            return Keep(handle), Save()
+        case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
+            return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
+        case Phase.LAUNCHING, LaunchDelayed(reason) if reason:
+            return (Explain(reason),)
+        case Phase.LAUNCHING, LaunchRefused(reason):
+            return Decide(Verdict(Ending.FATAL, f"can't start the gang: {reason}")), WindUp()
+        case _, Preempted(reason) if state.verdict is None:
+            return (Decide(Verdict(Ending.PREEMPTED, reason)),)
+        case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Due():
+            return (Observe(),)
+        case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Observed():
+            return _observed(state, event)
+        case Phase.ENDING, StopDelayed(reason):
+            return (Explain(reason),)
+        case _, Gone() if state.verdict is not None:
+            return (_close(state, state.verdict, event),)
+    return ()
+
+
+def _observed(state: State, seen: Observed) -> Instructions:
+    """The tables for a look, one after the other, each from the state that the one before leaves."""
+    done: Instructions = ()
+    for table in (_tell, _judge, _end):
+        for instruction in table(state, seen):
+            state, done = after(state, instruction), (*done, instruction)
+    return done
+
+
+def _tell(state: State, seen: Observed) -> Instructions:
+    """What the job's user is told of a gang."""
+    runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
+    if seen.waits:
+        return (Explain(seen.waits),)
+    if not state.started:
+        return (MarkRunning(runs, seen.moment),)
+    return (Explain(runs),) if state.verdict is None else ()
+
+
+def _judge(state: State, seen: Observed) -> Instructions:
+    """Whether the attempt is to end, and how: by the nodes' ends, on request, for its silence, or for its time."""
+    if state.verdict is not None:
+        return ()
+    waits: Instructions = ()
+    verdict = _by_ends(state.terms, seen.ends)
+    if verdict is not None and not verdict.certain:
+        since = seen.moment if state.cause_since is None else state.cause_since
+        if seen.moment - since <= CAUSE_PATIENCE:
+            verdict, waits = None, (AwaitCause(since),)
+    if verdict is None and state.stop_reason is not None:
+        verdict = Verdict(Ending.STOPPED, state.stop_reason)
+    verdict = verdict or _by_silence(state.terms, seen) or _by_time(state, seen.moment)
+    return waits if verdict is None else (*waits, Decide(verdict), Save())
+
+
+def _end(state: State, seen: Observed) -> Instructions:
+    """Once the end is decided: the gang is stopped, unless its children may end by themselves."""
+    if (verdict := state.verdict) is None:
+        return ()
+    said = (Explain(f"{verdict.reason}; waits for {seen.stale}"),) if seen.stale else ()
+    if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
+        since = seen.moment if state.done_since is None else state.done_since
+        if seen.moment - since < FINISHING:
+            return *said, AwaitChildren(since)
+    is_broken = verdict.ending in (Ending.FAILED, Ending.FATAL)
+    return *said, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
+
+
+def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:
+    if terms.options.is_native:
+        return judge(terms.options.on_child_failure, terms.main, ends)
+    return judge_as_aws(terms.main, ends, terms.hosts[terms.main])
+
+
+def _by_silence(terms: Terms, seen: Observed) -> Verdict | None:
+    """That a node is frozen or cut off; on AWS a child's death changes nothing."""
+    for index, (end, silence) in enumerate(zip(seen.ends, seen.silences, strict=True)):
+        counts = index == terms.main or terms.options.is_native
+        if counts and end is None and silence is not None and silence > LOST:
+            reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
+            return Verdict(Ending.FAILED, reason)
+    return None
+
+
+def _by_time(state: State, moment: int) -> Verdict | None:
+    timeout, since = state.terms.timeout, state.running_since
+    if timeout and since and moment - since > timeout * 1000:
+        return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
+    return None
+
+
+def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
+    """What becomes of the job: over, or RUNNABLE again."""
+    terms, ending, progress = state.terms, verdict.ending, gone.progress
+    native, number = terms.options.is_native, terms.number
+    ran = gone.moment - (state.running_since or gone.moment)
+    is_free = ending == Ending.PREEMPTED or (ending == Ending.REQUEUE and ran >= SHORTEST_REQUEUE)
+    spent = terms.spent + (not is_free)
+    is_left = spent < terms.allowed
+    head = gone.ends[terms.main] if terms.main < len(gone.ends) else None
+
+    def to(status: Status, reason: str) -> Close:
+        return Close(gone.moment, not is_free, status, reason)
+
+    match ending:
+        case Ending.STOPPED | Ending.FAILED | Ending.PREEMPTED | Ending.REQUEUE if state.stop_reason is not None:
+            return to(Status.FAILED, f"{state.stop_reason}{progress}" if native else state.stop_reason)
+        case Ending.SUCCEEDED:
+            return to(Status.SUCCEEDED, verdict.reason)
+        case Ending.PREEMPTED if (
+            head is not None and head.exit_code == 0
+        ):  # to leave with work to do is 75, or a signal's
+            return to(Status.SUCCEEDED, "done before it was preempted")
+        case Ending.PREEMPTED:
+            return to(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
+        case Ending.REQUEUE if is_free or is_left:
+            return to(Status.RUNNABLE, f"attempt {number} left on request{progress}; starting again")
+        case Ending.FAILED if is_left and _retries(terms, verdict, head):
+            return to(Status.RUNNABLE, f"attempt {number} failed ({verdict.reason}){progress}; trying again")
+        case Ending.FAILED if native:
+            return to(Status.FAILED, f"{verdict.reason} (attempt {spent} of {terms.allowed})")
+    return to(Status.FAILED, verdict.reason)
+
+
+def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
+    return retries(terms.conditions, verdict.exit_code, head.reason if head else "", verdict.reason)
+
+
+def after(state: State, instruction: Instruction) -> State:
+    """The state once an instruction was carried out."""
+    match instruction:
+        case Keep():
+            return replace(state, launched=True)
+        case MarkRunning(_, moment):
+            return replace(state, started=True, running_since=moment)
+        case AwaitCause(since):
+            return replace(state, cause_since=since)
+        case AwaitChildren(since):
+            return replace(state, done_since=since)
+        case Decide(verdict):
+            return replace(state, verdict=verdict)
+        case Close():
+            return replace(state, closed=True)
+    return state

@@ -1,0 +1,35 @@
+"""Tracks of the racer, by a process of the worker's: this package never imports what they are made of."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import Any
+
+from orchestrator.domain.errors import ServerError, UsageError
+
+
+def ask(order: Mapping[str, Any]) -> Any:
+    """What :mod:`worker.racer` answers to an order.
+
+    Args:
+        order: ``action``, ``store`` (its path), ``output`` (a path, or None), and what the action takes.
+
+    Raises:
+        UsageError: The order can't be carried out; one line.
+        ServerError: The worker is not installed here, or failed.
+    """
+    if find_spec("numpy") is None:
+        raise ServerError("tracks need numpy, which this environment lacks: pip install 'muster[worker]'")
+    asked = subprocess.run(
+        [sys.executable, "-P", "-m", "worker.racer", json.dumps(order)], capture_output=True, text=True, check=False
+    )
+    said = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
+    if asked.returncode == 2:
+        raise UsageError(said[-1])
+    if asked.returncode:
+        raise ServerError(f"worker.racer: {said[-1]}")
+    return json.loads(asked.stdout)

@@ -1,0 +1,367 @@
+"""The page of a job, through a real server: what it shows, what it follows, and what a person can do there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.client import ApiError
+from shared_store.layout import Run, Store
+from shared_store.logs import format_line
+from shared_store.metrics import MetricsWriter
+from tests.conftest import Serving, submit_gang, wait_for
+from tests.support.console.fixtures import Console
+from tests.support.console.visitor import Page, Visitor
+from tests.support.orchestrator.jobs import FOREVER, await_status
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
+
+HOSTILE = "</pre><script>alert(1)</script><img src=x onerror=alert(1)> {{ 7 * 7 }} \x1b[31m \u202e\u2028"
+
+
+@pytest.fixture(scope="module")
+def store(console: Console) -> Store:
+    """The store of a server on which only small jobs of the queue ``first`` start; it has a trained run with three checkpoints and its metrics."""
+    order = [{"order": 1, "computeEnvironment": "local"}]
+    console.client.batch("CreateJobQueue", jobQueueName="first", priority=9, computeEnvironmentOrder=order)
+    await_status(console.client, submit_gang(console.client, FOREVER, name="blocker", cpus="0.5"), "RUNNING")
+    store = Store(console.server.home / "store")
+    add_run(store, "taught", {**SPEC, "environment": {"LEVEL": "of-nobody-else"}})
+    for iteration in (3, 6, 9):
+        add_checkpoint(store, "taught", iteration, score=float(iteration), score_error=0.5)
+    with MetricsWriter(store.run("taught"), 1, 0) as metrics:
+        for iteration in range(1, 10):
+            metrics.write({"iteration": iteration, "reward": iteration / 2, "reward_alive": 1.0, "kl": None})
+    return store
+
+
+@pytest.fixture(scope="module")
+def training(console: Console, store: Store) -> str:
+    """Id of a job that waits to go on with the run."""
+    return str(console.client.post("/api/runs/taught/resume", {"set": ["train.iterations=20"]})["jobId"])
+
+
+@pytest.fixture(scope="module")
+def talking(console: Console, store: Store) -> str:
+    """Id of a job on two nodes that has said much and failed."""
+    script = (
+        "import os, sys, time\n"
+        "node = int(os.environ['AWS_BATCH_JOB_NODE_INDEX'])\n"
+        f"print({HOSTILE!r})\n"
+        "for i in range(600): print('line', i, 'of', node, flush=True)\n"
+        "time.sleep(1 if node == 0 else 60)\n"
+        "raise ValueError('the reason')\n"
+    )
+    job = submit_gang(console.client, script, 2, "talks", queue="first")
+    await_status(console.client, job, "FAILED")
+    return job
+
+
+def spec_of(console: Console, answer: Any) -> dict[str, Any]:
+    """The spec of the job to whose page an answer leads."""
+    assert answer.status_code == 200, answer.text
+    job = answer.json()["location"].removeprefix("/jobs/")
+    found: dict[str, Any] = console.client.get(f"/api/jobs/{job}")["spec"]
+    return found
+
+
+def log_of(visitor: Visitor, job: str, path: str = "", **query: Any) -> dict[str, Any]:
+    answer = visitor.http.get(f"/jobs/{job}/log{path}", params=query, headers={"Accept": "application/json"})
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def said(told: dict[str, Any]) -> list[str]:
+    return [each[5] for each in told["lines"]]
+
+
+def test_a_job_that_waits_says_why_and_shows_what_it_will_do(console: Console, training: str) -> None:
+    page = console.visitor().page(f"/jobs/{training}")
+    assert "RUNNABLE" in page.text and "CPU" in page.text and "It has not started yet" in page.text
+    assert "iterations: 20" in page.text and "Cartpole" in page.text and "muster view" in page.text
+    assert page.is_inert
+    (place,) = [each for tag, each in page.elements if tag == "div" and "data-job" in each]
+    assert place["data-curves"] == "/runs/taught/curves"
+
+
+def test_a_job_is_found_by_its_name_and_by_the_start_of_its_id(console: Console, training: str) -> None:
+    visitor = console.visitor()
+    for reference in ("taught", training[:8]):
+        assert visitor.http.get(f"/jobs/{reference}").url.path == f"/jobs/{training}"
+    assert "does not exist" in visitor.page("/jobs/nothing", 404).text
+
+
+def test_an_ended_job_has_its_attempt_on_a_line_of_time_and_how_each_node_ended(console: Console, talking: str) -> None:
+    page = console.visitor().page(f"/jobs/{talking}")
+    assert "FAILED" in page.text and "1 of 1" in page.text
+    assert "node 0 on localhost (exit 1" in page.text and "; node 1 on localhost" in page.text
+    (bar, *_) = page.all("rect", **{"class": "span"})
+    assert bar["data-state"] == "failed" and 0 <= float(bar["x"] or -1) < 100 and float(bar["width"] or 0) > 0
+    assert "It came through the Batch API" in page.text and page.all("button", form="with-checkpoint") == []
+
+
+def test_what_a_job_says_is_text_wherever_it_is_shown(console: Console, talking: str, store: Store) -> None:
+    visitor = console.visitor()
+    answer = visitor.http.get(f"/jobs/{talking}/log/search", params={"text": "ALERT(1)", "node": "0"})
+    assert answer.headers["content-type"] == "application/json" and HOSTILE in said(answer.json())
+    waiting = console.submit(console.register("hostile"), "hostile")
+    console.client.batch("TerminateJob", jobId=waiting, reason=HOSTILE)
+    await_status(console.client, waiting, "FAILED")
+    spec = {**SPEC, "name": "odd", "environment": {"TEXT": HOSTILE}}
+    add_run(store, "odd", spec)
+    odd = console.client.post("/api/runs/odd/resume", {})["jobId"]
+    for job in (talking, waiting, odd):
+        page = Page(visitor.http.get(f"/jobs/{job}").text)
+        assert page.is_inert and page.all("script", src="x") == [] and page.all("img", src="x") == []
+    assert "<script>alert" not in visitor.http.get(f"/jobs/{waiting}").text
+    assert "<script>alert(1)</script>" in visitor.page(f"/jobs/{waiting}").text, "as text it is there"
+
+
+def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(console: Console, talking: str) -> None:
+    visitor = console.visitor()
+    last = log_of(visitor, talking, node="0")
+    assert len(last["lines"]) == 400 and last["more"]
+    first = log_of(visitor, talking, node="0", before=json.dumps(last["first"]))
+    whole = [each for each in said(first) + said(last) if each.startswith("line ")]
+    assert whole == [f"line {i} of 0" for i in range(600)] and not first["more"]
+    onwards = log_of(visitor, talking, node="0", after=json.dumps(first["last"]))
+    assert said(onwards)[:400] == said(last)
+    assert {each[2] for each in log_of(visitor, talking)["lines"]} == {0, 1}
+    assert log_of(visitor, talking, rank="7")["lines"] == [] and log_of(visitor, talking, attempt="2")["lines"] == []
+    for wrong in ({"before": "x"}, {"before": '{"1/0": -1}'}, {"node": "x"}):
+        assert visitor.http.get(f"/jobs/{talking}/log", params=wrong).status_code == 400
+
+
+def test_the_log_is_searched_and_the_first_error_is_found_with_the_lines_around_it(
+    console: Console, talking: str
+) -> None:
+    visitor = console.visitor()
+    found = log_of(visitor, talking, "/search", text="LINE 77 OF")
+    assert sorted(said(found)) == ["line 77 of 0", "line 77 of 1"] and found["over"]
+    error = log_of(visitor, talking, "/search")
+    (line,) = error["lines"]
+    assert line[2] == 0 and line[5].startswith("Traceback")
+    around = said(log_of(visitor, talking, node="0", around=json.dumps({"1/0": error["positions"][0]})))
+    assert "line 599 of 0" in around and "ValueError: the reason" in around
+
+
+def test_the_stream_has_what_changed_and_ends_with_the_job(console: Console, talking: str) -> None:
+    visitor = console.visitor()
+    events = list(visitor.events(f"/jobs/{talking}/stream"))
+    names = [name for name, _, _ in events]
+    assert names == ["facts", "attempts", "checkpoints", "end"], "the page has the lines already"
+    assert events[0][1]["status"] == "FAILED" and events[0][1]["open"] == ""
+    assert json.loads(events[0][2])["l"] == log_of(visitor, talking)["last"]
+
+
+def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(console: Console, talking: str) -> None:
+    visitor = console.visitor()
+    middle = log_of(visitor, talking, before=json.dumps(log_of(visitor, talking)["first"]))
+    had = json.dumps({"i": None, "l": middle["last"]})
+    expected = said(log_of(visitor, talking))
+    by_header = visitor.events(f"/jobs/{talking}/stream", **{"Last-Event-ID": had})
+    by_query = visitor.events(f"/jobs/{talking}/stream?last={had}")
+    for events in (by_header, by_query):
+        lines = [line[5] for name, data, _ in events if name == "lines" for line in data["lines"]]
+        assert lines == expected
+
+
+def test_a_page_that_missed_too_much_gets_the_last_lines_and_how_much_it_missed(
+    console: Console, talking: str, store: Store
+) -> None:
+    run = store.run(console.client.get(f"/api/jobs/{talking}")["run"])
+    with open(run.log(talking, 1, 0), "a") as file:
+        file.writelines(format_line(4e9, 0, "o", f"late {i} " + "x" * 100) for i in range(20_000))
+    visitor = console.visitor()
+    (window,) = [
+        data for name, data, _ in visitor.events(f'/jobs/{talking}/stream?last={{"i":0,"l":{{}}}}') if name == "window"
+    ]
+    assert len(window["lines"]) == 400 and window["skipped"] > 2 << 20
+    assert said(window)[-1].startswith("late 19999 ")
+
+
+def test_a_restart_of_the_server_loses_no_line_and_repeats_none(tmp_path: Path) -> None:
+    server = Serving(tmp_path, "--cpus", "1")
+    visitor = Visitor(server.url)
+    try:
+        script = "import time\nfor i in range(400):\n  print('number', i, flush=True)\n  time.sleep(0.02)\n"
+        job = submit_gang(server.client, script, cpus="0.5")
+        server.wait(job, "RUNNING")
+        lines, last = read_until(visitor, job, '{"i":null,"l":{}}', "number 40")
+        server.kill()
+        server.options = (*server.options, "--port", server.url.rpartition(":")[2])
+        server.start()
+        rest, _ = read_until(visitor, job, last, "number 399")
+        numbers = [text for text in lines + rest if text.startswith("number ")]
+        assert numbers == [f"number {i}" for i in range(400)]
+    finally:
+        visitor.close()
+        server.close()
+
+
+def read_until(visitor: Visitor, job: str, last: str, text: str) -> tuple[list[str], str]:
+    """The lines of a stream up to the event that has a text, and its id."""
+    found: list[str] = []
+    for name, data, place in visitor.events(f"/jobs/{job}/stream", **{"Last-Event-ID": last}):
+        found += [line[5] for line in data["lines"]] if name in ("lines", "window") else []
+        if text in found:
+            return found, place
+    raise AssertionError(f"{text} never came; there is {found[-5:]}")
+
+
+def test_new_iterations_come_over_the_stream_and_a_run_that_went_back_is_read_again(
+    console: Console, training: str, store: Store
+) -> None:
+    visitor = console.visitor()
+    told = visitor.http.get("/runs/taught/curves", params={"name": "reward*"}).json()
+    assert told["series"]["reward"] == [i / 2 for i in range(1, 10)] and told["last"] == 9
+    had = json.dumps({"i": 7, "l": {}})
+    metrics = (data for name, data, _ in visitor.events(f"/jobs/{training}/stream?last={had}") if name == "metrics")
+    assert next(metrics) == {"iterations": [8, 9], "series": {"reward": [4.0, 4.5], "reward_alive": [1.0, 1.0]}}
+    run: Run = store.run("taught")
+    with MetricsWriter(run, 2, 4) as writer:
+        writer.write({"iteration": 5, "reward": 50.0})
+    assert next(metrics) == {"again": True}
+    assert visitor.http.get("/runs/taught/curves", params={"name": "reward"}).json()["series"]["reward"][-1] == 50.0
+    metrics.close()
+    (run.metrics / "metrics-e2.jsonl").unlink()
+
+
+def test_checkpoints_are_listed_with_their_scores_and_the_best_one(console: Console, training: str) -> None:
+    page = console.visitor().page(f"/jobs/{training}")
+    assert [each["value"] for each in page.all("input", type="radio") if each.get("value")] == ["9", "6", "3"]
+    assert "9 ± 0.5" in page.text and "newest, best" in page.text
+
+
+def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(console: Console, training: str) -> None:
+    visitor = console.visitor()
+    evaluated = spec_of(console, visitor.submit(f"/jobs/{training}/evaluate", checkpoint="6"))
+    assert evaluated["evaluate"]["run"] == "taught" and evaluated["evaluate"]["checkpoint"] == 6
+    exported = spec_of(console, visitor.submit(f"/jobs/{training}/export"))
+    assert exported["export"]["checkpoint"] == 9 and exported["queue"] == "default"
+    recorded = spec_of(console, visitor.submit(f"/jobs/{training}/record", checkpoint="best"))
+    assert recorded["record"]["checkpoint"] == 9
+    missing = visitor.submit(f"/jobs/{training}/evaluate", checkpoint="7")
+    assert missing.status_code == 404 and "it has: 3, 6, 9" in missing.json()["message"]
+    assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
+
+
+def test_a_run_goes_on_from_an_older_checkpoint_only_once_the_person_has_said_yes(
+    console: Console, store: Store
+) -> None:
+    add_run(store, "again", {**SPEC, "name": "again"})
+    for iteration in (3, 6):
+        add_checkpoint(store, "again", iteration)
+    first = console.client.post("/api/runs/again/resume", {})["jobId"]
+    console.client.batch("TerminateJob", jobId=first, reason="enough")
+    await_status(console.client, first, "FAILED")
+    visitor = console.visitor()
+    asked = visitor.submit(f"/jobs/{first}/resume", checkpoint="3")
+    assert asked.status_code == 409 and "after iteration 3 counts no longer" in asked.json()["question"]["text"]
+    told = visitor.submit(f"/jobs/{first}/resume", checkpoint="3", confirmed="yes", changes="train.iterations=30\n\n")
+    assert spec_of(console, told)["train"]["iterations"] == 30 and "from iteration 3" in told.json()["message"]
+    page = visitor.page(told.json()["location"])
+    assert "Compared with the job before it, again" in page.text and "train.iterations 9 30" in page.text
+    wrong = visitor.submit(f"/jobs/{first}/resume", changes="nonsense")
+    assert wrong.status_code == 400 and "expected KEY=VALUE" in wrong.json()["message"]
+
+
+def test_a_clone_shows_what_is_different_from_its_parent(console: Console, training: str) -> None:
+    visitor = console.visitor()
+    nameless = visitor.submit(f"/jobs/{training}/clone", checkpoint="6")
+    assert nameless.status_code == 400 and "give the new run a name" in nameless.json()["message"]
+    answer = visitor.submit(f"/jobs/{training}/clone", checkpoint="6", name="copied", changes="train.seed=7")
+    assert "cloned taught@6 as run copied" in answer.json()["message"]
+    page = visitor.page(answer.json()["location"])
+    assert "Started from taught@6" in page.text and "Compared with its parent taught" in page.text
+    assert "train.seed" in page.text and page.all("td", **{"class": "new"})
+
+
+def test_only_an_exported_checkpoint_becomes_a_model(console: Console, training: str) -> None:
+    answer = console.visitor().submit(f"/jobs/{training}/register", name="walker", checkpoint="6")
+    assert answer.status_code == 400 and "export" in answer.json()["message"]
+    assert console.client.get("/api/models") == []
+
+
+def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, store: Store) -> None:
+    job = submit_gang(console.client, FOREVER, name="runs", queue="first")
+    await_status(console.client, job, "RUNNING")
+    visitor = console.visitor()
+    assert visitor.submit(f"/jobs/{job}/stop").json()["question"]["title"] == f"Stop runs ({job[:8]})?"
+    saved = visitor.submit(f"/jobs/{job}/save")
+    assert saved.status_code == 409 and "nothing to save" in saved.json()["message"]
+    assert visitor.submit(f"/jobs/{job}/stop", confirmed="yes").json()["message"].endswith("is asked to stop")
+    ended = await_status(console.client, job, "FAILED")
+    assert ended["statusReason"] == "stopped in the console by key admin"
+
+
+def test_a_read_only_key_sees_no_buttons_and_no_values_and_is_refused_each_action(
+    console: Console, training: str
+) -> None:
+    visitor = console.visitor("reader")
+    page = visitor.page(f"/jobs/{training}")
+    assert "taught" in page.text and page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
+    assert "LEVEL: (hidden)" in page.text and "of-nobody-else" not in page.source
+    assert page.all("input", type="radio") == []
+    jobs = console.client.get("/api/jobs")["total"]
+    for action in ("stop", "save", "resume", "clone", "evaluate", "export", "record", "register"):
+        answer = visitor.submit(f"/jobs/{training}/{action}", name="x", confirmed="yes")
+        assert answer.status_code == 403 and "is read-only" in answer.json()["message"], answer.text
+    assert console.client.get("/api/jobs")["total"] == jobs
+
+
+def test_a_key_of_another_queue_sees_nothing_of_the_job_and_changes_nothing(console: Console, training: str) -> None:
+    visitor = console.visitor("lab")
+    for path in ("", "/stream", "/log", "/log/search?text=x"):
+        assert visitor.http.get(f"/jobs/{training}{path}").status_code == 403, path
+    for path in ("/runs/taught/curves", "/runs/taught/files/metrics/metrics-e1.jsonl"):
+        assert visitor.http.get(path).status_code == 403, path
+    for action in ("stop", "save", "resume", "evaluate", "register"):
+        assert visitor.submit(f"/jobs/{training}/{action}", name="x", confirmed="yes").status_code == 403, action
+
+
+def test_files_of_a_run_are_downloads_pictures_are_shown_and_nothing_leads_out_of_the_run(
+    console: Console, training: str, store: Store
+) -> None:
+    run, visitor = store.run("taught"), console.visitor()
+    run.recordings.mkdir()
+    (run.recordings / "gait.gif").write_bytes(b"GIF89a")
+    (run.recordings / "page.html").write_bytes(b"<script>alert(1)</script>")
+    (run.recordings / "way-out").symlink_to("/etc/passwd")
+    page = visitor.page(f"/jobs/{training}")
+    assert [each["src"] for each in page.all("img")] == ["/runs/taught/files/recordings/gait.gif"]
+    assert "recordings/page.html" in page.text and "way-out" not in page.text
+    picture = visitor.http.get("/runs/taught/files/recordings/gait.gif")
+    assert (picture.content, picture.headers["content-type"]) == (b"GIF89a", "image/gif")
+    download = visitor.http.get("/runs/taught/files/recordings/page.html")
+    assert download.headers["content-type"] == "application/octet-stream"
+    assert download.headers["content-disposition"].startswith("attachment")
+    assert "sandbox" in ", ".join(download.headers.get_list("content-security-policy"))
+    for path in (
+        "run.json",
+        "recordings/../run.json",
+        "recordings/..%2f..%2frun.json",
+        "recordings/.x",
+        "recordings/no",
+    ):
+        assert visitor.http.get(f"/runs/taught/files/{path}").status_code == 404, path
+    assert visitor.http.get("/runs/taught/files/recordings/way-out").status_code == 409
+
+
+def test_the_page_of_an_array_leads_to_its_jobs(console: Console, store: Store) -> None:
+    needs = [{"type": "VCPU", "value": "4"}, {"type": "MEMORY", "value": "16"}]
+    container = {"image": "muster", "command": ["true"], "resourceRequirements": needs}
+    definition = {"jobDefinitionName": "child", "type": "container", "containerProperties": container}
+    arn = console.client.batch("RegisterJobDefinition", **definition)["jobDefinitionArn"]
+    sent = {"jobName": "many", "jobQueue": "default", "jobDefinition": arn, "arrayProperties": {"size": 3}}
+    job = console.client.batch("SubmitJob", **sent)["jobId"]
+    page = console.visitor().page(f"/jobs/{job}")
+    assert [each["href"] for each in page.all("a") if f"{job}:" in str(each["href"])] == [
+        f"/jobs/{job}:{i}" for i in range(3)
+    ]
+    wait_for(lambda: "RUNNABLE" in console.visitor().page(f"/jobs/{job}:1").text, 20, "the child's reason")
+    with pytest.raises(ApiError):
+        console.client.get(f"/api/jobs/{job}:7")

@@ -1,0 +1,241 @@
+"""The wizard and the YAML editor, through a real server."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from orchestrator.spec import strict_yaml
+from tests.support.console.fixtures import Console
+from tests.support.console.visitor import Page, Visitor
+
+HOSTILE = "</textarea></pre><script>alert(1)</script>"
+REWARD = "def reward_function(params):\r\n    return params['speed']\r\n"
+COMMAND = (
+    "name: works\nqueue: lab\nresources: {cpus: 1, memory: 16}\ncommand: [echo, '</pre><script>alert(1)</script>']\n"
+)
+
+
+def inputs(page: Page) -> dict[str, Any]:
+    """The fields of the page's wizard as they stand, but for those that offer a choice."""
+    return {str(each["name"]): each.get("value") or "" for each in page.all("input") if each.get("type") != "checkbox"}
+
+
+def filled(visitor: Visitor, task: str, **changes: Any) -> dict[str, Any]:
+    fields = inputs(visitor.page(f"/submit/task/{task}")) | {"queue": "default", "train.algorithm": "ppo"}
+    return fields | {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def checked(visitor: Visitor, fields: dict[str, Any], **more: str) -> dict[str, Any]:
+    token = visitor.page("/").form_token
+    answer = visitor.http.post(
+        "/submit/check", data={"form_token": token, **fields, **more}, headers={"Accept": "application/json"}
+    )
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def yaml_of(page: Page) -> str:
+    (kept, *_) = page.all("input", name="yaml")
+    return str(kept["value"])
+
+
+def test_every_installed_task_has_a_wizard_with_its_own_settings(console: Console) -> None:
+    visitor = console.visitor()
+    addresses = [str(each["href"]) for each in visitor.page("/submit").all("a", **{"class": "card plain"})]
+    assert {"/submit/task/Ant", "/submit/task/RacerPixels", "/submit/yaml"} <= set(addresses)
+    names = inputs(visitor.page("/submit/task/Cartpole"))
+    assert {"train.config.cart_limit", "train.config.rewards.alive", "train.ppo.gamma", "train.sac.tau"} <= set(names)
+    assert not any(each.startswith("train.hyperparameters") for each in names)
+    racer = visitor.page("/submit/task/Racer")
+    assert {"train.hyperparameters.lr", "train.config.track", "train.config.lidar.rays"} <= set(inputs(racer))
+    assert [each["value"] for each in racer.all("input", type="checkbox")] == ["oval", "rounded-rectangle", "chicane"]
+    assert len(racer.all("textarea")) == 2
+    assert "did you mean Ant?" in visitor.page("/submit/task/Antt", 404).text
+
+
+def test_the_wizard_shows_the_yaml_that_it_submits(console: Console) -> None:
+    visitor = console.visitor()
+    given = {
+        "train__worlds": "8",
+        "train__ppo__gamma": "0.9",
+        "train__ppo__learning_rate": "3e-4",
+        "train__sac__tau": "0.1",
+    }
+    fields = filled(visitor, "Cartpole", **given, train__config__rewards__alive="0.2", nodes="{min: 1, max: 2}")
+    told = checked(visitor, fields)
+    assert told["problem"] is None and told["help"] is None
+    job, _ = strict_yaml.load(told["yaml"])
+    assert job["train"] == {
+        **{
+            "task": "Cartpole",
+            "worlds": 8,
+            "iterations": 100,
+            "algorithm": "ppo",
+            "config": {"rewards": {"alive": 0.2}},
+        },
+        "ppo": {"learning_rate": 0.0003, "gamma": 0.9},
+    }
+    assert (job["nodes"], list(job)[:3]) == ({"min": 1, "max": 2}, ["name", "queue", "nodes"])
+    review = Page(visitor.http.post("/submit/review", data=fields).text)
+    assert yaml_of(review) == told["yaml"]
+    assert "python -P -m worker.train" in review.text and "localhost" in review.text
+    answer = visitor.submit("/submit", yaml=yaml_of(review))
+    id_ = answer.json()["location"].rpartition("/")[2]
+    assert answer.json()["message"] == f"submitted cartpole as {id_[:8]}"
+    spec = console.client.get(f"/api/jobs/{id_}")["spec"]
+    assert spec["train"]["ppo"] == {"learning_rate": 0.0003, "gamma": 0.9} and spec["train"]["worlds"] == 8
+    console.client.batch("TerminateJob", jobId=id_, reason="seen")
+    again = visitor.http.get(f"/submit/yaml?job={id_}")
+    assert again.status_code == 200 and "gamma: 0.9" in again.text
+    assert "gamma" not in console.visitor("lab").page(f"/submit/yaml?job={id_}", 403).text
+    back = Page(visitor.http.post("/submit/task/Cartpole", data=fields).text)
+    assert inputs(back)["train.ppo.gamma"] == "0.9" and inputs(back)["nodes"] == "{min: 1, max: 2}"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("train.worlds", "many", "expected a whole number"),
+        ("train.config.rewards.alive", "[1]", "found"),
+        ("train.ppo.gamma", "7", "7"),
+        ("name", "a b", "expected letters"),
+        ("nodes", "x", "expected a whole number of nodes"),
+        ("timeout", "soon", "expected a duration"),
+    ],
+)
+def test_a_wrong_value_is_told_at_its_field(console: Console, field: str, value: str, words: str) -> None:
+    visitor = console.visitor()
+    fields = {**filled(visitor, "Cartpole"), field: value}
+    problem = checked(visitor, fields)["problem"]
+    assert problem["key"].startswith(field) and words in problem["message"] and problem["line"] > 0
+    answer = visitor.http.post("/submit/review", data=fields)
+    page = Page(answer.text)
+    shown = [each for each in page.all("p", **{"class": "problem"}) if "data-wrong" in each and "hidden" not in each]
+    assert answer.status_code == 400 and [each["data-wrong"] for each in shown] == [field]
+    assert page.all("input", name=field)[0]["value"] == value and problem["message"] in page.text
+
+
+def test_a_job_that_no_host_could_hold_is_refused_before_anything_is_registered(console: Console) -> None:
+    visitor = console.visitor()
+    fields = filled(visitor, "Cartpole", name="huge", resources__cpus="64")
+    answer = visitor.http.post("/submit/review", data=fields)
+    assert answer.status_code == 400 and "64" in Page(answer.text).text
+    refused = visitor.submit("/submit", yaml=checked(visitor, fields)["yaml"])
+    assert refused.status_code == 400
+    found = console.client.batch("DescribeJobDefinitions", jobDefinitionName="huge")["jobDefinitions"]
+    assert found == []
+
+
+def test_a_reward_function_is_checked_as_it_is_typed_and_tried_when_its_editor_is_left(console: Console) -> None:
+    visitor, name = console.visitor(), "train.config.reward_function"
+    fields = filled(visitor, "Racer", **{"train__config__track": ["oval", "", "random:7"]})
+    fields["train.hyperparameters.lr"] = "1e-4"
+    told = checked(visitor, {**fields, name: REWARD})
+    job, lines = strict_yaml.load(told["yaml"])
+    assert told["problem"] is None and job["train"]["config"]["track"] == ["oval", "random:7"]
+    assert job["train"]["config"]["reward_function"]["text"] == REWARD.replace("\r\n", "\n")
+    forbidden = checked(visitor, {**fields, name: "import os\n" + REWARD})
+    assert (forbidden["problem"]["key"], forbidden["problem"]["code_line"]) == (name, 1)
+    assert forbidden["problem"]["line"] == lines["train", "config", "reward_function", "text"] + 1
+    assert "os can't be imported" in forbidden["problem"]["message"]
+    fails = {**fields, name: REWARD.replace("speed", "sped")}
+    assert checked(visitor, fails)["problem"] is None
+    problem = checked(visitor, fails, whole="yes")["problem"]
+    assert problem["code_line"] == 2 and re.match(r"reward_function\.py:2: TEST_FAILURE: .*sped", problem["message"])
+    answer = visitor.http.post("/submit/review", data=fails)
+    assert answer.status_code == 400 and Page(answer.text).all("div", **{"data-line": "2"})
+    assert visitor.http.post("/submit/review", data={**fields, name: REWARD}).status_code == 200
+
+
+def test_the_code_of_a_key_of_some_queues_is_read_here_and_run_by_its_job_alone(console: Console) -> None:
+    visitor, name = console.visitor("lab"), "train.config.reward_function"
+    fields = {**filled(visitor, "Racer"), "queue": "lab", "resources.cpus": "1"}
+    fails = {**fields, name: REWARD.replace("speed", "sped")}
+    assert checked(visitor, fails, whole="yes")["problem"] is None
+    assert "os can't" in checked(visitor, {**fields, name: "import os\n" + REWARD}, whole="yes")["problem"]["message"]
+    page = visitor.page("/submit/task/Racer")
+    assert "the job's ranks try it" in page.text
+    assert "lab" in page.text and "default" not in [each.get("value") for each in page.all("option")]
+
+
+def test_code_and_names_are_text_wherever_they_are_shown(console: Console) -> None:
+    visitor, name = console.visitor(), "train.config.reward_function"
+    fields = filled(visitor, "Racer", **{"train__config__track": HOSTILE})
+    code = f"{REWARD}# {HOSTILE}\r\n"
+    for path, sent in (
+        ("/submit/review", {**fields, name: code}),
+        ("/submit/review", {**fields, name: code, "train.config.track": "oval"}),
+        ("/submit/task/Racer", {**fields, name: code}),
+        ("/submit/yaml", {**fields, name: code}),
+        ("/submit/review", {**fields, "name": HOSTILE, "train.worlds": HOSTILE}),
+        ("/submit/review", {"form_token": fields["form_token"], "yaml": f"name: '{HOSTILE}'"}),
+        ("/submit/review", {"form_token": fields["form_token"], "yaml": HOSTILE}),
+    ):
+        text = visitor.http.post(path, data=sent).text
+        assert Page(text).is_inert and "<script>alert" not in text and "&lt;script&gt;alert" in text, (path, text)
+    for path in (f"/submit/task/{HOSTILE}", f"/submit/yaml?job={HOSTILE}"):
+        text = visitor.http.get(path).text
+        assert Page(text).is_inert and "<script>alert" not in text
+
+
+def test_any_job_is_submitted_as_yaml_with_help_for_the_line_and_its_errors_marked(console: Console) -> None:
+    visitor = console.visitor()
+    text = "name: x\nqueue: lab\ntrain:\n  task: Ant\n  worlds: 2\n  wordls: 3\n"
+    told = checked(visitor, {"yaml": text.replace("\n", "\r\n")}, line="4")
+    assert told["yaml"] == text
+    assert (told["problem"]["key"], told["problem"]["line"]) == ("train.wordls", 6)
+    assert "did you mean worlds?" in told["problem"]["message"]
+    keys = {each["name"]: each for each in told["help"]["keys"]}
+    assert told["help"]["section"] == "train" and keys["task"]["given"] and not keys["seed"]["given"]
+    assert "name of a task" in told["help"]["key"]["about"]
+    answer = visitor.http.post("/submit/review", data={"form_token": visitor.page("/").form_token, "yaml": text})
+    assert answer.status_code == 400 and Page(answer.text).all("div", **{"data-line": "6"})
+    review = Page(
+        visitor.http.post("/submit/review", data={"form_token": visitor.page("/").form_token, "yaml": COMMAND}).text
+    )
+    assert yaml_of(review) == COMMAND and review.is_inert and "echo </pre><script>" in review.text
+    job = visitor.submit("/submit", yaml=COMMAND).json()["location"].rpartition("/")[2]
+    found = console.client.get(f"/api/jobs/{job}")
+    assert (found["queue"], found["name"], found["owner"]) == ("lab", "works", "key admin")
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "line"),
+    [
+        ("name: [", "not valid YAML", 1),
+        ("a: &x 1\nb: *x\n", "anchors and aliases", 1),
+        ("", "expected a mapping", 0),
+        ("name: x\ntrain: {task: Racer, worlds: 1, iterations: 1, hyperparameters: a.json}", "a file is read", 2),
+        (
+            "name: x\ntrain:\n  task: Racer\n  worlds: 1\n  iterations: 1\n  config:\n    reward_function: /etc/passwd\n",
+            "write what the file holds",
+            7,
+        ),
+    ],
+)
+def test_what_a_request_may_not_bring_is_refused_at_its_line(
+    console: Console, text: str, words: str, line: int
+) -> None:
+    visitor = console.visitor()
+    problem = checked(visitor, {"yaml": text})["problem"]
+    assert words in problem["message"] and problem["line"] == line and "root:" not in problem["message"]
+    assert words in visitor.submit("/submit", yaml=text).json()["message"]
+
+
+def test_a_read_only_key_and_a_key_of_another_queue_submit_nothing(console: Console) -> None:
+    reader = console.visitor("reader")
+    for path in ("/submit", "/submit/task/Ant", "/submit/yaml"):
+        assert "is read-only" in reader.page(path, 403).text
+    for path in ("/submit", "/submit/check", "/submit/review", "/submit/yaml", "/submit/task/Ant"):
+        refused = reader.submit(path, yaml=COMMAND)
+        assert refused.status_code == 403 and "is read-only" in refused.json()["message"], path
+    lab = console.visitor("lab")
+    answer = lab.submit("/submit", yaml=COMMAND.replace("queue: lab", "queue: default"))
+    assert answer.status_code == 403 and "may use job queue lab only" in answer.json()["message"]
+    token = lab.page("/").form_token
+    stolen = lab.http.post("/submit", data={"form_token": token[:-1] + "x", "yaml": COMMAND})
+    assert stolen.status_code == 403 and "load the page again" in stolen.text

@@ -1,0 +1,177 @@
+"""Jobs on which an engine or the controller fails again and again: the others start and end meanwhile, and the log stays short."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.control.attempts import Attempts
+from orchestrator.control.monitoring import exposition
+from orchestrator.domain.hosts import Host, Hosts
+from orchestrator.domain.job import Status
+from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, Plan
+from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.models import Attempt, Job, Node
+from tests.support.orchestrator.fake_controller import FakeController, properties
+from tests.support.orchestrator.rows import job
+from tests.support.waiting import wait_for
+
+
+class PoisonedEngine(FakeEngine):
+    """Its calls for one job raise: a bug of an engine that this job brings out."""
+
+    poisoned = "bad"
+
+    def __init__(self) -> None:
+        super().__init__(capacity=Hosts([Host("fake/large", 8.0, (), 8192), Host("fake/small", 4.0, (), 8192)]))
+        self.raises: dict[str, BaseException] = {}
+        """By name of the call."""
+        self.tries = Counter[str]()
+
+    def plan(self, gang: Gang) -> Plan[Gang]:
+        self._check("plan", gang.job)
+        return super().plan(gang)
+
+    def launch(self, plan: Plan[Any]) -> Handle:
+        self._check("launch", plan.gang.job)
+        return super().launch(plan)
+
+    def observe(self, handle: Handle) -> GangStatus:
+        self._check("observe", handle.gang.partition("/")[0])
+        return super().observe(handle)
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        self._check("stop", handle.gang.partition("/")[0])
+        super().stop(handle, grace)
+
+    def _check(self, call: str, job_id: str) -> None:
+        if job_id == self.poisoned and (error := self.raises.get(call)) is not None:
+            self.tries[call] += 1
+            raise error
+
+
+Bench = FakeController[PoisonedEngine]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with ExitStack() as stack:
+        made = FakeController(tmp_path, PoisonedEngine(), stack)
+        made.reconciler.start()
+        yield made
+
+
+GOES_WRONG = {
+    "plan": "the fake engine failed to plan the gang (RuntimeError: no words for it)",
+    "launch": "the fake engine failed to start the gang (RuntimeError: no words for it)",
+    "observe": "the fake engine failed to look at the gang (RuntimeError: no words for it)",
+    "stop": "attempt 1 can't be stopped: the fake engine failed to stop the gang (RuntimeError: no words for it)",
+}
+
+
+@pytest.mark.parametrize("call", GOES_WRONG)
+def test_a_bug_of_an_engine_holds_up_one_job_and_is_logged_once(
+    bench: Bench, caplog: pytest.LogCaptureFixture, call: str
+) -> None:
+    began = time.monotonic()
+    bench.engine.raises[call] = RuntimeError("no\nwords for it")
+    bench.submit("bad")
+    if call == "stop":
+        bench.wait("bad", Status.RUNNING)
+        with bench.database.session() as session:
+            session.get_one(Job, "bad").stop_reason = "enough"
+    bench.explains("bad", GOES_WRONG[call])
+    bench.runs_and_ends("good-0", "good-1")
+    wait_for(lambda: bench.engine.tries[call] > 1, 30, "another try")
+    bench.runs_and_ends("good-2")
+    tries, passed = bench.engine.tries[call], time.monotonic() - began
+    assert 2 ** (tries - 1) - 1 <= passed, (
+        f"{tries} tries within {passed:.1f} s: each pause doubles, from one second on"
+    )
+    tracebacks = [record for record in caplog.records if record.exc_info]
+    assert len(tracebacks) == 1 and GOES_WRONG[call] in tracebacks[0].getMessage(), caplog.text
+    assert bench.job("bad").status in (Status.STARTING, Status.RUNNING)
+    assert bench.job("bad").status_reason.endswith("trying again")  # type: ignore[union-attr]
+    bench.engine.raises.clear()
+    if call == "stop":
+        assert bench.wait("bad", Status.FAILED).status_reason == "enough"
+    else:
+        bench.wait("bad", Status.RUNNING)
+        wait_for(lambda: bench.job("bad").status_reason == "attempt 1 runs on 2 nodes", 30, "that it is well again")
+
+
+def test_an_engine_that_wants_to_end_the_process_ends_neither_its_thread_nor_the_controller_s(bench: Bench) -> None:
+    bench.engine.raises["launch"] = bench.engine.raises["plan"] = SystemExit(3)
+    bench.submit("bad")
+    bench.explains("bad", "failed to plan the gang (SystemExit: 3)")
+    del bench.engine.raises["plan"]
+    bench.explains("bad", "failed to start the gang (SystemExit: 3)")
+    bench.runs_and_ends("good")
+    bench.engine.raises.clear()
+    bench.wait("bad", Status.RUNNING)
+
+
+HALF = "a name with half a character: \udcff"
+"""As the name of a file has it that is no UTF-8: no database can store it."""
+
+
+def test_a_reason_that_no_column_can_hold_is_written_out(bench: Bench) -> None:
+    bench.engine.raises["launch"] = EngineError(HALF)
+    bench.submit("bad")
+    said = bench.wait("bad", Status.FAILED).status_reason
+    assert said == "can't start the gang: a name with half a character: \\udcff"
+    bench.runs_and_ends("good")
+
+
+@pytest.mark.parametrize("part", ["begin", "advance", "preempt"])
+@pytest.mark.parametrize("words", ["no words for it", HALF], ids=["plain", "half a character"])
+def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: str, words: str
+) -> None:
+    whole, tries = getattr(Attempts, part), list[float]()
+
+    def poisoned(attempts: Attempts, session: Any, found: Job, *more: Any) -> None:
+        if found.id == "bad":
+            tries.append(time.monotonic())
+            raise RuntimeError(words)
+        whole(attempts, session, found, *more)
+
+    monkeypatch.setattr(Attempts, part, poisoned)
+    bench.submit("bad", node_properties=properties(5, MUSTER_PREEMPTIBLE="1"))
+    if part == "preempt":
+        bench.wait("bad", Status.RUNNING)
+        bench.submit("urgent", node_properties=properties(8), queue="urgent")
+    shown = words.replace("\udcff", "\\udcff")
+    bench.explains("bad", f"the controller failed on this job (RuntimeError: {shown}); trying again")
+    bench.runs_and_ends("good-0", "good-1")
+    wait_for(lambda: len(tries) > 1, 30, "another try")
+    bench.runs_and_ends("good-2")
+    pauses = [after - before for before, after in itertools.pairwise(tries)]
+    assert all(pause >= 2**number for number, pause in enumerate(pauses)), pauses
+    tracebacks = [record.getMessage() for record in caplog.records if record.exc_info]
+    assert tracebacks == [f"job bad: the controller failed on this job (RuntimeError: {shown}); trying again"]
+    monkeypatch.undo()
+    bench.wait("urgent" if part == "preempt" else "bad", Status.RUNNING)
+
+
+@pytest.mark.parametrize("damaged", [{}, {"numNodes": 1}, {"numNodes": "x", "mainNode": 0}], ids=str)
+def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_starting_and_no_metric_from_being_read(
+    bench: Bench, caplog: pytest.LogCaptureFixture, damaged: dict[str, Any]
+) -> None:
+    nodes = [Node(index=0, host="fake/small", cpus=1.0, memory=64)]
+    with bench.database.session() as session:
+        row = job("bad", status=Status.RUNNING, node_properties=damaged)
+        row.attempts.append(Attempt(number=1, epoch=1, nodes=nodes, compute_environment="fake"))
+        session.add(row)
+    bench.explains("bad", "the controller failed on this job")
+    bench.runs_and_ends("good-0", "good-1")
+    assert b'muster_cpus_in_use{engine="fake",queue="default"} 1.0' in exposition(bench.reconciler)
+    [failed] = [record.getMessage() for record in caplog.records if record.exc_info]
+    assert failed.startswith("job bad: the controller failed on this job")

@@ -1,0 +1,84 @@
+"""A stop in an iteration that takes longer than a stopped job has: nothing but that iteration is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Store
+from tests.conftest import PATIENCE
+from tests.support.worker.ranks import free_port, start_rank, training
+from tests.support.worker.runs import assert_same_bits, last, train
+
+
+def train_slowly_from_the_third() -> int:
+    """Body of a rank: its iterations take a second each, but the third, which takes minutes."""
+    from tests.support.worker import ranks
+    from tests.support.worker.point_task import Point
+
+    step = Point.step
+
+    def slow(self: Point, actions: object) -> None:
+        import time
+
+        time.sleep(30.0 if int(self._steps[0]) >= 16 else 0.15)
+        step(self, actions)  # type: ignore[arg-type]
+
+    Point.step = slow  # type: ignore[method-assign, assignment]
+    return ranks.train()
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_stop_in_a_long_iteration_loses_that_iteration_alone(tmp_path: Path, ranks: int) -> None:
+    env = training(tmp_path, run="stopped", iterations=6, every=100, keep=2)
+    body = "training.worker.test_long_iterations:train_slowly_from_the_third"
+    port = free_port()
+    started = [start_rank(body, rank, ranks, port, {**env, "MUSTER_GRACE_SECONDS": "2"}) for rank in range(ranks)]
+    outputs = stopped_after(started, 2)
+    assert [rank.returncode for rank in started] == [75] * ranks, outputs
+    assert "asked to stop: iteration 3 did not end within 1.6 s and was left; checkpoint 00000002-e1 stands" in outputs
+    (newest,) = list_checkpoints(Store(tmp_path).run("stopped"))
+    assert not newest.is_scheduled, "the job asked for none before iteration 100"
+    if ranks == 1:  # what goes on from it ends with the bits of a run that was never stopped
+        train(training(tmp_path, run="stopped", iterations=6, epoch=2))
+        train(training(tmp_path, run="straight", iterations=6))
+        assert_same_bits(last(tmp_path, "straight"), last(tmp_path, "stopped"))
+
+
+def stopped_after(ranks: list[subprocess.Popen[str]], iteration: int) -> str:
+    """Ask all ranks to stop when the first one has told of an iteration; the first one's output."""
+    try:
+        assert ranks[0].stdout
+        said = []
+        for line in ranks[0].stdout:
+            said.append(line)
+            if line.startswith(f"iteration {iteration}/"):
+                break
+        for rank in ranks:
+            os.kill(rank.pid, signal.SIGTERM)
+        ends = [rank.communicate(timeout=10 * PATIENCE) for rank in ranks]
+    finally:
+        for rank in ranks:
+            rank.kill()
+    return "".join(said) + "".join(out + errors for out, errors in ends)
+
+
+def test_short_iterations_are_saved_when_the_job_says_so_alone(tmp_path: Path) -> None:
+    train(training(tmp_path, iterations=6, every=4))
+    saved = list_checkpoints(Store(tmp_path).run("run"))
+    assert [(each.iteration, each.is_scheduled) for each in saved] == [(4, True), (6, True)]
+
+
+def test_saves_of_long_iterations_push_out_no_checkpoint_that_the_job_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUSTER_GRACE_SECONDS", "0.001")  # every iteration is too long
+    train(training(tmp_path, iterations=9, every=3, keep=2))
+    saved = list_checkpoints(Store(tmp_path).run("run"))
+    best = max(saved, key=lambda each: each.manifest["score"] or -1e9).iteration
+    assert [each.iteration for each in saved if each.iteration != best or each.is_scheduled] == [6, 9]

@@ -1,0 +1,33 @@
+"""What `muster stop` says of a training: how long an iteration takes, and what no checkpoint has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from orchestrator.cli.jobs import lost_iterations, slow_iteration
+
+
+def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[str, Any]:
+    progress = {"iteration": done, "iteration_seconds": seconds} if done else None
+    return {
+        "name": "ant",
+        "kind": "train",
+        "status": "RUNNING",
+        "progress": progress,
+        "results": {"iteration": saved},
+        **facts,
+    }
+
+
+def test_iterations_that_no_checkpoint_has_are_lost() -> None:
+    assert lost_iterations(training(7, 7)) == lost_iterations(training(0, 0)) == ""
+    assert lost_iterations(training(8, 7)) == "lost: 1 iteration, those after 7 until 8"
+    assert lost_iterations(training(3, 0)) == "lost: 3 iterations, those after 0 until 3"
+    assert lost_iterations(training(3, 0, kind="command", progress=None, results=None)) == ""
+
+
+def test_a_long_iteration_is_told_before_it_is_left() -> None:
+    assert slow_iteration(training(7, 7, seconds=1.0)) == slow_iteration(training(0, 0)) == ""
+    assert slow_iteration(training(7, 7, seconds=40.0, status="RUNNABLE")) == ""
+    told = slow_iteration(training(7, 7, seconds=40.0))
+    assert told.startswith("an iteration takes about 40 s; ") and "muster checkpoint ant, then stop" in told

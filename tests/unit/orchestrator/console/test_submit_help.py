@@ -1,0 +1,70 @@
+"""Help for a line of a job's YAML, and the place of an error in it."""
+
+from __future__ import annotations
+
+import pytest
+
+from orchestrator.console.submit_help import Problem, help_at, problem_of
+
+JOB = """name: x
+nodes: {min: 1, max: 2}
+train:
+  task: Racer
+  worlds: 1
+  config:
+    track: oval
+    reward_function:
+      file: a.py
+      text: |
+        def reward_function(params):
+            return 1.0
+  ppo:
+    gamma: 0.9
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "section", "key"),
+    [
+        (1, "", "name"),
+        (2, "nodes", "max"),
+        (3, "train", "worlds"),
+        (4, "train", "iterations"),
+        (6, "train.config", "track"),
+        (7, "train.config", "lidar"),
+        (9, "train.config.reward_function", "text"),
+        (12, "train.config.reward_function", "file"),
+        (14, "train.ppo", "learning_rate"),
+        (0, "", "queue"),
+        (99, "train.ppo", "gamma"),
+    ],
+)
+def test_help_is_of_the_section_in_which_the_line_stands(line: int, section: str, key: str) -> None:
+    found = help_at(JOB, line)
+    assert found["section"] == section and key in [each["name"] for each in found["keys"]]
+
+
+def test_help_says_what_a_key_is_and_which_are_given() -> None:
+    found = help_at(JOB, 5)
+    assert found["key"] == {
+        "name": "train.worlds",
+        "about": "simulated worlds of each rank; whole number from 1",
+        "given": True,
+    }
+    assert [each["name"] for each in found["keys"] if each["given"]] == ["task", "worlds", "config", "ppo"]
+
+
+def test_what_is_not_yaml_yet_has_the_help_of_what_stands_above() -> None:
+    assert help_at("name: x\ntrain:\n  task: Ant\n  wor: [", 4)["section"] == "train"
+    assert help_at("name: [", 1)["section"] == "" == help_at("", 1)["section"]
+
+
+def test_an_error_has_its_key_its_line_and_that_of_its_code() -> None:
+    code = "reward_function.py:2: FORBIDDEN: open can't be used"
+    found = problem_of(f"job.yaml:8: train.config.reward_function: {code}", JOB)
+    assert found == Problem(code, "train.config.reward_function", 12, 2)
+    inline = JOB.replace("text: |", 'text: "')
+    assert problem_of(f"job.yaml:8: train.config.reward_function: {code}", inline).line == 8
+    assert problem_of("job.yaml:3: not valid YAML: what", JOB) == Problem("not valid YAML: what", "", 3)
+    assert problem_of("job.yaml: expected a mapping", "") == Problem("expected a mapping")
+    assert problem_of("something: else", "") == Problem("something: else")

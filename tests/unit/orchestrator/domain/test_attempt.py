@@ -1,0 +1,362 @@
+"""The rules of an attempt, one by one: from a state and an event to instructions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from orchestrator.domain.attempt import (
+    CAUSE_PATIENCE,
+    FINISHING,
+    LOST,
+    SHORTEST_REQUEUE,
+    AwaitCause,
+    AwaitChildren,
+    Close,
+    Decide,
+    Due,
+    Event,
+    Explain,
+    Gone,
+    Instruction,
+    Keep,
+    Launch,
+    LaunchDelayed,
+    Launched,
+    LaunchRefused,
+    MarkRunning,
+    Observe,
+    Observed,
+    Phase,
+    Preempted,
+    Save,
+    State,
+    Stop,
+    StopDelayed,
+    Terms,
+    WindUp,
+    step,
+)
+from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
+from orchestrator.domain.native_options import NativeOptions
+
+T = 1_000_000
+"""The moment of every event here (steady time [ms])."""
+NATIVE = NativeOptions(is_native=True, on_child_failure="restart")
+TERMS = Terms(number=2, hosts=("h/0", "h/1"), whole=2, main=0, options=NATIVE, grace=30.0, allowed=3, spent=1)
+AWS = replace(TERMS, options=NativeOptions())
+
+LAUNCHING = State(TERMS)
+STARTING = replace(LAUNCHING, launched=True)
+RUNNING = replace(STARTING, started=True, running_since=T - 50_000)
+
+
+def ending(ending: Ending, reason: str = "why", exit_code: int | None = None, of: State = RUNNING) -> State:
+    return replace(of, verdict=Verdict(ending, reason, exit_code))
+
+
+def asked(state: State) -> State:
+    return replace(state, stop_reason="enough")
+
+
+def on_aws(state: State) -> State:
+    return replace(state, terms=AWS)
+
+
+def seen(*ends: NodeEnd | None, silences: Sequence[float | None] = (None, None), **facts: Any) -> Observed:
+    """A look at two nodes that run, where nothing else is said."""
+    return Observed(T, ends or (None, None), silences, **facts)
+
+
+def end(code: int, **facts: Any) -> NodeEnd:
+    return NodeEnd(code, f"exit {code}", 1.0, **facts)
+
+
+RUNS = "attempt 2 runs on 2 nodes"
+SAYS_SO = Explain(RUNS)
+DONE = Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
+STOPPED = Verdict(Ending.STOPPED, "enough")
+FAILED = Verdict(Ending.FAILED, "main node: exit 1", 1)
+MAIN_LAST = (end(0), end(0))
+KILLED = end(143, asked=True)
+UNSURE = Verdict(Ending.FAILED, "main node: exit 143", 143, certain=False)
+FROZEN = Verdict(Ending.FAILED, "node 1 gives no sign of life for 21 s: frozen, or cut off")
+TIMED = replace(RUNNING, terms=replace(TERMS, timeout=50))
+
+RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
+    # -- launching
+    "what is recorded is launched": (LAUNCHING, Due(), [Launch()]),
+    "also when it is to end": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [Launch()]),
+    "a handle is saved at once": (LAUNCHING, Launched("handle"), [Keep("handle"), Save()]),
+    "a launch that waits says why": (LAUNCHING, LaunchDelayed("no room", False), [Explain("no room")]),
+    "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
+    "one that is not needed any more is given up": (
+        asked(LAUNCHING),
+        LaunchDelayed("no room", False),
+        [Decide(STOPPED), WindUp()],
+    ),
+    "unless something may run": (asked(LAUNCHING), LaunchDelayed("silent", True), [Explain("silent")]),
+    "a refusal is final": (
+        LAUNCHING,
+        LaunchRefused("no such image"),
+        [Decide(Verdict(Ending.FATAL, "can't start the gang: no such image")), WindUp()],
+    ),
+    "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),
+    # -- what is told
+    "what is launched is looked at": (STARTING, Due(), [Observe()]),
+    "also while it runs": (RUNNING, Due(), [Observe()]),
+    "and while it ends": (ending(Ending.FAILED), Due(), [Observe()]),
+    "a main node that waits says why": (STARTING, seen(waits="queued"), [Explain("queued")]),
+    "also one that can't be seen any more": (RUNNING, seen(waits="silent"), [Explain("silent")]),
+    "the main node's first sign makes the job run": (STARTING, seen(), [MarkRunning(RUNS, T)]),
+    "in the engine's words where it has some": (STARTING, seen(words="on n1"), [MarkRunning("on n1", T)]),
+    "so does an end that came before any sign": (
+        STARTING,
+        seen(*MAIN_LAST),
+        [MarkRunning(RUNS, T), Decide(DONE), Save(), Stop(35.0)],
+    ),
+    "a gang with too little room is called so": (
+        replace(RUNNING, terms=replace(TERMS, whole=4)),
+        seen(),
+        [Explain("attempt 2 runs on 2 of 4 nodes: there is no room for more")],
+    ),
+    "one node is no nodes": (
+        replace(RUNNING, terms=replace(TERMS, hosts=("h/0",), whole=1)),
+        seen(None, silences=(None,)),
+        [Explain("attempt 2 runs on 1 node")],
+    ),
+    # -- what ends it
+    "the main node's end decides": (RUNNING, seen(*MAIN_LAST), [SAYS_SO, Decide(DONE), Save(), Stop(35.0)]),
+    "a failure has little to save": (RUNNING, seen(end(1), None), [SAYS_SO, Decide(FAILED), Save(), Stop(5.0)]),
+    "what was told to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, AwaitCause(T)]),
+    "since the first time": (
+        replace(RUNNING, cause_since=T - CAUSE_PATIENCE),
+        seen(KILLED, None),
+        [SAYS_SO, AwaitCause(T - CAUSE_PATIENCE)],
+    ),
+    "but not for ever": (
+        replace(RUNNING, cause_since=T - CAUSE_PATIENCE - 1),
+        seen(KILLED, None),
+        [SAYS_SO, Decide(UNSURE), Save(), Stop(5.0)],
+    ),
+    "nor when the job is to stop": (
+        asked(RUNNING),
+        seen(KILLED, None),
+        [SAYS_SO, AwaitCause(T), Decide(STOPPED), Save(), Stop(35.0)],
+    ),
+    "a request ends it": (asked(RUNNING), seen(), [SAYS_SO, Decide(STOPPED), Save(), Stop(35.0)]),
+    "also before it runs": (
+        asked(STARTING),
+        seen(waits="queued"),
+        [Explain("queued"), Decide(STOPPED), Save(), Stop(35.0)],
+    ),
+    "an end counts more than a request": (
+        asked(RUNNING),
+        seen(*MAIN_LAST),
+        [SAYS_SO, Decide(DONE), Save(), Stop(35.0)],
+    ),
+    "silence ends it": (
+        RUNNING,
+        seen(silences=(None, LOST + 1)),
+        [SAYS_SO, Decide(FROZEN), Save(), Stop(5.0)],
+    ),
+    "not a short one": (RUNNING, seen(silences=(None, LOST)), [SAYS_SO]),
+    "nor that of a node that has ended": (RUNNING, seen(None, end(0), silences=(None, LOST + 1)), [SAYS_SO]),
+    "nor that of a child on AWS": (on_aws(RUNNING), seen(silences=(None, LOST + 1)), [SAYS_SO]),
+    "time ends it": (
+        replace(TIMED, running_since=T - 50_001),
+        seen(),
+        [SAYS_SO, Decide(Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")), Save(), Stop(35.0)],
+    ),
+    "to the second": (TIMED, seen(), [SAYS_SO]),
+    "on AWS a child's end is nothing": (on_aws(RUNNING), seen(None, end(1)), [SAYS_SO]),
+    "and the main node's everything": (
+        on_aws(RUNNING),
+        seen(end(1), None),
+        [SAYS_SO, Decide(Verdict(Ending.FAILED, AWS_EXITED, 1)), Save(), Stop(5.0)],
+    ),
+    "where it vanished its host is named": (
+        on_aws(RUNNING),
+        seen(end(137, lost=True), None),
+        [SAYS_SO, Decide(Verdict(Ending.FAILED, "Host EC2 (instance h/0) terminated.")), Save(), Stop(5.0)],
+    ),
+    "the scheduler ends it": (RUNNING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
+    "also before its launch": (LAUNCHING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
+    "not twice": (ending(Ending.FAILED), Preempted("for b"), []),
+    # -- how it is ended
+    "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), [Stop(5.0)]),
+    "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), [Stop(35.0)]),
+    "one that never ran is stopped, too": (
+        ending(Ending.PREEMPTED, of=STARTING),
+        seen(waits="queued"),
+        [Explain("queued"), Stop(35.0)],
+    ),
+    "children of a main node that is done may end": (
+        RUNNING,
+        seen(end(0), None),
+        [SAYS_SO, Decide(DONE), Save(), AwaitChildren(T)],
+    ),
+    "for a while": (
+        replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING + 1),
+        seen(end(0), None),
+        [AwaitChildren(T - FINISHING + 1)],
+    ),
+    "and no longer": (
+        replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING),
+        seen(end(0), None),
+        [Stop(35.0)],
+    ),
+    "on AWS not at all": (on_aws(ending(Ending.SUCCEEDED)), seen(end(0), None), [Stop(35.0)]),
+    "an old picture is named": (
+        ending(Ending.FAILED),
+        seen(stale="Slurm to answer"),
+        [Explain("why; waits for Slurm to answer"), Stop(5.0)],
+    ),
+    "a stop that fails is told": (ending(Ending.FAILED), StopDelayed("not allowed"), [Explain("not allowed")]),
+    "but not of a gang that runs": (RUNNING, StopDelayed("not allowed"), []),
+    "a gang does not go before its end is decided": (RUNNING, Gone(T, MAIN_LAST, ""), []),
+}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_rule_says_what_follows_from_an_event_in_a_state(rule: str) -> None:
+    state, event, expected = RULES[rule]
+    assert list(step(state, event)) == expected
+
+
+SAVED = "; last checkpoint: iteration 50"
+LEFT = SHORTEST_REQUEUE
+SPENT, FREE = True, False
+REQUEUE, STOP = Ending.REQUEUE, Ending.STOPPED
+CODE_4 = {"action": "EXIT", "onExitCode": "4"}
+
+
+def with_terms(state: State, **terms: Any) -> State:
+    return replace(state, terms=replace(state.terms, **terms))
+
+
+def ran(state: State, milliseconds: int) -> State:
+    return replace(state, running_since=T - milliseconds)
+
+
+LAST = {"spent": 2}
+"""Terms of the third of three attempts."""
+
+# state, the nodes' ends → whether the attempt is spent, the job's state, and its reason
+CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
+    "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, Status.SUCCEEDED, "why"),
+    "done before the stop": (asked(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, Status.SUCCEEDED, "why"),
+    "stopped": (asked(ending(STOP)), (), SPENT, Status.FAILED, f"enough{SAVED}"),
+    "stopped, on AWS": (on_aws(asked(ending(STOP))), (), SPENT, Status.FAILED, "enough"),
+    "failed when it was asked to stop": (asked(ending(Ending.FAILED)), (), SPENT, Status.FAILED, f"enough{SAVED}"),
+    "left when it was asked to stop": (asked(ending(REQUEUE)), (), FREE, Status.FAILED, f"enough{SAVED}"),
+    "preempted when it was asked to stop": (
+        asked(ending(Ending.PREEMPTED)),
+        MAIN_LAST,
+        FREE,
+        Status.FAILED,
+        f"enough{SAVED}",
+    ),
+    "refused when it was asked to stop": (asked(ending(Ending.FATAL)), (), SPENT, Status.FAILED, "why"),
+    "over time when it was asked to stop": (asked(ending(Ending.TIMEOUT)), (), SPENT, Status.FAILED, "why"),
+    "preempted": (ending(Ending.PREEMPTED), (end(75), end(75)), FREE, Status.RUNNABLE, f"attempt 2 was why{SAVED}"),
+    "preempted before its launch": (
+        ending(Ending.PREEMPTED, of=LAUNCHING),
+        (),
+        FREE,
+        Status.RUNNABLE,
+        f"attempt 2 was why{SAVED}",
+    ),
+    "done before it was preempted": (
+        ending(Ending.PREEMPTED),
+        MAIN_LAST,
+        FREE,
+        Status.SUCCEEDED,
+        "done before it was preempted",
+    ),
+    "left on request": (
+        with_terms(ran(ending(REQUEUE), LEFT), spent=2),
+        (end(75), end(75)),
+        FREE,
+        Status.RUNNABLE,
+        f"attempt 2 left on request{SAVED}; starting again",
+    ),
+    "left at once": (
+        ran(ending(REQUEUE), LEFT - 1),
+        (end(75), end(75)),
+        SPENT,
+        Status.RUNNABLE,
+        f"attempt 2 left on request{SAVED}; starting again",
+    ),
+    "left at once, the last time": (
+        with_terms(ran(ending(REQUEUE), LEFT - 1), **LAST),
+        (end(75), end(75)),
+        SPENT,
+        Status.FAILED,
+        "why",
+    ),
+    "failed": (
+        ending(Ending.FAILED),
+        (end(1), None),
+        SPENT,
+        Status.RUNNABLE,
+        f"attempt 2 failed (why){SAVED}; trying again",
+    ),
+    "failed the last time": (
+        with_terms(ending(Ending.FAILED), **LAST),
+        (end(1), None),
+        SPENT,
+        Status.FAILED,
+        "why (attempt 3 of 3)",
+    ),
+    "failed the last time, on AWS": (
+        with_terms(on_aws(ending(Ending.FAILED)), **LAST),
+        (end(1), None),
+        SPENT,
+        Status.FAILED,
+        "why",
+    ),
+    "failed as no retry mends": (
+        with_terms(ending(Ending.FAILED, exit_code=4), conditions=[CODE_4]),
+        (end(4), None),
+        SPENT,
+        Status.FAILED,
+        "why (attempt 2 of 3)",
+    ),
+    "failed for the reason that no retry mends": (
+        with_terms(ending(Ending.FAILED, exit_code=3), conditions=[{"action": "EXIT", "onReason": "exit 3"}]),
+        (end(3), None),
+        SPENT,
+        Status.FAILED,
+        "why (attempt 2 of 3)",
+    ),
+    "fatal": (ending(Ending.FATAL), (), SPENT, Status.FAILED, "why"),
+    "over time": (ending(Ending.TIMEOUT), (), SPENT, Status.FAILED, "why"),
+}
+
+
+@pytest.mark.parametrize("case", CLOSES)
+def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
+    state, ends, spent, status, reason = CLOSES[case]
+    assert step(state, Gone(T, ends, SAVED)) == (Close(T, spent, status, reason),)
+
+
+EVENTS = (
+    Due(),
+    Launched("handle"),
+    LaunchDelayed("why", False),
+    LaunchRefused("why"),
+    Preempted("why"),
+    seen(),
+    StopDelayed("why"),
+    Gone(T, MAIN_LAST, ""),
+)
+
+
+@pytest.mark.parametrize("event", EVENTS, ids=lambda event: type(event).__name__)
+def test_nothing_follows_from_an_event_of_a_closed_attempt(event: Event) -> None:
+    closed = replace(ending(Ending.FAILED), closed=True)
+    assert closed.phase is Phase.CLOSED and step(closed, event) == ()
