@@ -1,4 +1,4 @@
-"""Runs side by side: those that differ in their seed alone are one group, with means and standard deviations."""
+"""Comparison of runs. Runs that differ only in their seed form a group, with means and standard deviations."""
 
 from __future__ import annotations
 

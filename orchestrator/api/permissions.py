@@ -133,10 +133,10 @@ class Operation(StrEnum):
     RERUN_ENTRY = "POST /api/leagues/{name}/entries/{number}/races"
     ENTER_LEAGUE = "POST /api/leagues/{name}/entries"
     DISQUALIFY = "POST /api/leagues/{name}/entries/{number}/disqualify"
-    LIST_TRACKS = "GET /api/tracks"
     READ_KEYS = "GET /api/keys"
     CREATE_KEY = "POST /api/keys"
     DELETE_KEY = "DELETE /api/keys/{name}"
+    LIST_TRACKS = "GET /api/tracks"
     READ_WEBHOOKS = "GET /api/webhooks"
     TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 

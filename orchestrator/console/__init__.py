@@ -43,16 +43,19 @@ from orchestrator.console import assets, routing
 PAGES = (
     "login",
     "jobs",
-    "curves",
-    "run_files",
+    "job",
     "job_log",
     "job_actions",
-    "job",
+    "run_files",
+    "curves",
+    "queues",
+    "runs",
+    "compare",
+    "keys",
     "submit",
     "tracks",
     "models",
     "leagues",
-PAGES = ("queues", "runs", "compare", "keys")
 )
 """Modules of this package, each with a ``router``."""
 

@@ -18,7 +18,7 @@ from orchestrator.control.compute_environments import own_queues
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
 from orchestrator.control.usage import held_by, placements_of, usage_at
-from orchestrator.domain.hosts import Queued, engine_of
+from orchestrator.domain.hosts import Capacity, Queued, engine_of
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.resources import Resources
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
@@ -50,6 +50,7 @@ def queues(
 def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
     """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises ClientError."""
     engine = reconciler.engine
+    capacities = engine.capacity()
     with reconciler.database.session() as session:
         policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
         rows = [
@@ -83,7 +84,7 @@ def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
     return {
         "queues": found,
         "computeEnvironments": environments,
-        "engines": _engines(reconciler),
+        "engines": _engines(reconciler, capacities),
         "hosts": [
             {
                 **{key: value for key, value in asdict(host).items() if key in ("name", "cpus", "memory", "away")},
@@ -91,7 +92,7 @@ def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
                 "gpus": len(host.gpus),
                 "inUse": asdict(taken.get(host.name, Resources())),
             }
-            for capacity in engine.capacity().values()
+            for capacity in capacities.values()
             for host in capacity.machines
         ],
     }
@@ -165,7 +166,7 @@ def _environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
     return {"name": read.name, "engine": read.engine, "state": row.state, "hosts": read.hosts, "cpus": read.max_cpus}
 
 
-def _engines(reconciler: Reconciler) -> list[dict[str, Any]]:
+def _engines(reconciler: Reconciler, capacities: Mapping[str, Capacity]) -> list[dict[str, Any]]:
     engine = reconciler.engine
     own = own_queues(engine.names)
     capacities = engine.capacity()
@@ -174,7 +175,7 @@ def _engines(reconciler: Reconciler) -> list[dict[str, Any]]:
             "name": name,
             "queue": own[name],
             "elastic": engine.is_elastic([name]),
-            "queuesByItself": isinstance(capacities.get(name), Queued),
+            "queuesByItself": isinstance(capacities[name], Queued),
             "toldAt": health.told_at,
             "problem": health.problem,
             "failing": health.failing,

@@ -101,10 +101,10 @@ TABLE = {
     Operation.RERUN_ENTRY: OWN_WRITE,
     Operation.ENTER_LEAGUE: OWN_WRITE,
     Operation.DISQUALIFY: OWN_WRITE,
-    Operation.LIST_TRACKS: SHARED_READ,
     Operation.READ_KEYS: ALL_READ,
     Operation.CREATE_KEY: SHARED_WRITE,
     Operation.DELETE_KEY: SHARED_WRITE,
+    Operation.LIST_TRACKS: SHARED_READ,
     Operation.READ_WEBHOOKS: ALL_READ,
     Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
@@ -213,10 +213,10 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.RERUN_ENTRY, {}),
         of_ours(of.ENTER_LEAGUE, {"model": world.run, "job": world.job}),
         of_ours(of.DISQUALIFY, {"reason": "x"}),
-        of_ours(of.LIST_TRACKS),
         of_ours(of.READ_KEYS),
         lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
         lambda key: world.delete_key(key),
+        of_ours(of.LIST_TRACKS),
         of_ours(of.READ_WEBHOOKS),
         of_ours(of.TEST_WEBHOOK, {}),
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from orchestrator.client import Client
@@ -23,7 +25,14 @@ def waiting(console: Console) -> dict[str, str]:
     definition = console.register("waits")
     found = {queue: console.submit(definition, f"in-{queue}", queue) for queue in ("default", "lab")}
     job = {"jobName": "in-shared", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
-    return {**found, "shared": console.client.batch("SubmitJob", **job)["jobId"]}
+    found["shared"] = console.client.batch("SubmitJob", **job)["jobId"]
+
+    def has_all() -> Any:
+        told = console.client.get("/api/queues")
+        return {job["id"] for queue in told["queues"] for job in queue["front"]} == {*found.values()} and told["hosts"]
+
+    wait_for(has_all, 30, "a scheduling pass")
+    return found
 
 
 def rows_of(page: Page, key: str) -> int:
@@ -100,5 +109,6 @@ def test_hostile_names_are_text(console: Console) -> None:
     console.client.batch(
         "CreateComputeEnvironment", computeEnvironmentName="odd", type="UNMANAGED", tags={"muster:hosts": hostile}
     )
+    wait_for(lambda: hostile in visitor.page("/queues").text, 10, "the new one")
     page = visitor.page("/queues")
-    assert hostile in page.text and page.is_inert and not page.all("img")
+    assert page.is_inert and not page.all("img")
