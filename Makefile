@@ -4,6 +4,7 @@
 # make long             trainings that are killed, stretched and cut off, and trainings that learn something
 # make robots           robots, sensors, terrain, randomisation, terms and cameras against MuJoCo's own engine
 # make services         W&B, MLflow and LEAPP, whose packages (130 MB) it installs: tracked trainings, a bundle that LEAPP runs
+# make console          the console by clicking, in a real browser (Chromium): stories, hostile texts, no mouse, a phone, axe
 # make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
@@ -17,7 +18,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test unit integration training long robots services engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run race test unit integration training long robots services console engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -35,7 +36,7 @@ PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --duratio
 # each of the first two keeps one core busy
 test: $(READY)
 	$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
-	$(PYTEST) -m "not cluster and not robots and not long"
+	$(PYTEST) -m "not cluster and not robots and not long and not console"
 
 unit: $(READY)
 	$(PYTEST) tests/unit
@@ -57,6 +58,11 @@ robots: $(READY)
 services: $(READY) kernels
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
 	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_bundle_parts.py
+
+# pictures of the pages are left in build/console
+console: $(READY)
+	$(BIN)/python -m tests.support.kernels Cartpole Racer
+	$(PYTEST) tests/console
 
 # one after the other: a cluster has this machine for itself
 engines: $(READY) kernels

@@ -21,7 +21,7 @@ from tests.support.processes import end_all
 from tests.support.waiting import PATIENCE, wait_for
 
 REPOSITORY = Path(__file__).parent.parent
-TIERS = ("long", "training", "integration", "unit", "robots", "cluster")
+TIERS = ("long", "training", "integration", "unit", "robots", "console", "cluster")
 """The folders of the tests, and the marker of each one's tests; in the order in which they run: what takes long first, so that no
 process is left with a long one at the end."""
 pytest_plugins = [

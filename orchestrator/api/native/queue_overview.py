@@ -169,7 +169,6 @@ def _environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
 def _engines(reconciler: Reconciler, capacities: Mapping[str, Capacity]) -> list[dict[str, Any]]:
     engine = reconciler.engine
     own = own_queues(engine.names)
-    capacities = engine.capacity()
     return [
         {
             "name": name,

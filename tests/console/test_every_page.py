@@ -1,0 +1,111 @@
+"""Every page: read by axe, dark and light, on a phone, and with hostile texts in it."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import expect
+
+from shared_store.layout import Store
+from shared_store.metrics import MetricsWriter
+from tests.conftest import submit_gang
+from tests.support.console.fixtures import Console
+from tests.support.console.person import PHONE, People
+from tests.support.console.racers import add_league, add_racer
+from tests.support.orchestrator.jobs import await_status
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
+
+HOSTILE = "</pre></textarea><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7 * 7 }}"
+RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
+
+
+@pytest.fixture(scope="module")
+def places(console: Console) -> dict[str, str]:
+    """The addresses of pages that have something to show, by a name."""
+    store = Store(console.server.home / "store")
+    add_racer(store, "fast", "fast-run", 8)
+    add_league(store, "cup", "ada", "grace")
+    add_run(store, "taught", {**SPEC, "environment": {"TEXT": HOSTILE}})
+    for iteration in (3, 6, 9):
+        add_checkpoint(store, "taught", iteration, score=float(iteration), score_error=0.5)
+    with MetricsWriter(store.run("taught"), 1, 0) as metrics:
+        for iteration in range(1, 10):
+            metrics.write({"iteration": iteration, "reward": iteration / 2, "reward_alive": 1.0, "policy_loss": 0.1})
+    said = submit_gang(console.client, f"print({HOSTILE!r}); raise ValueError({HOSTILE!r})", name="said", cpus="0.5")
+    await_status(console.client, said, "FAILED")
+    training = console.client.post("/api/runs/taught/resume", {"set": ["train.iterations=20"]})["jobId"]
+    return {
+        "jobs": "/",
+        "training": f"/jobs/{training}",
+        "command": f"/jobs/{said}",
+        "submit": "/submit",
+        "wizard": "/submit/task/Racer",
+        "yaml": "/submit/yaml",
+        "models": "/models",
+        "model": "/models/fast",
+        "leagues": "/leagues",
+        "league": "/leagues/cup",
+        "entry": "/leagues/cup/entries/1",
+        "tracks": "/tracks",
+        "track": "/tracks/oval",
+        "missing": "/jobs/none",
+    }
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_fault_on_any_page(console: Console, people: People, places: dict[str, str], scheme: Any) -> None:
+    person = people(console.url, console.secrets["admin"], color_scheme=scheme)
+    faults = []
+    for name, path in places.items():
+        page = person.goto(path)
+        page.wait_for_load_state("load")
+        page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+        found = Axe().run(page, options={"runOnly": RULES})
+        faults += [f"{name}: {fault_of(each)}" for each in found.response["violations"]]
+        person.picture(f"{name}-{scheme}")
+    assert not faults, "\n".join(faults)
+
+
+def fault_of(violation: dict[str, Any]) -> str:
+    first = violation["nodes"][0]
+    return f"{violation['id']} ({len(violation['nodes'])}): {first['html'][:200]} {first['failureSummary'][:300]}"
+
+
+def test_no_page_is_wider_than_a_phone(console: Console, people: People, places: dict[str, str]) -> None:
+    person = people(console.url, console.secrets["admin"], viewport=PHONE, has_touch=True, is_mobile=True)
+    wide = {}
+    for name, path in places.items():
+        page = person.goto(path)
+        page.wait_for_load_state("load")
+        person.picture(f"{name}-phone")
+        wide[name] = page.evaluate("document.documentElement.scrollWidth")
+    assert {name: width for name, width in wide.items() if width > PHONE["width"]} == {}
+
+
+def test_what_a_job_says_is_text_in_its_log(console: Console, people: People, places: dict[str, str]) -> None:
+    person = people(console.url, console.secrets["admin"])
+    page = person.goto(places["command"])
+    expect(page.get_by_role("log").locator(".line").first).to_contain_text(HOSTILE)
+    person.click("First error")
+    expect(page.get_by_role("log").locator(".line.hit")).to_be_visible()
+    assert page.locator("main img, main iframe, main script").count() == 0
+    page = person.goto(places["training"])
+    page.get_by_text("The whole job").click()
+    expect(page.locator("details pre")).to_contain_text(HOSTILE)
+    assert page.locator("main img, main iframe, main script").count() == 0
+
+
+def test_a_text_that_is_typed_into_the_editors_stays_a_text(console: Console, people: People) -> None:
+    person = people(console.url, console.secrets["admin"])
+    page = person.goto("/submit/yaml")
+    page.get_by_label("The job's YAML").fill(
+        f"name: odd\nresources: {{cpus: 1, memory: 16}}\ncommand: [echo, '{HOSTILE}']\n"
+    )
+    person.click("Review")
+    expect(page.locator("pre").first).to_contain_text(HOSTILE)
+    assert page.locator("main img, main iframe, main script").count() == 0
+    person.click("Back")
+    expect(page.get_by_label("The job's YAML")).to_have_value(re.compile(re.escape(HOSTILE)))

@@ -1,0 +1,115 @@
+"""The list of jobs: two people at once, no mouse, hostile texts, a thousand jobs."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from playwright.sync_api import Locator, expect
+
+from tests.support.console.fixtures import Console
+from tests.support.console.person import People, Person
+from tests.support.orchestrator.jobs import await_status
+
+HOSTILE = "</td><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7 * 7 }}"
+MANY = 1000
+
+
+@pytest.fixture(scope="module")
+def waiting(console: Console) -> str:
+    """The definition of jobs that wait."""
+    return console.register("waits")
+
+
+def row(person: Person, job: str) -> Locator:
+    return person.page.locator(f'tr[data-key="{job}"]')
+
+
+def test_two_people_see_each_others_changes_and_a_reader_has_no_buttons(
+    console: Console, people: People, waiting: str
+) -> None:
+    one, other = people(console.url, console.secrets["admin"]), people(console.url, console.secrets["reader"])
+    for each in (one, other):
+        each.goto("/")
+    job = console.submit(waiting, "shared")
+    for each in (one, other):
+        expect(row(each, job)).to_contain_text("shared")
+    expect(other.page.get_by_role("button", name="Stop marked")).to_have_count(0)
+    row(one, job).get_by_role("checkbox").check()
+    one.click("Stop marked")
+    one.confirm()
+    for each in (one, other):
+        expect(row(each, job).locator(".badge")).to_have_text("FAILED")
+
+
+def test_a_job_is_stopped_without_a_mouse(console: Console, people: People, waiting: str) -> None:
+    person = people(console.url, console.secrets["admin"])
+    job = console.submit(waiting, "by-keyboard")
+    page = person.goto("/?search=by-keyboard")
+    tab_to(person, "a.skip")
+    page.keyboard.press("Enter")
+    tab_to(person, f'tr[data-key="{job}"] input[type=checkbox]')
+    page.keyboard.press("Space")
+    tab_to(person, "#stop button.danger", backwards=True)
+    page.keyboard.press("Enter")
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_role("button", name="Cancel")).to_be_focused()
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    expect(row(person, job).locator(".badge")).to_have_text("FAILED")
+
+
+def tab_to(person: Person, selector: str, backwards: bool = False) -> None:
+    """Press Tab until an element has the focus. Raises AssertionError: it can't be reached."""
+    for _ in range(60):
+        person.page.keyboard.press("Shift+Tab" if backwards else "Tab")
+        if person.page.evaluate("selector => document.activeElement.matches(selector)", selector):
+            return
+    raise AssertionError(f"{selector} can't be reached with Tab")
+
+
+def test_hostile_names_and_reasons_are_text(console: Console, people: People, waiting: str) -> None:
+    job = console.submit(waiting, "hostile")
+    console.client.batch("TerminateJob", jobId=job, reason=HOSTILE)
+    await_status(console.client, job, "FAILED")
+    person = people(console.url, console.secrets["admin"])
+    person.goto("/")
+    expect(row(person, job).locator(".reason")).to_have_text(HOSTILE)
+    second = console.submit(waiting, "hostile-later")
+    expect(row(person, second)).to_be_visible()
+    console.client.batch("TerminateJob", jobId=second, reason=HOSTILE)
+    expect(row(person, second).locator(".reason")).to_have_text(HOSTILE)
+    page = person.goto(f"/?search={HOSTILE}".replace("#", "%23"))
+    expect(page.get_by_label("Search")).to_have_value(HOSTILE)
+    assert page.locator("img, iframe, main script").count() == 0
+
+
+def test_a_thousand_jobs_are_found_paged_and_stopped(console: Console, people: People, waiting: str) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        jobs = list(pool.map(lambda i: console.submit(waiting, f"many-{i:04}"), range(MANY)))
+    person = people(console.url, console.secrets["admin"])
+    page = person.goto("/?search=many-")
+    rows = page.locator("tr[data-key]")
+    expect(rows).to_have_count(50)
+    expect(page.locator(".tabs")).to_contain_text(f"{MANY}")
+    person.picture("jobs-1000")
+    first = rows.first.get_attribute("data-key")
+    person.click("Older")
+    expect(page).to_have_url(re.compile("search=many-.*page=2"))
+    expect(rows).to_have_count(50)
+    assert rows.first.get_attribute("data-key") != first
+    person.click("Newer")
+    expect(rows.first).to_have_attribute("data-key", str(first))
+    page.get_by_label("Search").fill("many-0042")
+    page.keyboard.press("Enter")
+    expect(rows).to_have_count(1)
+    expect(row(person, jobs[42])).to_be_visible()
+    person.goto("/?search=many-")
+    person.click("Stop all found")
+    expect(page.get_by_role("dialog")).to_contain_text("1000")
+    person.confirm()
+    page.goto("/?search=many-")
+    expect(rows.first.locator(".badge")).to_have_text("FAILED")
+    ended = console.client.get("/api/jobs", status="FAILED", search="many-")
+    assert ended["total"] == MANY
