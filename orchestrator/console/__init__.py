@@ -40,7 +40,23 @@ from fastapi import FastAPI
 
 from orchestrator.console import assets, routing
 
-PAGES = ("login", "jobs", "curves", "run_files", "job_log", "job_actions", "job", "submit", "tracks", "models", "leagues")
+PAGES = (
+    "login",
+    "jobs",
+    "job",
+    "job_log",
+    "job_actions",
+    "run_files",
+    "curves",
+    "queues",
+    "runs",
+    "compare",
+    "keys",
+    "submit",
+    "tracks",
+    "models",
+    "leagues",
+)
 """Modules of this package, each with a ``router``."""
 
 

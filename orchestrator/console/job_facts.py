@@ -86,7 +86,7 @@ def _attempt(attempt: Mapping[str, Any], begin: int, end: int, saves: bool) -> d
         "epoch": str(attempt["epoch"]),
         "ending": f"{ended}{'' if attempt['spent'] else ', not counted'}",
         "kind": ended,
-        "why": attempt["statusReason"] or "" if ended != "succeeded" else "",
+        "why": (attempt["statusReason"] or "") if ended != "succeeded" else "",
         "started": words.moment(started),
         "took": words.duration((stopped - started) / 1000) if started and stopped else "",
         "since": words.moment(started) if started and not stopped else "",

@@ -56,7 +56,13 @@ export class JobLog {
 
   /** New lines of the stream. */
   add(told) {
+    const before = this.last;
     this.last = told.last;
+    if (this.isAtEnd && this.#count() > 2 * MOST) {
+      // the person reads what is further up: these lines wait
+      this.isAtEnd = this.buttons.later.hidden = this.buttons.follow.hidden = false;
+      this.end = before;
+    }
     if (!this.isAtEnd) {
       this.state.textContent = "New lines have come.";
       return;
@@ -77,13 +83,18 @@ export class JobLog {
     this.buttons.later.hidden = this.buttons.follow.hidden = this.isAtEnd;
   }
 
+  #count() {
+    return [...this.place.children].reduce((sum, each) => sum + each.childElementCount, 0);
+  }
+
   /** Drop the first blocks; they can be read again. */
   #trim() {
-    let count = [...this.place.children].reduce((sum, each) => sum + each.childElementCount, 0);
+    let count = this.#count();
     while (count > MOST && this.place.childElementCount > 1) {
       count -= this.place.firstElementChild.childElementCount;
       this.first = null; // the place is no longer known: the lines before the first one are found by reading back from the end
       this.place.firstElementChild.remove();
+      this.buttons.earlier.hidden = false;
     }
   }
 
