@@ -60,14 +60,14 @@ def main() -> None:
                     server.url,
                     "Jobs (1,000 jobs)",
                     "/",
-                    "document.querySelectorAll('tr[data-key]').length >= 50",
+                    "() => document.querySelectorAll('tr[data-key]').length >= 50",
                 ),
                 visits(
                     browser,
                     server.url,
                     "Job (10,000 iterations × 50 metrics, 1 GB log)",
                     f"/jobs/{trained}",
-                    "document.querySelectorAll('[data-charts] svg').length > 3 && document.querySelectorAll('.line').length > 100",
+                    "() => document.querySelectorAll('[data-charts] svg').length > 3 && document.querySelectorAll('.line').length > 100",
                 ),
             ]
             late = {
@@ -156,6 +156,7 @@ def visits(browser: Browser, url: str, name: str, path: str, is_there: str) -> d
 def visit(page: Page, path: str, is_there: str) -> dict[str, float]:
     page.goto(path, wait_until="load")
     page.wait_for_function(is_there, polling="raf")
+    page.wait_for_function("() => performance.getEntriesByName('first-contentful-paint').length", polling="raf")
     told: dict[str, float] = page.evaluate(
         """() => {
           const [navigation] = performance.getEntriesByType("navigation");
