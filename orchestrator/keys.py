@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.alias_generators import to_camel
@@ -55,6 +56,16 @@ class Key(_Document):
     read_only: bool = False
     created_at: int
     """Milliseconds since 1970."""
+
+    @property
+    def rights(self) -> str:
+        """What it may do, in words."""
+        queues = "all queues" if self.queues is None else f"queues {', '.join(self.queues)}"
+        return f"{queues}, {'read only' if self.read_only else 'read and write'}"
+
+    def describe(self) -> dict[str, Any]:
+        """Everything but its secret, as JSON values."""
+        return self.model_dump(mode="json", by_alias=True, exclude={"secret"})
 
 
 class _File(_Document):

@@ -94,7 +94,7 @@ class Server:
         _check_proxies(trusted_proxies)
         told = _read_webhooks(webhooks)
         exposed = not is_loopback(host) or bool(trusted_proxies)
-        self.access = Access(KeyStore(home), token, exposed=exposed, user=os.geteuid())
+        self.access = Access(KeyStore(home), token, exposed=exposed, reachable=exposed, user=os.geteuid())
         _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home)

@@ -117,6 +117,8 @@ class Run:
             raise DamagedFile(f"{path}: spec is not a mapping")
         if found is not None and not isinstance(found.get("created"), int | float | None):
             raise DamagedFile(f"{path}: created is not a number")
+        if found is not None and not 0 <= (found.get("created") or 0) < 2**53:  # no database holds more
+            raise DamagedFile(f"{path}: created is no time")
         if found is not None and not isinstance(found.get("parent"), dict | None):
             raise DamagedFile(f"{path}: parent is not a mapping")
         return found

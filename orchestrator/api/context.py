@@ -127,10 +127,15 @@ def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Ru
     return find_run(reconciler, name)
 
 
-def visible_runs(session: Session, store: Store, after: str = "", most: int | None = None) -> list[Run]:
-    """The runs of the store that the caller may see, by name: those behind ``after``, at most so many."""
-    if visible_queues() is None:
+def visible_runs(
+    session: Session, store: Store, after: str = "", most: int | None = None, search: str = ""
+) -> list[Run]:
+    """The runs of the store that the caller may see, by name: those behind ``after``, at most so many, with ``search`` in their names."""
+    if visible_queues() is None and not search:
         return store.runs(after, most)
+    found = (run for run in store.runs(after) if search.lower() in run.name.lower())
+    if visible_queues() is None:
+        return list(islice(found, most))
     recorded = {record.name: record for record in session.scalars(select(RunRecord))}
-    owned = ((run, recorded.get(run.name) or owner_of(session, run)) for run in store.runs(after))
+    owned = ((run, recorded.get(run.name) or owner_of(session, run)) for run in found)
     return list(islice((run for run, owner in owned if owner is not None and is_visible(owner)), most))

@@ -106,6 +106,7 @@ class Operation(StrEnum):
     READ_DOCUMENTATION = "GET /api/docs"
     READ_MONITORING = "GET /metrics"
     READ_CAPACITY = "GET /api/capacity"
+    READ_QUEUES = "GET /api/queues"
     PLAN = "POST /api/plan"
     FIT = "POST /api/fit"
     FIND_JOBS = "GET /api/jobs"
@@ -133,6 +134,9 @@ class Operation(StrEnum):
     ENTER_LEAGUE = "POST /api/leagues/{name}/entries"
     DISQUALIFY = "POST /api/leagues/{name}/entries/{number}/disqualify"
     LIST_TRACKS = "GET /api/tracks"
+    READ_KEYS = "GET /api/keys"
+    CREATE_KEY = "POST /api/keys"
+    DELETE_KEY = "DELETE /api/keys/{name}"
     READ_WEBHOOKS = "GET /api/webhooks"
     TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 

@@ -11,14 +11,12 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.comparison.curves import ENDINGS, draw
-from orchestrator.cli.comparison.runs import Group, RunFacts, grouped, same_episodes
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.recordings import OverwriteOption, refuse_existing
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
-from shared_store.pairs import paired, read_returns
-from shared_store.wording import counted
+from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, versus
 
 _PAGE = 10_000
 
@@ -55,43 +53,22 @@ def compare(
         groups = grouped([_facts(client, name) for name in names])
     if output is not None:
         _draw(groups, output)
-    versus = [_versus(group, groups[0]) for group in groups]
+    against = [versus(group, groups[0]) for group in groups]
     if as_json:
-        echo_json([{**group.describe(), "against": told} for group, told in zip(groups, versus, strict=True)], indent=1)
+        echo_json(
+            [{**group.describe(), "against": told} for group, told in zip(groups, against, strict=True)], indent=1
+        )
         return
     table = Table(box=None, pad_edge=False)
-    for column in ("RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS"):
+    for column in COLUMNS:
         table.add_column(column, no_wrap=True)
     for group in groups:
         table.add_row(*group.cells())
     print_cut(table)
-    for told in filter(None, versus):
-        low, high = (f"{end:+.2f}" if end is not None else "-" for end in (told["low"], told["high"]))
-        echo(
-            f"{told['new']} against {told['old']}: return {told['difference']:+.2f} ({low} to {high}, paired over "
-            f"{counted(told['pairs'], 'episode')}): {told['verdict']}"
-        )
+    for told in filter(None, against):
+        echo(sentence(told))
     if output is not None:
         echo(f"written: {output}")
-
-
-def _versus(group: Group, first: Group) -> dict[str, Any] | None:
-    """Difference of a single run from the first one in the same episodes; None without such episodes, or if they can't be read here."""
-    if group is first or len(group.runs) > 1 or len(first.runs) > 1:
-        return None
-    new, old = group.runs[0], first.runs[0]
-    pair = same_episodes(new, old)
-    if pair is None:
-        return None
-    tables = [
-        Path(run.path) / "evaluations" / f"{each['name']}.parquet" for run, each in zip((new, old), pair, strict=True)
-    ]
-    try:
-        told = paired(*map(read_returns, tables))
-    except (ImportError, OSError, ValueError):  # for example, the store is on another machine
-        return None
-    names = [f"{run.name}@{each['iteration']}" for run, each in zip((new, old), pair, strict=True)]
-    return {"new": names[0], "old": names[1], **told}
 
 
 def _chosen(client: Client, patterns: Sequence[str]) -> list[str]:
@@ -126,14 +103,8 @@ def _facts(client: Client, name: str) -> RunFacts:
     records: list[dict[str, Any]] = []
     while page := client.get(f"/api/runs/{named(name)}/metrics", after=records[-1]["iteration"] if records else 0):
         records += page
-    listed = client.get(f"/api/runs/{named(name)}/checkpoints")
-    best = next((each for each in listed if each["best"] and each["evaluated"]), None)
-    judged = best or next((each for each in reversed(listed) if each["evaluated"]), None)
-    evaluations = client.get(f"/api/runs/{named(name)}/evaluations")
-    of_it = [each for each in evaluations if judged and each["checkpoint"] == judged["name"]]
-    called = judged["evaluated"]["name"] if judged else None
-    evaluation = next((each for each in evaluations if each["name"] == called), None)
-    return RunFacts(name, described["spec"] or {}, records, evaluation, of_it, described["path"])
+    checkpoints = client.get(f"/api/runs/{named(name)}/checkpoints")
+    return facts_of(described, records, checkpoints, client.get(f"/api/runs/{named(name)}/evaluations"))
 
 
 def _check_output(output: Path | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
@@ -13,7 +13,7 @@ from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.home import local_url, muster_home
-from orchestrator.keys import Key, KeyStore
+from orchestrator.keys import KeyStore
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the key: its user or program.")]
 
@@ -40,11 +40,11 @@ def create(
     """Create a key and show it once. From now on the server admits only callers with a key or MUSTER_TOKEN."""
     key = KeyStore(muster_home()).create(name, tuple(queue or ()), read_only)
     if as_json:
-        echo_json({**_describe(key), "secretAccessKey": key.secret})
+        echo_json({**key.describe(), "secretAccessKey": key.secret})
         return
     url = local_url() or EXAMPLE_URL
     echo(
-        f"""created key {key.name} ({_may(key)}); its secret is shown only this once
+        f"""created key {key.name} ({key.rights}); its secret is shown only this once
 
 AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(profile_name="{key.name}")):
   aws configure set aws_access_key_id {key.access_key_id} --profile {key.name}
@@ -63,7 +63,7 @@ def list_keys(as_json: JsonOption = False) -> None:
     """List the keys, without their secrets."""
     keys = KeyStore(muster_home()).load().values()
     if as_json:
-        echo_json([_describe(key) for key in keys], indent=1)
+        echo_json([key.describe() for key in keys], indent=1)
         return
     if not keys:
         echo("no keys yet; create one with: muster keys create NAME")
@@ -73,7 +73,7 @@ def list_keys(as_json: JsonOption = False) -> None:
         table.add_column(column, no_wrap=column != "MAY")
     for key in keys:
         created = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(key.created_at / 1000))
-        table.add_row(key.name, key.access_key_id, _may(key), created)
+        table.add_row(key.name, key.access_key_id, key.rights, created)
     Console(soft_wrap=True).print(table)
 
 
@@ -89,18 +89,3 @@ def delete(name: NameArgument) -> None:
   a server started from now on accepts its own user's requests on loopback without a key
   a server that other machines can reach (--host) does not start without a key or MUSTER_TOKEN"""
         )
-
-
-def _may(key: Key) -> str:
-    queues = "all queues" if key.queues is None else f"queues {', '.join(key.queues)}"
-    return f"{queues}, {'read only' if key.read_only else 'read and write'}"
-
-
-def _describe(key: Key) -> dict[str, Any]:
-    return {
-        "name": key.name,
-        "accessKeyId": key.access_key_id,
-        "queues": None if key.queues is None else list(key.queues),
-        "readOnly": key.read_only,
-        "createdAt": key.created_at,
-    }

@@ -52,6 +52,10 @@ PAGES = (
     "tracks",
     "models",
     "leagues",
+    "queues",
+    "runs",
+    "compare",
+    "keys",
 )
 """Modules of this package, each with a ``router``."""
 

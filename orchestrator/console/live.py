@@ -85,13 +85,15 @@ def _written(event: Event) -> bytes:
 class Rows:
     """The rows of a live table: what has changed of them since the last look, by key and field."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "rows") -> None:
+        """``name``: of its events; a page with several tables has one of each."""
+        self._name = name
         self._order: list[str] | None = None
         self._shown: dict[str, Mapping[str, Any]] = {}
         self._totals: Mapping[str, Any] = {}
 
     def changes(self, rows: Mapping[str, Mapping[str, Any]], totals: Mapping[str, Any]) -> list[Event]:
-        """The event ``rows``: the order of the keys, where it changed, and the changed fields of each row; ``totals`` of the whole page.
+        """One event, or none: the order of the keys, where it changed, and the changed fields of each row; ``totals`` of the whole page.
 
         Args:
             rows: Key of each row, in their order, and its fields as texts.
@@ -107,7 +109,7 @@ class Rows:
         if totals != self._totals:
             data["totals"] = totals
         self._order, self._shown, self._totals = order, dict(rows), totals
-        return [Event("rows", data)] if data else []
+        return [Event(self._name, data)] if data else []
 
 
 def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> Mapping[str, Any]:

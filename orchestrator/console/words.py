@@ -35,8 +35,11 @@ def ago(moment: int | None) -> str:
 
 
 def moment(when: int | float | None) -> str:
-    """Unix time [ms] for the attribute ``datetime`` of a ``<time>``; empty for None."""
-    return "" if when is None else datetime.fromtimestamp(when / 1000, UTC).isoformat(timespec="seconds")
+    """Unix time [ms] for the attribute ``datetime`` of a ``<time>``; empty for None, and beyond all calendars."""
+    try:
+        return "" if when is None else datetime.fromtimestamp(when / 1000, UTC).isoformat(timespec="seconds")
+    except (ValueError, OverflowError, OSError):  # what a file of the store says may be anything
+        return ""
 
 
 def since(iso: str) -> str:

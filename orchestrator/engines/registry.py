@@ -20,7 +20,7 @@ from orchestrator.engines.api import (
     Plan,
     read_handle,
 )
-from orchestrator.engines.runner import Runner
+from orchestrator.engines.runner import Health, Runner
 from orchestrator.engines.secrets import Secrets, SecretsError
 
 FRESH = 2.0
@@ -81,6 +81,10 @@ class EngineSet:
             for name in (self.engines if names is None else names)
             if name in self._runners
         }
+
+    def health(self) -> Mapping[str, Health]:
+        """How each engine answers, by its name."""
+        return {name: runner.health for name, runner in self._runners.items()}
 
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, wait
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from queue import SimpleQueue
@@ -45,6 +45,20 @@ _CLOSING = 5.0
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class Health:
+    """How an engine answers."""
+
+    told_at: int | None
+    """When it told its hosts last, Unix time [ms]; None before it did."""
+    problem: str | None
+    """That it does not answer, or why it can't tell its hosts; None where it does."""
+    failing: int
+    """Gangs that it could not start, or look at, the last time; each is tried again."""
+    retry: float | None
+    """Seconds until the next of these tries; None where none fails."""
+
+
 class Underway(NotYet):
     """The engine was asked to launch a gang and has not answered yet; the message is empty until it is overdue."""
 
@@ -70,6 +84,7 @@ class Runner:
         """By handle: the newest picture."""
         self._telling: Future[Capacity] | None = None
         self._capacity: Capacity = Hosts(())
+        self._told_at: int | None = None
         self._backoff = Backoff(log)
         self._since: float | None = None
         """Since when the present call is being carried out (monotonic [s])."""
@@ -97,6 +112,13 @@ class Runner:
             said = f"the {self.engine.name} engine has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
             self._backoff.failed("silence", said)
         return said
+
+    @property
+    def health(self) -> Health:
+        """How the engine answers just now."""
+        problem = self.silence or self._backoff.said("hosts")
+        gangs = {subject[1]: pause for subject, pause in self._backoff.pauses().items() if isinstance(subject, tuple)}
+        return Health(self._told_at, problem, len(gangs), min(gangs.values(), default=None))
 
     # -- what the controller asks -------------------------------------------------------------------------------------
 
@@ -226,6 +248,7 @@ class Runner:
             self._failed("hosts", error)
             raise
         self._backoff.worked("hosts")
+        self._told_at = int(time.time() * 1000)
         if capacity != self._capacity:
             self._capacity = capacity
             self._changed()

@@ -27,6 +27,8 @@ class Access:
     token: str | None = None
     exposed: bool = False
     """Whether other machines can reach the server, or keys have existed: from then on authentication is always required."""
+    reachable: bool = False
+    """Whether other machines can reach the server: then nobody makes or deletes keys through it."""
     user: int | None = None
     """Uid of the processes whose requests are taken while no key is demanded; None for an application without a socket."""
     own_token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)

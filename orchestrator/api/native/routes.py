@@ -27,8 +27,10 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.native import (
     job_list,
+    key_routes,
     league_routes,
     model_routes,
+    queue_overview,
     run_routes,
     runs,
     track_routes,
@@ -59,11 +61,13 @@ from shared_store.logs import LogFollower, LogLine, timestamp
 
 router = APIRouter(prefix="/api")
 router.include_router(job_list.router)
+router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
 router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
+router.include_router(key_routes.router)
 
 _LARGEST_PLAN = 4 << 20
 """Characters of all nodes' variables together."""

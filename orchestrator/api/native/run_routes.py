@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from typing import Any, Literal
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
 from orchestrator.api.context import IDEMPOTENCY_HEADER, permitted_run, reconciler_of
-from orchestrator.api.native import clones, runs
+from orchestrator.api.native import clones, lineage, runs
 from orchestrator.api.native.continuing import Changes
 from orchestrator.api.permissions import Operation
 from shared_store.checkpoints import best_checkpoint, list_checkpoints
@@ -54,23 +55,26 @@ def list_runs(
     response: Response,
     after: str = Query(default="", max_length=128, description="name of the last run of the page before"),
     most: int = Query(default=RUNS_A_PAGE, ge=1, le=RUNS_A_PAGE, alias="max"),
+    search: str = Query(default="", max_length=128, description="part of a name"),
 ) -> Any:
     """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
     reconciler = reconciler_of(request)
     with reconciler.database.session() as session:
-        found = runs.list_runs(reconciler, session, after, most)
+        found = runs.list_runs(reconciler, session, after, most, search)
     if len(found) == most:
-        response.headers["Link"] = f'</api/runs?max={most}&after={found[-1]["run"]}>; rel="next"'
+        query = urlencode({"max": most, "after": found[-1]["run"], **({"search": search} if search else {})})
+        response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
     return permissions.shown(found)
 
 
 @router.get("/runs/{name}")
 def run_detail(request: Request, name: str) -> Any:
-    """One run."""
+    """One run; ``parent`` is where its weights come from, ``clones`` are the runs that began with its own."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.READ_RUN)
     with reconciler.database.session() as session:
-        return permissions.shown(runs.describe_run(reconciler, session, run))
+        described = runs.describe_run(reconciler, session, run)
+        return permissions.shown({**described, "clones": lineage.clones_of(reconciler, session, run)})
 
 
 @router.get("/runs/{name}/checkpoints")

@@ -36,10 +36,15 @@ from shared_store.settings import first_difference, fixed_settings, innermost, s
 from shared_store.wording import counted
 
 
-def list_runs(reconciler: Reconciler, session: Session, after: str, most: int) -> list[dict[str, Any]]:
-    """The first ``most`` runs behind the name ``after`` that the caller may see; one that can't be read has a ``problem`` instead of its facts."""
+def list_runs(
+    reconciler: Reconciler, session: Session, after: str, most: int, search: str = ""
+) -> list[dict[str, Any]]:
+    """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see.
+
+    One that can't be read has a ``problem`` instead of its facts.
+    """
     found = []
-    page = visible_runs(session, reconciler.store, after, most)
+    page = visible_runs(session, reconciler.store, after, most, search.strip())
     recorded = select(RunRecord).where(RunRecord.name.in_([run.name for run in page]))
     _known = session.scalars(recorded).all()  # one query instead of one a run: the session looks here first
     for run in page:

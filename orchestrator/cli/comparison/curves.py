@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from orchestrator.cli.comparison.runs import Group
+from shared_store.comparison import Group
 from shared_store.files import write_atomic
 
 Curves = Sequence[tuple[str, Sequence[tuple[float, float, float, int]]]]

@@ -56,6 +56,11 @@ class Backoff:
         trouble = self._troubles.get(subject)
         return trouble.said if trouble else None
 
+    def pauses(self) -> dict[Hashable, float]:
+        """Seconds until the next try of each subject that fails at present; 0 where it may be tried now."""
+        with self._lock:
+            return {subject: max(0.0, each.next - time.monotonic()) for subject, each in self._troubles.items()}
+
     def hurry(self, subject: Hashable) -> None:
         """Something has changed: the next try need not wait."""
         with self._lock:

@@ -118,6 +118,12 @@ class World:
             method, self.url + path, json=body, headers={"Authorization": f"Bearer {self.tokens[key]}"}
         )
 
+    def delete_key(self, key: str) -> httpx.Response:
+        """Delete a key that was just made."""
+        name = KeyStore(self.server.home).create(self.fresh()).name
+        bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
+        return self.http.delete(f"{self.url}/api/keys/{name}", headers=bearer)
+
 
 def definition(name: str) -> dict[str, Any]:
     container = {

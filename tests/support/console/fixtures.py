@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 
@@ -29,10 +29,10 @@ class Console:
         self.visitors.append(Visitor(self.url, self.secrets[name]))
         return self.visitors[-1]
 
-    def register(self, name: str) -> str:
-        """A definition that needs more than the machine has, so that its jobs wait; returns its ARN."""
-        needs = [{"type": "VCPU", "value": "4"}, {"type": "MEMORY", "value": "16"}]
-        container = {"image": "muster", "command": ["true"], "resourceRequirements": needs}
+    def register(self, name: str, cpus: str = "4", command: Sequence[str] = ("true",)) -> str:
+        """A definition, which by default needs more than the machine has, so that its jobs wait; returns its ARN."""
+        needs = [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "16"}]
+        container = {"image": "muster", "command": list(command), "resourceRequirements": needs}
         properties = {
             "numNodes": 1,
             "mainNode": 0,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from orchestrator.cli.comparison.curves import draw
-from orchestrator.cli.comparison.runs import POINTS, RunFacts, grouped
+from shared_store.comparison import POINTS, RunFacts, grouped
 
 
 def run(name: str, seed: int, rewards: list[float], *, evaluated: float | None = None, **train: Any) -> RunFacts:

@@ -1,4 +1,4 @@
-"""Comparison of runs. Runs that differ only in their seed form a group, with means and standard deviations. Pure."""
+"""Runs side by side: those that differ in their seed alone are one group, with means and standard deviations."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import json
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from shared_store.pairs import are_paired
+from shared_store.pairs import are_paired, paired, read_returns
+from shared_store.wording import counted
 
+COLUMNS = ("RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS")
+"""Of the table; see :meth:`Group.cells`."""
 POINTS = 200
 """Number of points in the curve of a group."""
 
@@ -38,13 +42,17 @@ class RunFacts:
     @property
     def train(self) -> Mapping[str, Any]:
         """How it was trained."""
-        return self.spec.get("train") or {}
+        train = self.spec.get("train")
+        return train if isinstance(train, Mapping) else {}
 
-    @property
-    def curve(self) -> list[tuple[float, float]]:
-        """Environment steps and mean return at the records with finished episodes."""
-        told = ((record.get("env_steps"), record.get("reward")) for record in self.records)
-        return [(float(steps), float(reward)) for steps, reward in told if steps is not None and reward is not None]
+    def curve(self, metric: str = "reward") -> list[tuple[float, float]]:
+        """Environment steps and a metric, where it has a value: the mean return where episodes have ended."""
+        told = ((record.get("env_steps"), record.get(metric)) for record in self.records)
+        return [
+            (float(steps), float(value))
+            for steps, value in told
+            if isinstance(steps, int | float) and isinstance(value, int | float)
+        ]
 
     def last(self, key: str) -> float | None:
         """A number of the newest record."""
@@ -89,7 +97,7 @@ class Group:
         }
 
     def cells(self) -> list[str]:
-        """A row of the table."""
+        """A row of the table, by :data:`COLUMNS`."""
         seeds = ", ".join(str(run.train.get("seed", "-")) for run in self.runs)
         evaluated = [each["mean_return"] for each in self.evaluations]
         shares = [100 * share for share in self._successes()]
@@ -110,26 +118,61 @@ class Group:
 
     def _successes(self) -> list[float]:
         told = [each.get("success") for each in self.evaluations]
-        return [float(each["share"]) for each in told if isinstance(each, Mapping)]
+        shares = [each.get("share") for each in told if isinstance(each, Mapping)]
+        return [float(share) for share in shares if isinstance(share, int | float)]
 
-    def curve(self) -> list[tuple[float, float, float, int]]:
-        """Steps, mean return of its runs, their standard deviation and their number, up to the end of the longest run.
+    def curve(self, metric: str = "reward", at: Sequence[float] | None = None) -> list[tuple[float, float, float, int]]:
+        """Steps, mean of a metric (the return) over its runs, their standard deviation, and how many they are.
 
-        Returns are interpolated linearly between records; a run counts only within its records.
+        Between two of its records a run's metric is taken to change in proportion; a run counts where it has records.
+
+        Args:
+            metric: Its name in the records.
+            at: The steps that are wanted; as far as the longest run went where None.
         """
-        curves = [run.curve for run in self.runs if run.curve]
+        curves = [curve for run in self.runs if (curve := run.curve(metric))]
         if not curves:
             return []
-        first, last = min(curve[0][0] for curve in curves), max(curve[-1][0] for curve in curves)
-        points = [first + (last - first) * index / (POINTS - 1) for index in range(POINTS)]
-        if len(curves) == 1:
-            points = [steps for steps, _ in curves[0]]
+        points = at
+        if points is None:
+            single = len(curves) == 1
+            points = [steps for steps, _ in curves[0]] if single else spaced(span(curves), POINTS)
         found = []
         for steps in points:
             there = [value for curve in curves if (value := _at(curve, steps)) is not None]
             if there:
                 found.append((steps, fmean(there), stdev(there) if len(there) > 1 else 0.0, len(there)))
         return found
+
+
+def span(curves: Iterable[Sequence[tuple[float, float]]]) -> tuple[float, float]:
+    """The least and the greatest steps of curves that have points."""
+    ends = [(curve[0][0], curve[-1][0]) for curve in curves]
+    return min(first for first, _ in ends), max(last for _, last in ends)
+
+
+def spaced(ends: tuple[float, float], count: int) -> list[float]:
+    """So many values, evenly spaced between two ends, which are the first and the last."""
+    first, last = ends
+    return [first + (last - first) * index / (count - 1) for index in range(count)]
+
+
+def facts_of(
+    described: Mapping[str, Any],
+    records: Sequence[Mapping[str, Any]],
+    checkpoints: Sequence[Mapping[str, Any]],
+    evaluations: Sequence[Mapping[str, Any]],
+) -> RunFacts:
+    """What is compared of a run, from what the native API tells of it, its metrics, its checkpoints and its evaluations.
+
+    It is judged by its best checkpoint that has an evaluation, else by the last one that has.
+    """
+    best = next((each for each in checkpoints if each["best"] and each["evaluated"]), None)
+    judged = best or next((each for each in reversed(checkpoints) if each["evaluated"]), None)
+    of_it = [each for each in evaluations if judged and each["checkpoint"] == judged["name"]]
+    called = judged["evaluated"]["name"] if judged else None
+    evaluation = next((each for each in evaluations if each["name"] == called), None)
+    return RunFacts(described["run"], described["spec"] or {}, records, evaluation, of_it, described["path"])
 
 
 def grouped(runs: Iterable[RunFacts]) -> list[Group]:
@@ -148,6 +191,38 @@ def same_episodes(new: RunFacts, old: RunFacts) -> tuple[Mapping[str, Any], Mapp
     """An evaluation of each of two runs on the same episodes: the pair with the most common episodes; None without any."""
     both = [(a, b) for a in new.evaluations for b in old.evaluations if are_paired(a, b)]
     return max(both, key=lambda pair: min(pair[0]["episodes"], pair[1]["episodes"]), default=None)
+
+
+def versus(group: Group, first: Group) -> dict[str, Any] | None:
+    """How a single run differs from the first one in the same episodes; None where there are no such, or they can't be read here.
+
+    Returns:
+        ``new`` and ``old`` (as ``RUN@ITERATION``), and what :func:`shared_store.pairs.paired` finds.
+    """
+    if group is first or len(group.runs) > 1 or len(first.runs) > 1:
+        return None
+    new, old = group.runs[0], first.runs[0]
+    pair = same_episodes(new, old)
+    if pair is None:
+        return None
+    tables = [
+        Path(run.path) / "evaluations" / f"{each['name']}.parquet" for run, each in zip((new, old), pair, strict=True)
+    ]
+    try:
+        told = paired(*map(read_returns, tables))
+    except (ImportError, OSError, ValueError):  # the store is on another machine, say
+        return None
+    names = [f"{run.name}@{each.get('iteration')}" for run, each in zip((new, old), pair, strict=True)]
+    return {"new": names[0], "old": names[1], **told}
+
+
+def sentence(told: Mapping[str, Any]) -> str:
+    """What :func:`versus` found, in words."""
+    low, high = (f"{end:+.2f}" if end is not None else "-" for end in (told["low"], told["high"]))
+    return (
+        f"{told['new']} against {told['old']}: return {told['difference']:+.2f} ({low} to {high}, paired over "
+        f"{counted(told['pairs'], 'episode')}): {told['verdict']}"
+    )
 
 
 def _at(curve: Sequence[tuple[float, float]], steps: float) -> float | None:

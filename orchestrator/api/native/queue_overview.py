@@ -1,0 +1,184 @@
+"""Queues and compute as a whole: what waits and why, what shares have used, how full the hosts are, how the engines answer."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from fastapi import APIRouter, Query, Request
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from orchestrator.api.context import reconciler_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import JobsOf, is_visible
+from orchestrator.control.compute_environments import own_queues
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
+from orchestrator.control.usage import held_by, placements_of, usage_at
+from orchestrator.domain.hosts import Queued, engine_of
+from orchestrator.domain.job import TERMINAL, Status
+from orchestrator.domain.resources import Resources
+from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
+from orchestrator.scheduling.order import score, weight
+from orchestrator.scheduling.snapshot import Queue
+
+router = APIRouter()
+
+FIRST = 10
+"""Waiting jobs of each queue that are told, where none is named."""
+MOST = 100
+"""Of one that is named."""
+
+Held = Sequence[tuple[Job, Attempt]]
+
+
+@router.get("/queues")
+def queues(
+    request: Request,
+    queue: str = Query(default="", max_length=128, description="this one alone, with more of its jobs"),
+) -> dict[str, Any]:
+    """The queues whose jobs the caller may see, each with the jobs that start next, and the compute environments, engines and hosts.
+
+    How full a host is counts the jobs of all queues.
+    """
+    return overview(reconciler_of(request), queue)
+
+
+def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
+    """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises ClientError."""
+    engine = reconciler.engine
+    with reconciler.database.session() as session:
+        policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
+        rows = [
+            row for row in session.scalars(select(JobQueue).order_by(JobQueue.name)) if is_visible(JobsOf(row.name))
+        ]
+        if only and only not in {row.name for row in rows}:
+            there = ", ".join(row.name for row in rows[:10]) or "none"
+            raise ClientError(f"there is no queue {only[:100]!r}; there is {there}", 404)
+        rows = sorted((row for row in rows if only in ("", row.name)), key=lambda row: -row.priority)
+        read = {row.name: read_queue(row, policies) for row in rows}
+        held = open_attempts(session, reconciler.work_queue.active())
+        decays = {name: queue.policy.decay_seconds for name, queue in read.items() if queue.policy}
+        used = usage_at(session, reconciler.clock.now(), decays, held)
+        counts = _counts(session)
+        found = [
+            {
+                "name": row.name,
+                "state": "DELETING" if row.deleting else row.state,
+                "priority": row.priority,
+                "policy": row.policy,
+                "computeEnvironments": row.compute_environments,
+                "counts": counts.get(row.name, {}),
+                "inUse": _amounts(attempt for job, attempt in held if job.queue == row.name),
+                "shares": _shares(read[row.name], used, held),
+                "front": _front(reconciler, session, row.name, MOST if only else FIRST),
+            }
+            for row in rows
+        ]
+        environments = [_environment(row, engine.names[0]) for row in session.scalars(select(ComputeEnvironment))]
+        taken = _taken(held)
+    return {
+        "queues": found,
+        "computeEnvironments": environments,
+        "engines": _engines(reconciler),
+        "hosts": [
+            {
+                **{key: value for key, value in asdict(host).items() if key in ("name", "cpus", "memory", "away")},
+                "engine": engine_of(host.name),
+                "gpus": len(host.gpus),
+                "inUse": asdict(taken.get(host.name, Resources())),
+            }
+            for capacity in engine.capacity().values()
+            for host in capacity.machines
+        ],
+    }
+
+
+def _counts(session: Session) -> dict[str, dict[str, int]]:
+    """Jobs that are not over, by queue and state; an array is counted by its children."""
+    query = select(Job.queue, Job.status, func.count()).where(Job.status.not_in(TERMINAL), Job.kind != "array")
+    found: dict[str, dict[str, int]] = defaultdict(dict)
+    for queue, status, count in session.execute(query.group_by(Job.queue, Job.status)):
+        found[queue][str(status)] = count
+    return found
+
+
+def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> list[dict[str, Any]]:
+    """The jobs of a queue that start next, in their order, with why each waits and since when [Unix ms]."""
+    order, times = reconciler.front(queue, most)
+    jobs = {job.id: job for job in session.scalars(select(Job).where(Job.id.in_(order)))}
+    waiting = [jobs[each] for each in order if each in jobs and jobs[each].status == Status.RUNNABLE]
+    return [
+        {
+            "id": job.id,
+            "name": job.name,
+            "owner": job.owner,
+            "share": job.share,
+            "reason": reconciler.reason(job) or job.status_reason,
+            "since": times.get(job.id),
+        }
+        for job in waiting
+    ]
+
+
+def _shares(queue: Queue, used: Mapping[tuple[str, str], float], held: Held) -> list[dict[str, Any]]:
+    """Each active share of a queue with a policy: its weight, what it has used lately, and what it holds; first come those that used least.
+
+    ``used``: GPU-seconds, or CPU-seconds of jobs without GPUs, decayed by the policy; ``score``: the same times the weight, by which
+    shares are served.
+    """
+    if queue.policy is None:
+        return []
+    names = {share for name, share in used if name == queue.name}
+    found = [
+        {
+            "share": share,
+            "weight": weight(queue.policy, share),
+            "used": used[queue.name, share],
+            "score": score(queue, share, used),
+            "inUse": _amounts(attempt for job, attempt in held if (job.queue, job.share or "") == (queue.name, share)),
+        }
+        for share in names
+    ]
+    return sorted(found, key=lambda each: (each["score"], each["share"]))
+
+
+def _amounts(attempts: Iterable[Attempt]) -> dict[str, float]:
+    held = sum((held_by(attempt) for attempt in attempts), Resources())
+    return {"cpus": held.cpus, "gpus": held.gpus}
+
+
+def _taken(held: Held) -> dict[str, Resources]:
+    """What the nodes of all gangs hold, by host."""
+    found: dict[str, Resources] = defaultdict(Resources)
+    for _, attempt in held:
+        for each in placements_of(attempt):
+            found[each.host] += each.resources
+    return found
+
+
+def _environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
+    read = read_compute_environment(row, first)
+    return {"name": read.name, "engine": read.engine, "state": row.state, "hosts": read.hosts, "cpus": read.max_cpus}
+
+
+def _engines(reconciler: Reconciler) -> list[dict[str, Any]]:
+    engine = reconciler.engine
+    own = own_queues(engine.names)
+    capacities = engine.capacity()
+    return [
+        {
+            "name": name,
+            "queue": own[name],
+            "elastic": engine.is_elastic([name]),
+            "queuesByItself": isinstance(capacities.get(name), Queued),
+            "toldAt": health.told_at,
+            "problem": health.problem,
+            "failing": health.failing,
+            "retry": health.retry,
+        }
+        for name, health in engine.health().items()
+    ]

@@ -1,0 +1,130 @@
+"""The comparison of runs: the table, the paired differences and the curves of ``muster compare``, over seeds with their spread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from functools import partial
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from fastapi import Query, Request, Response
+
+from orchestrator.api.context import permitted_run, reconciler_of, visible_runs
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native import run_routes
+from orchestrator.api.permissions import Operation, current_identity
+from orchestrator.console.curves import number
+from orchestrator.console.live import Recent
+from orchestrator.console.pages import render
+from orchestrator.console.routing import page_router
+from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
+from shared_store.metrics import sampled
+
+router = page_router()
+
+MOST = 40
+"""Runs that are compared at once."""
+_RECORDS = 600
+"""Of each run that are read, evenly spread over its history; the newest is among them."""
+_POINTS = 200
+_NO_METRICS = {"iteration", "env_steps", "time", "epoch"}
+"""Numbers of a record that no one wants as a curve over the steps."""
+_recent = Recent(2.0)
+
+
+@router.get("/compare")
+def compare(
+    request: Request,
+    runs: list[str] = Query(default=[], alias="run", max_length=MOST),
+    metric: str = Query(default="reward", max_length=200),
+) -> Response:
+    """The page; ``run`` is a name, or a pattern such as ``ant-*``."""
+    names = _chosen(request, runs) if runs else []
+    groups = _groups(request, names)
+    first = groups[0] if groups else None
+    differences = [versus(group, groups[0]) for group in groups]
+    return render(
+        request,
+        "compare.html",
+        columns=[name.title() for name in COLUMNS],
+        rows=[
+            (group.cells(), [(run.name, f"/runs/{quote(run.name, safe='')}") for run in group.runs]) for group in groups
+        ],
+        differences=[(sentence(told), told["verdict"]) for told in differences if told],
+        first=first.label if first else "",
+        given=" ".join(runs),
+        metrics=_metrics(groups),
+        metric=metric,
+        curves=f"/compare/curves?{urlencode([('run', name) for name in names])}",
+    )
+
+
+@router.get("/compare/curves")
+def curves(
+    request: Request,
+    runs: list[str] = Query(alias="run", max_length=MOST),
+    metric: str = Query(default="reward", max_length=200),
+) -> dict[str, Any]:
+    """The curves of a metric over the environment steps: ``x``, and for each group its mean ``y``, ``low`` and ``high``.
+
+    ``low`` and ``high`` are one standard deviation over its runs away; null where a single run has records.
+    """
+    groups = _groups(request, _chosen(request, runs))
+    there = [curve for group in groups for run in group.runs if (curve := run.curve(metric))]
+    at = spaced(span(there), _POINTS) if there else []
+    return {"x": at, "xLabel": "environment steps", "lines": [_line(group, metric, at) for group in groups]}
+
+
+def _line(group: Group, metric: str, at: Sequence[float]) -> dict[str, Any]:
+    found = {steps: (mean, spread, count) for steps, mean, spread, count in group.curve(metric, at)}
+    values = [found.get(steps) for steps in at]
+    line: dict[str, Any] = {"name": group.label, "y": [number(each[0]) if each else None for each in values]}
+    if len(group.runs) > 1:
+        for end, sign in (("low", -1), ("high", 1)):
+            line[end] = [number(each[0] + sign * each[1]) if each and each[2] > 1 else None for each in values]
+    return line
+
+
+def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
+    """The names that are meant, in the order of the patterns, separated by spaces or given one by one. Raises ClientError."""
+    chosen: dict[str, None] = {}
+    known: list[str] | None = None
+    reconciler = reconciler_of(request)
+    for pattern in (part for each in patterns for part in each.split()):
+        if not any(sign in pattern for sign in "*?["):
+            chosen[pattern] = None
+            continue
+        if known is None:
+            with reconciler.database.session() as session:
+                known = [run.name for run in visible_runs(session, reconciler.store)]
+        fitting = [name for name in known if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise ClientError(f"no run is called like {pattern[:128]}; the page of runs has their names", 404)
+        chosen |= dict.fromkeys(fitting)
+    if len(chosen) > MOST:
+        raise ClientError(f"these are {len(chosen)} runs; {MOST} at most are compared at once, so give fewer")
+    return list(chosen)
+
+
+def _groups(request: Request, names: Sequence[str]) -> list[Group]:
+    """The runs in groups, shared by all who look at the same. Raises ClientError where one may not be seen, or does not exist."""
+    key = (id(reconciler_of(request)), current_identity.get(), tuple(names))
+    return _recent.get(key, lambda: grouped(map(partial(_facts, request), names)))
+
+
+def _facts(request: Request, name: str) -> RunFacts:
+    described = run_routes.run_detail(request, name)
+    run = permitted_run(reconciler_of(request), name, Operation.READ_METRICS)
+    try:
+        records = sampled(run, _RECORDS)
+    except OSError as error:
+        raise ClientError(f"the metrics of run {name} can't be read now: {error.strerror or error}", 503) from None
+    checkpoints = run_routes.run_checkpoints(request, name)
+    return facts_of(described, records, checkpoints, run_routes.run_evaluations(request, name))
+
+
+def _metrics(groups: Sequence[Group]) -> list[str]:
+    """The metrics of which some run has a number."""
+    newest = [run.records[-1] for group in groups for run in group.runs if run.records]
+    return sorted({name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS)

@@ -1,0 +1,192 @@
+"""The pages of runs and their comparison, through a real server whose store has trained runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow
+import pyarrow.parquet
+import pytest
+
+from shared_store.files import write_json
+from shared_store.layout import Run, Store
+from shared_store.metrics import MetricsWriter
+from tests.conftest import call_muster
+from tests.support.console.fixtures import Console
+from tests.support.console.visitor import Page
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+def trained(store: Store, name: str, returns: list[float], **changes: Any) -> Run:
+    """A run of 9 iterations whose last checkpoint is evaluated in as many episodes as there are returns."""
+    train = {**SPEC["train"], "seed": 1, **changes.pop("train", {})}
+    add_run(store, name, {**SPEC, "name": name, "train": train})
+    run = store.run(name)
+    described = run.description()
+    assert described is not None
+    write_json(
+        run.path / "run.json", {**described, "created": 1.7e12, "queue": "default", "owner": "key admin", **changes}
+    )
+    for iteration in (6, 9):
+        add_checkpoint(store, name, iteration)
+    with MetricsWriter(run, 1, 0) as metrics:
+        for iteration in range(1, 10):
+            record = {
+                "iteration": iteration,
+                "env_steps": 100 * iteration,
+                "reward": returns[0] * iteration,
+                "kl": 0.01,
+            }
+            metrics.write({**record, "note": HOSTILE})
+    mean = sum(returns) / len(returns)
+    write_json(
+        run.evaluations / "00000009-e1-job.json",
+        {
+            "mean_return": mean,
+            "mean_length": 9.0,
+            "max_length": 10,
+            "episodes": len(returns),
+            "time": 1.7e9,
+            "task": "Cartpole",
+            "seed": 7,
+            "iteration": 9,
+            "return": {"mean": mean, "low": mean - 1, "high": mean + 1},
+            "success": {"share": 0.75},
+        },
+    )
+    columns = {"episode": list(range(len(returns))), "return": returns}
+    pyarrow.parquet.write_table(pyarrow.table(columns), run.evaluations / "00000009-e1-job.parquet")
+    return run
+
+
+@pytest.fixture(scope="module")
+def store(console: Console) -> Store:
+    store = Store(console.server.home / "store")
+    trained(store, "fast", [10.0, 20.0, 30.0, 41.0])
+    trained(store, "fast-b", [12.0, 20.0, 30.0, 41.0], train={"seed": 2})
+    parent = {"run": "fast", "checkpoint": "00000009-e1", "iteration": 9}
+    trained(store, "sure", [11.0, 21.5, 31.0, 42.5], train={"worlds": 5}, parent=parent)
+    trained(store, "labs", [1.0, 2.0], train={"worlds": 6}, queue="lab", owner="key lab")
+    return store
+
+
+def names(page: Page) -> list[str]:
+    return [str(each["value"]) for each in page.all("input", name="run", type="checkbox") if each.get("value")]
+
+
+def test_the_list_has_every_run_with_its_task_and_best_evaluation(console: Console, store: Store) -> None:
+    page = console.visitor().page("/runs")
+    assert names(page) == ["fast", "fast-b", "labs", "sure"]
+    assert page.all("time", datetime="2023-11-14T22:13:20+00:00")
+    assert "Cartpole" in page.text and "25.2 at 9" in page.text and "key admin" in page.text
+    assert names(console.visitor().page("/runs?search=FAST")) == ["fast", "fast-b"]
+    assert names(console.visitor().page("/runs?after=fast-b")) == ["labs", "sure"]
+    assert "No run is called like this" in console.visitor().page("/runs?search=nothing").text
+    assert [each["run"] for each in console.client.get("/api/runs", search="fast")] == ["fast", "fast-b"]
+
+
+def test_the_page_of_a_run_has_checkpoints_evaluations_and_lineage(console: Console, store: Store) -> None:
+    page = console.visitor().page("/runs/sure")
+    assert "00000009-e1" in page.text and "26.50 ± 1.00" in page.text and "75.0 %" in page.text
+    table = console.visitor().http.get("/runs/sure/files/evaluations/00000009-e1-job.parquet")
+    assert page.all("a", href=table.url.path) and table.content[:4] == b"PAR1"
+    assert page.all("a", href="/runs/fast") and "No run was cloned from it" in page.text
+    (curves,) = [each for each in page.all("div") if each.get("data-curves")]
+    assert (curves["data-curves"], curves["data-metrics"]) == ("/runs/sure/curves", "reward kl")
+    parent = console.visitor().page("/runs/fast")
+    assert parent.all("a", href="/runs/sure") and parent.all("a", href="/compare?run=fast&run=sure")
+    assert console.client.get("/api/runs/fast")["clones"] == ["sure"]
+    assert "did you mean fast" in console.visitor().page("/runs/fsat", 404).text
+
+
+def test_a_run_that_goes_on_is_renewed(console: Console, store: Store) -> None:
+    run = trained(store, "goes-on", [1.0, 2.0], train={"worlds": 7})
+    stream = console.visitor().events("/runs/goes-on/stream")
+    first = dict((name, data) for name, data, _ in (next(stream) for _ in range(4)))
+    assert first["changed"] == {"iteration": 9} and first["checkpoints"]["order"] == ["00000009-e1", "00000006-e1"]
+    with MetricsWriter(run, 1, 9) as metrics:
+        metrics.write({"iteration": 10, "env_steps": 1000, "reward": 1.0})
+    assert next(stream)[:2] == ("changed", {"iteration": 10})
+    add_checkpoint(store, "goes-on", 10)
+    name, data, _ = next(stream)
+    assert name == "checkpoints" and data["order"][0] == "00000010-e1"
+    stream.close()
+
+
+def test_the_comparison_is_what_the_command_computes(
+    console: Console, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUSTER_TOKEN", console.secrets["admin"])
+    page = console.visitor().page("/compare?run=fast&run=sure")
+    done = call_muster("compare", "fast", "sure", home=console.server.home)
+    _, fast, sure, line = done.stdout.splitlines()
+    assert line == "sure@9 against fast@9: return +1.25 (+0.79 to +1.71, paired over 4 episodes): better"
+    assert line in page.text
+    for row in (fast, sure):
+        assert " ".join(row.split()) in page.text
+    grouped = console.visitor().page("/compare?run=fast*+sure").text
+    assert "fast* (2)" in grouped and "1, 2" in grouped
+
+
+def test_curves_over_seeds_have_their_spread(console: Console, store: Store) -> None:
+    visitor = console.visitor()
+    told = visitor.http.get("/compare/curves?run=fast*&run=sure", headers={"Accept": "application/json"}).json()
+    group, single = told["lines"]
+    assert (told["x"][0], told["x"][-1], len(told["x"])) == (100.0, 900.0, 200)
+    assert group["name"] == "fast* (2)" and group["y"][0] == 11.0 and group["low"][0] == pytest.approx(11 - 2**0.5)
+    assert group["high"][-1] == pytest.approx(99 + 9 * 2**0.5) and single["y"][0] == 11.0 and "low" not in single
+    empty = visitor.http.get("/compare/curves?run=fast&metric=note", headers={"Accept": "application/json"}).json()
+    assert empty["x"] == [] and empty["lines"][0]["y"] == []
+
+
+def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
+    visitor = console.visitor("lab")
+    assert names(visitor.page("/runs")) == ["labs"]
+    for path in ("/runs/fast", "/compare?run=labs&run=fast", "/compare/curves?run=fast", "/runs/fast/stream"):
+        assert "belongs to job queue default" in visitor.page(path, 403).text
+    assert "no run is called like fas*" in visitor.page("/compare?run=fas*", 404).text
+    assert names(console.visitor("reader").page("/runs?search=sure")) == ["sure"]
+
+
+def test_what_is_in_a_run_is_text_and_nothing_else(console: Console, store: Store) -> None:
+    parent = {"run": HOSTILE, "checkpoint": HOSTILE}
+    run = trained(
+        store,
+        "hostile",
+        [1.0],
+        train={"task": HOSTILE, "seed": HOSTILE},
+        owner=HOSTILE,
+        parent=parent,
+    )
+    written = run.evaluations / "00000009-e1-job.json"
+    summary = {**SPEC, "mean_return": 1.0, "mean_length": 1.0, "max_length": 1, "episodes": 1, "time": 1.0}
+    write_json(
+        written, {**summary, "seed": HOSTILE, "config": {HOSTILE: HOSTILE}, "success": HOSTILE, "return": HOSTILE}
+    )
+    visitor = console.visitor()
+    add_checkpoint(store, "hostile", 12, reward=HOSTILE, score=[HOSTILE], created=HOSTILE)
+    add_run(store, "odd", {"name": HOSTILE, "train": HOSTILE})
+    for path in (
+        "/runs",
+        "/runs/odd",
+        "/compare?run=odd&run=hostile",
+        "/runs/hostile",
+        "/compare?run=hostile&run=fast",
+        f"/runs?search={HOSTILE}",
+    ):
+        page = visitor.page(path)
+        assert page.is_inert and "<script>alert" not in page.source, path
+    for path in (f"/runs/{HOSTILE}", f"/compare?run={HOSTILE}"):
+        answer = visitor.http.get(path)
+        assert answer.status_code in (400, 404) and Page(answer.text).is_inert and "<script>alert" not in answer.text
+
+
+def test_a_damaged_run_says_so_and_takes_no_other_away(console: Console, store: Store) -> None:
+    run = trained(store, "damaged", [1.0])
+    (run.path / "run.json").write_text("{")
+    trained(store, "odd-age", [1.0], created=1e300)
+    page = console.visitor().page("/runs?search=a")
+    assert "damaged" in names(page) and "fast" in names(page) and "created is no time" in page.text
+    assert "damaged file" in console.visitor().page("/runs/damaged", 409).text
