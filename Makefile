@@ -18,7 +18,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test unit integration training long robots services console engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run race test unit integration training long robots services console engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -96,6 +96,11 @@ bench-engines: $(READY)
 
 bench-startup: $(READY)
 	$(BIN)/python -m benchmarks.startup
+
+# the console's pages; and, in an environment that is made for it, the same table in NiceGUI
+bench-console: $(READY)
+	$(BIN)/python -m benchmarks.console
+	$(BIN)/python -m benchmarks.console_stack
 
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume

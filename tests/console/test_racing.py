@@ -78,4 +78,5 @@ def races(person: Person) -> None:
     expect(page.get_by_role("main")).to_contain_text("The entry and its model are as they were entered.")
     page.goto("/leagues/evening")
     expect(page.get_by_role("region", name="Table")).to_contain_text(re.compile("ada.*speedy@1", re.DOTALL))
+    expect(page.get_by_role("region", name="Races").locator("tr[data-key]")).to_have_count(0)
     person.picture("league")

@@ -41,8 +41,8 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     page = person.page
     job = submit(person, "Cartpole", SMALL)
     watches_the_curve_grow(person)
-    reads_the_log(person)
     person.picture("job")
+    reads_the_log(person)
     saves_and_stops(person)
     resumed = resumes(person)
     server.client.batch("TerminateJob", jobId=resumed, reason="seen")
@@ -61,12 +61,16 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     person.click("Register as a model")
     expect(page.locator("[data-message]")).to_contain_text(f"@{iteration} as balancer@1")
     clones(person)
+    compares(person)
     page.goto("/models")
     person.click("balancer")
     expect(page.get_by_role("heading", name="Model balancer@1")).to_be_visible()
     person.click("Verify")
     expect(page.locator("main")).to_contain_text("Every file is as it was registered.")
     person.picture("model")
+    page.goto("/")
+    expect(page.locator("tr[data-key]")).to_have_count(5)
+    person.picture("jobs")
 
 
 def watches_the_curve_grow(person: Person) -> None:
@@ -118,3 +122,16 @@ def clones(person: Person) -> None:
     ended(person)
     configuration = page.get_by_role("region", name="Differences")
     expect(configuration).to_contain_text("train.seed")
+
+
+def compares(person: Person) -> None:
+    """The two runs, which differ in their seed and length, as `muster compare` does it."""
+    page = person.goto("/runs")
+    marks = page.get_by_role("region", name="Runs").locator("tr[data-key^=pole] input, tr[data-key^=twin] input")
+    expect(marks).to_have_count(2)
+    for mark in marks.all():
+        mark.check()
+    person.leave("Compare marked")
+    expect(page.get_by_role("region", name="Runs").locator("tbody tr")).to_have_count(2)
+    expect(page.locator(".one-chart svg path, .one-chart svg polyline").first).to_be_visible()
+    person.picture("compare")
