@@ -1,6 +1,6 @@
-"""Queues and compute environments that are there without anybody making them: one of each for every engine.
+"""The built-in queues and compute environments: one of each for every engine.
 
-A job goes to an engine by its queue. The queue ``default`` is that of the first engine, as long as nobody gave it others.
+A job goes to an engine by its queue. The queue ``default`` is that of the first engine, unless it was given others.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def ensure_compute_environments(session: Session, engines: Sequence[str]) -> Non
 
 
 def is_built_in(compute_environment: ComputeEnvironment) -> bool:
-    """Whether this is the compute environment that an engine has without anybody creating one."""
+    """Whether this is an engine's built-in compute environment."""
     return compute_environment.name in ENGINES and compute_environment.tags.get(ENGINE_TAG) == compute_environment.name
 
 
