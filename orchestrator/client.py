@@ -21,6 +21,7 @@ import httpx
 from orchestrator.domain.errors import ApiError as ApiError
 from orchestrator.domain.errors import NotServing, NoUrl
 from orchestrator.domain.errors import Unreachable as Unreachable
+from orchestrator.domain.job import TERMINAL
 from orchestrator.home import local_url, muster_home
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
@@ -137,7 +138,7 @@ class Client:
                 raise broken
 
     def _is_over(self, job: str) -> bool:
-        return self.get(f"/api/jobs/{named(job)}")["status"] in ("SUCCEEDED", "FAILED")
+        return self.get(f"/api/jobs/{named(job)}")["status"] in TERMINAL
 
     def _stream(self, job: str, query: dict[str, Any], positions: dict[str, int]) -> Iterator[list[dict[str, Any]]]:
         wanted = {key: value for key, value in query.items() if value is not None}

@@ -44,7 +44,7 @@ def local_url() -> str | None:
 
 
 def console_secret(home: Path) -> bytes:
-    """What signs the console's sessions: the home directory's own, made where there is none. A new one each time where it can't be kept."""
+    """The key that signs the console's sessions: the home directory's own, made where there is none. A new one each time where it can't be kept."""
     path = home / "console.secret"
     with suppress(OSError):
         if len(kept := path.read_bytes()) == 32:
@@ -126,7 +126,7 @@ class HomeLock:
 
 
 def describe_holder(home: Path) -> str:
-    """Who holds the lock of ``home``, as far as it said."""
+    """The holder of the lock of ``home``, as far as it is known."""
     try:
         told = json.loads((home / "controller.json").read_text())
         return f"a controller (pid {told['pid']}, {told['url']})"

@@ -22,7 +22,7 @@ def queue_arn(name: str) -> str:
     return f"{PREFIX}job-queue/{name}"
 
 
-def environment_arn(name: str) -> str:
+def compute_environment_arn(name: str) -> str:
     return f"{PREFIX}compute-environment/{name}"
 
 

@@ -15,13 +15,13 @@ from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.excerpts import shown
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.ownership import owner_of
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.layout import NAME
 from shared_store.parent import TeacherCopy, named_parent
+from shared_store.wording import shown
 
 _TEACHER = "train.rsl_rl.teacher_checkpoint"
 

@@ -164,13 +164,13 @@ def _engine(engine: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _environment(environment: Mapping[str, Any]) -> dict[str, Any]:
-    hosts, cpus = environment.get("hosts"), environment.get("cpus")
+def _compute_environment(compute_environment: Mapping[str, Any]) -> dict[str, Any]:
+    hosts, cpus = compute_environment.get("hosts"), compute_environment.get("cpus")
     return {
-        "key": environment.get("name", ""),
-        "name": environment.get("name", ""),
-        "engine": environment.get("engine") or "",
-        "state": environment.get("state", ""),
+        "key": compute_environment.get("name", ""),
+        "name": compute_environment.get("name", ""),
+        "engine": compute_environment.get("engine") or "",
+        "state": compute_environment.get("state", ""),
         "hosts": "all of its engine" if hosts is None else ", ".join(hosts),
         "most": f"at most {cpus:g} CPUs" if cpus is not None else "",
     }
@@ -192,6 +192,6 @@ _ROWS = {
     "shares": _share,
     "hosts": _host,
     "engines": _engine,
-    "computeEnvironments": _environment,
+    "computeEnvironments": _compute_environment,
 }
 """Of each table: the texts of a row; all empty for the row that scripts copy."""

@@ -91,7 +91,7 @@ class Bus:
         self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
         self._expected: dict[tuple[str, int], int] = {}
-        """The open attempts and how many nodes each has; what is said of others is dropped."""
+        """The open attempts and their numbers of nodes; messages about others are dropped."""
         self._gone: dict[Node, float | None] = {}
         """Since when (monotonic [s]) each node that was ever here is gone; None while it is here."""
         self._progress: dict[Node, dict[str, Any]] = {}

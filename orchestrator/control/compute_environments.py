@@ -1,6 +1,6 @@
-"""Queues and compute environments that are there without anybody making them: one of each for every engine.
+"""The built-in queues and compute environments: one of each for every engine.
 
-A job goes to an engine by its queue. The queue ``default`` is that of the first engine, as long as nobody gave it others.
+A job goes to an engine by its queue. The queue ``default`` is that of the first engine, unless it was given others.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ ENGINE_TAG = "muster:engine"
 def ensure_compute_environments(session: Session, engines: Sequence[str]) -> None:
     """A compute environment for each of ``engines``, and a queue of its name for each but the first, which has ``default``."""
     for name, queue in own_queues(engines).items():
-        if (environment := session.get(ComputeEnvironment, name)) is None:
-            environment = ComputeEnvironment(name=name, document={}, tags={})
-            session.add(environment)
-        environment.document = {**environment.document, "type": "MANAGED"}
-        if environment.tags.get(ENGINE_TAG) != name:
-            environment.tags = {**environment.tags, ENGINE_TAG: name}
+        if (compute_environment := session.get(ComputeEnvironment, name)) is None:
+            compute_environment = ComputeEnvironment(name=name, document={}, tags={})
+            session.add(compute_environment)
+        compute_environment.document = {**compute_environment.document, "type": "MANAGED"}
+        if compute_environment.tags.get(ENGINE_TAG) != name:
+            compute_environment.tags = {**compute_environment.tags, ENGINE_TAG: name}
         if queue != "default" and session.get(JobQueue, queue) is None:
             session.add(JobQueue(name=queue, compute_environments=[name]))
     default = session.get(JobQueue, "default")
@@ -32,9 +32,9 @@ def ensure_compute_environments(session: Session, engines: Sequence[str]) -> Non
         default.compute_environments = [engines[0]]
 
 
-def is_built_in(environment: ComputeEnvironment) -> bool:
-    """Whether this is the compute environment that an engine has without anybody creating one."""
-    return environment.name in ENGINES and environment.tags.get(ENGINE_TAG) == environment.name
+def is_built_in(compute_environment: ComputeEnvironment) -> bool:
+    """Whether this is an engine's built-in compute environment."""
+    return compute_environment.name in ENGINES and compute_environment.tags.get(ENGINE_TAG) == compute_environment.name
 
 
 def own_queues(engines: Sequence[str]) -> dict[str, str]:
@@ -45,8 +45,10 @@ def own_queues(engines: Sequence[str]) -> dict[str, str]:
 def queue_engines(session: Session, queue: str, first: str) -> list[str]:
     """The engines of a queue's compute environments, in their order; none for a queue that does not exist."""
     found = session.get(JobQueue, queue)
-    environments = [session.get(ComputeEnvironment, name) for name in (found.compute_environments if found else [])]
-    return list(dict.fromkeys(engine_named_by(each.tags, first) for each in environments if each is not None))
+    compute_environments = [
+        session.get(ComputeEnvironment, name) for name in (found.compute_environments if found else [])
+    ]
+    return list(dict.fromkeys(engine_named_by(each.tags, first) for each in compute_environments if each is not None))
 
 
 def engine_named_by(tags: dict[str, str], first: str) -> str:

@@ -15,7 +15,7 @@ _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "
 _INTERVAL = 0.5
 """Seconds between two looks at a volume."""
 _PATIENCE = 5.0
-"""Seconds after which a volume that has not answered is said not to."""
+"""Seconds after which a volume counts as not answering."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ DEFAULT = MinFree(size=1 << 30, share=0.05)
 
 @dataclass
 class _Volume:
-    """One volume, and what the last look at it said."""
+    """One volume, and the result of the last look at it."""
 
     name: str
     path: Path

@@ -30,7 +30,7 @@ def held_by(attempt: Attempt) -> Resources:
 
 
 def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
-    """Where the nodes of an attempt are and what they were given, by index."""
+    """The hosts of an attempt's nodes and the resources allocated to them, by index."""
     return tuple(node.placement for node in attempt.nodes)
 
 

@@ -1,4 +1,4 @@
-"""Webhooks: whom the operator of a controller has told when jobs end, and how a message is signed.
+"""Webhooks: the receivers of messages about ended jobs, and the signature of a message.
 
 They are those of a file that the operator gives at the start, and no others: a URL in a user's YAML would let any user make the
 controller connect to what only the controller can reach. Signatures follow Standard Webhooks (standardwebhooks.com).

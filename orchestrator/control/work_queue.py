@@ -1,4 +1,4 @@
-"""The controller's memory of the jobs that are not over: who waits for room, whose gang runs, who is to be looked at.
+"""The controller's memory of the jobs that are not over: those that wait for resources, those with a gang, those that are due for a look.
 
 It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a look.
 """

@@ -314,7 +314,7 @@ def _observed(state: State, seen: Observed) -> Instructions:
 
 
 def _tell(state: State, seen: Observed) -> Instructions:
-    """What the job's user is told of a gang."""
+    """The reason that the job's user sees."""
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
     if seen.waits:
         return (Explain(seen.waits),)

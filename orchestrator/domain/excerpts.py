@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from shared_store.wording import shown as shown
-
 LONGEST_REASON = 1024
 """Characters of a status reason."""
 LONGEST_ERROR = 2000

@@ -108,12 +108,12 @@ Request = TypeVar("Request")
 
 @dataclass(frozen=True)
 class Plan(Generic[Request]):
-    """What a launch will do; printable."""
+    """A launch before it is carried out; printable."""
 
     gang: Gang
     nodes: Sequence[NodePlan]
     request: Request
-    """What the launch sends, in the engine's own type: processes with their environments, containers, a script, a request to AWS. A launch
+    """The request of the launch, in the engine's own type: processes with their environments, containers, a script, a request to AWS. A launch
     adds only what can't be known before: a free port or network, the contents of an image."""
     document: str = ""
     """The request as another scheduler will be given it, to be read: an sbatch script, a request in JSON; without credentials."""
@@ -210,7 +210,7 @@ class NodePhase(StrEnum):
 
 
 class Cause(StrEnum):
-    """What ended a node, as its engine saw it."""
+    """The cause of a node's end, as its engine observed it."""
 
     EXIT = "exit"
     """It left by itself, with its exit code."""
@@ -227,7 +227,7 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class NodeStatus:
-    """What the engine knows of one node. Raises ValueError where the fields contradict each other."""
+    """The engine's knowledge of one node. Raises ValueError where the fields contradict each other."""
 
     phase: NodePhase
     address: str = ""
@@ -235,7 +235,7 @@ class NodeStatus:
     """For people; nothing is decided by them. Why it does not run yet or can't be seen (then they are never empty); of one that has
     ended, what its supervisor said where it could not say it in the store, or what the engine says of its end."""
     cause: Cause | None = None
-    """What ended it; None while it runs, or where the engine can't say."""
+    """The cause of its end; None while it runs, or if the engine can't say."""
     exit_code: int | None = None
     """128 + n for signal n; None while it runs, or if the end was not observed."""
     gpus: tuple[str, ...] = ()
@@ -269,7 +269,7 @@ class Option:
 
     name: str
     help: str
-    """What it means, in a few words."""
+    """Its meaning, in a few words."""
     kind: type[str] | type[int] = str
     values: Sequence[str] = ()
     """Those that it may have; empty for any of its kind."""
@@ -286,7 +286,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Setting:
-    """What an engine is made with."""
+    """Arguments of an engine's factory."""
 
     home: Path
     """``$MUSTER_HOME``."""
@@ -335,7 +335,7 @@ class Engine(Protocol):
         ...
 
     def plan(self, gang: Gang) -> Plan[Any]:
-        """What :meth:`launch` would do. Pure, and quick. Raises EngineError where the engine can't do what the gang asks for."""
+        """The plan of a launch. Pure, and quick. Raises EngineError where the engine can't do what the gang asks for."""
         ...
 
     def launch(self, plan: Plan[Any]) -> Handle:

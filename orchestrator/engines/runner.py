@@ -50,9 +50,9 @@ class Health:
     """How an engine answers."""
 
     told_at: int | None
-    """When it told its hosts last, Unix time [ms]; None before it did."""
+    """When it last reported its capacity, Unix time [ms]; None before the first time."""
     problem: str | None
-    """That it does not answer, or why it can't tell its hosts; None where it does."""
+    """That it does not answer, or why it can't report its capacity; None while it does."""
     failing: int
     """Gangs that it could not start, or look at, the last time; each is tried again."""
     retry: float | None
@@ -123,7 +123,7 @@ class Runner:
     # -- what the controller asks -------------------------------------------------------------------------------------
 
     def capacity(self, patience: float = 0.0) -> Capacity:
-        """What the engine told last of its hosts or limits. Asks for them again, and waits for that for ``patience`` seconds at most."""
+        """The hosts or limits that the engine reported last. Requests a newer report and waits for it at most ``patience`` seconds."""
         with self._lock:
             if self._telling is None or self._telling.done():
                 self._telling = self._submit(self._tell_capacity)

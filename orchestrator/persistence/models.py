@@ -269,7 +269,7 @@ class WebhookDelivery(Base):
     """When it is tried next; None where it was given up."""
     tries: Mapped[int] = mapped_column(default=0)
     body: Mapped[str | None] = mapped_column(default=None)
-    """What is sent, from the first try on."""
+    """The message, unchanged from the first try on."""
     problem: Mapped[str | None] = mapped_column(default=None)
     """Error of the last try."""
 
@@ -400,7 +400,7 @@ class ClockState(Base):
 
 
 class ShareUsage(Base):
-    """What a share has used of a queue, decayed to ``as_of`` (steady time [ms])."""
+    """A share's use of a queue, decayed to ``as_of`` (steady time [ms])."""
 
     __tablename__ = "share_usage"
     queue: Mapped[str] = mapped_column(primary_key=True)

@@ -18,7 +18,7 @@ from shared_store.layout import Run
 
 
 def owner_of(session: Session, run: Run) -> RunRecord | None:
-    """Whose the run is: as recorded, else as ``run.json`` says, else as its first job says.
+    """The owner and the queue of a run: as recorded, else as ``run.json`` says, else as its first job says.
 
     A run that does not exist belongs to the unfinished job that will create it, whatever is recorded of an earlier run of that
     name; None without such a job. The record is in the session only where it was in the database. Its queue is empty for a run
@@ -45,7 +45,7 @@ def owner_of(session: Session, run: Run) -> RunRecord | None:
 
 
 def first_description(run: Run, job: Job, owner: str | None, queue: str) -> dict[str, Any]:
-    """What ``run.json`` of a run says that ``job`` begins."""
+    """The first ``run.json`` of a run that ``job`` begins."""
     spec = job.gang.spec
     facts = {"run": run.name, "job": job.id, "created": now(), "version": __version__, "spec": spec, "name": job.name}
     return {**facts, "owner": owner, "queue": queue}

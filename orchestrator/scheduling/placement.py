@@ -62,7 +62,7 @@ def never_fits(shape: Shape, hosts: Sequence[Host], elastic: bool = False) -> st
 
 
 def limit_of(hosts: Iterable[Host]) -> str | None:
-    """What an engine's own queue gives, in words; None for hosts that are machines."""
+    """The limit of an engine's own queue, in words; None for hosts that are machines."""
     queue = next((host for host in hosts if host.queue), None)
     return f"queue {queue.name} gives a gang at most {amounts(queue.resources)}" if queue else None
 

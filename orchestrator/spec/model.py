@@ -24,7 +24,6 @@ from pydantic import (
 )
 
 from orchestrator.domain.errors import SpecError
-from orchestrator.domain.excerpts import shown
 from orchestrator.spec.sections import CheckpointPolicy, Evaluation, Logs, NodeRange, Resources, Retry, Share
 from orchestrator.spec.settings import effective_problem, section_of, settings_classes, task_config, train_section
 from orchestrator.spec.track import Track, key_in
@@ -40,7 +39,7 @@ from orchestrator.spec.values import (
     place_of,
 )
 from shared_store.races import DEFAULTS, TRIALS
-from shared_store.wording import Refused, explain, kind_of, nearest, path_of
+from shared_store.wording import Refused, explain, kind_of, nearest, path_of, shown
 
 KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
 """The kinds of jobs: a spec has exactly one of these keys."""

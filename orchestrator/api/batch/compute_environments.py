@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api import permissions
-from orchestrator.api.arns import ACCOUNT, ecs_arn, environment_arn, plain_name, policy_arn
+from orchestrator.api.arns import ACCOUNT, compute_environment_arn, ecs_arn, plain_name, policy_arn
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
@@ -21,7 +21,7 @@ from orchestrator.control.compute_environments import is_built_in
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy
 
-_MOST_ENVIRONMENTS = 50
+_MOST_COMPUTE_ENVIRONMENTS = 50
 _SERVICE_ROLE = "/aws-service-role/batch.amazonaws.com/AWSServiceRoleForBatch"
 
 
@@ -33,8 +33,8 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
     rules.check_tags(request.get("tags") or {})
     if context.session.get(ComputeEnvironment, name):
         raise ClientError(f"Compute environment {name} exists already; UpdateComputeEnvironment changes it")
-    if len(context.session.scalars(select(ComputeEnvironment.name)).all()) >= _MOST_ENVIRONMENTS:
-        raise ClientError(f"there are {_MOST_ENVIRONMENTS} compute environments; delete one first")
+    if len(context.session.scalars(select(ComputeEnvironment.name)).all()) >= _MOST_COMPUTE_ENVIRONMENTS:
+        raise ClientError(f"there are {_MOST_COMPUTE_ENVIRONMENTS} compute environments; delete one first")
     if request["type"] not in ("MANAGED", "UNMANAGED"):
         raise ClientError(f"type is {request['type'][:50]!r}; it is MANAGED or UNMANAGED")
     if request.get("eksConfiguration"):
@@ -44,11 +44,11 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
         raise ClientError("a MANAGED compute environment needs computeResources")
     _check_resources(resources or {})
     document = {key: value for key, value in request.items() if key not in ("tags", "state")}
-    environment = ComputeEnvironment(name=name, document=document, tags=request.get("tags") or {})
-    environment.state = _state(request.get("state", "ENABLED"))
-    check_engine_tags(context, environment, environment.tags)
-    context.session.add(environment)
-    return {"computeEnvironmentName": name, "computeEnvironmentArn": environment_arn(name)}
+    compute_environment = ComputeEnvironment(name=name, document=document, tags=request.get("tags") or {})
+    compute_environment.state = _state(request.get("state", "ENABLED"))
+    check_engine_tags(context, compute_environment, compute_environment.tags)
+    context.session.add(compute_environment)
+    return {"computeEnvironmentName": name, "computeEnvironmentArn": compute_environment_arn(name)}
 
 
 def describe_compute_environments(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -57,45 +57,52 @@ def describe_compute_environments(context: Context, request: dict[str, Any]) -> 
     if named := request.get("computeEnvironments"):
         query = query.where(ComputeEnvironment.name.in_([plain_name(each, "compute-environment") for each in named]))
     rows, token = page(context.session, query, request, page_size(request, 100), (ComputeEnvironment.name,), (False,))
-    return {"computeEnvironments": [_describe(context, environment) for environment in rows], **token}
+    return {"computeEnvironments": [_describe(context, compute_environment) for compute_environment in rows], **token}
 
 
 def update_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateComputeEnvironment: state and resources; running jobs are left alone."""
-    environment = _environment(context, request["computeEnvironment"])
-    permissions.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, environment)
+    compute_environment = _compute_environment(context, request["computeEnvironment"])
+    permissions.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, compute_environment)
     if (state := request.get("state")) is not None:
-        environment.state = _state(state)
+        compute_environment.state = _state(state)
     if changes := request.get("computeResources"):
-        if environment.document["type"] != "MANAGED":
-            raise ClientError(f"Compute environment {environment.name} is UNMANAGED and has no computeResources")
+        if compute_environment.document["type"] != "MANAGED":
+            raise ClientError(
+                f"Compute environment {compute_environment.name} is UNMANAGED and has no computeResources"
+            )
         _check_resources(changes)
-        resources = {**(environment.document.get("computeResources") or {}), **changes}
-        environment.document = {**environment.document, "computeResources": resources}
+        resources = {**(compute_environment.document.get("computeResources") or {}), **changes}
+        compute_environment.document = {**compute_environment.document, "computeResources": resources}
     for key in ("serviceRole", "unmanagedvCpus", "context"):
         if key in request:
-            environment.document = {**environment.document, key: request[key]}
-    return {"computeEnvironmentName": environment.name, "computeEnvironmentArn": environment_arn(environment.name)}
+            compute_environment.document = {**compute_environment.document, key: request[key]}
+    return {
+        "computeEnvironmentName": compute_environment.name,
+        "computeEnvironmentArn": compute_environment_arn(compute_environment.name),
+    }
 
 
 def delete_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteComputeEnvironment of one that is DISABLED and in no queue."""
     permissions.check(Operation.DELETE_COMPUTE_ENVIRONMENT, Shared())
-    environment = context.session.get(
+    compute_environment = context.session.get(
         ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment")
     )
-    if environment is None:
+    if compute_environment is None:
         return {}
-    if environment.state != "DISABLED":
-        raise ClientError(f"Compute environment {environment.name} is ENABLED; disable it first")
+    if compute_environment.state != "DISABLED":
+        raise ClientError(f"Compute environment {compute_environment.name} is ENABLED; disable it first")
     users = [
         queue.name
         for queue in context.session.scalars(select(JobQueue))
-        if environment.name in queue.compute_environments
+        if compute_environment.name in queue.compute_environments
     ]
     if users:
-        raise ClientError(f"Compute environment {environment.name} is used by job queue {users[0]}; delete that first")
-    context.session.delete(environment)
+        raise ClientError(
+            f"Compute environment {compute_environment.name} is used by job queue {users[0]}; delete that first"
+        )
+    context.session.delete(compute_environment)
     return {}
 
 
@@ -159,11 +166,11 @@ def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
     return {}
 
 
-def _environment(context: Context, reference: str) -> ComputeEnvironment:
-    environment = context.session.get(ComputeEnvironment, plain_name(reference, "compute-environment"))
-    if environment is None:
+def _compute_environment(context: Context, reference: str) -> ComputeEnvironment:
+    compute_environment = context.session.get(ComputeEnvironment, plain_name(reference, "compute-environment"))
+    if compute_environment is None:
         raise ClientError(f"Compute environment {reference[:300]} does not exist")
-    return environment
+    return compute_environment
 
 
 def _policy(context: Context, arn: str) -> SchedulingPolicy:
@@ -218,31 +225,34 @@ def _matches(pattern: str, name: str) -> bool:
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 
-def _describe(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
+def _describe(context: Context, compute_environment: ComputeEnvironment) -> dict[str, Any]:
     document: dict[str, Any] = {
         "containerOrchestrationType": "ECS",
-        "uuid": str(uuid.uuid5(uuid.NAMESPACE_OID, f"{environment.name}/{environment.created_at}")),
-        "ecsClusterArn": ecs_arn("cluster", environment.name),
-        **environment.document,
-        "computeEnvironmentName": environment.name,
-        "computeEnvironmentArn": environment_arn(environment.name),
-        "state": environment.state,
+        "uuid": str(uuid.uuid5(uuid.NAMESPACE_OID, f"{compute_environment.name}/{compute_environment.created_at}")),
+        "ecsClusterArn": ecs_arn("cluster", compute_environment.name),
+        **compute_environment.document,
+        "computeEnvironmentName": compute_environment.name,
+        "computeEnvironmentArn": compute_environment_arn(compute_environment.name),
+        "state": compute_environment.state,
         "status": "VALID",
         "statusReason": "ComputeEnvironment Healthy",
-        "tags": environment.tags,
+        "tags": compute_environment.tags,
     }
     if document["type"] == "MANAGED":
         document.setdefault("serviceRole", f"arn:aws:iam::{ACCOUNT}:role{_SERVICE_ROLE}")
         document.setdefault("updatePolicy", {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30})
-    if is_built_in(environment):
-        document["computeResources"] = {**_own_resources(context, environment), **document.get("computeResources", {})}
+    if is_built_in(compute_environment):
+        document["computeResources"] = {
+            **_own_resources(context, compute_environment),
+            **document.get("computeResources", {}),
+        }
     return document
 
 
-def _own_resources(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
-    """``computeResources`` of a built-in environment: the hosts that its engine has now."""
+def _own_resources(context: Context, compute_environment: ComputeEnvironment) -> dict[str, Any]:
+    """``computeResources`` of a built-in compute environment: the hosts that its engine has now."""
     engine = context.reconciler.engine
-    served = [environment.name] if environment.name in engine.names else []
+    served = [compute_environment.name] if compute_environment.name in engine.names else []
     cpus = int(sum(host.cpus for each in engine.capacity(served, FRESH).values() for host in each.places))
     return {
         "type": "EC2",

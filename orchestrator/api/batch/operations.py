@@ -15,8 +15,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions
-from orchestrator.api.batch import compute_environments as environments
-from orchestrator.api.batch import definitions, jobs, queues, submission, tags
+from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
 from orchestrator.api.batch.service_model import service_model
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
@@ -42,15 +41,15 @@ OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
     "UpdateJobQueue": queues.update_job_queue,
     "DeleteJobQueue": queues.delete_job_queue,
     "GetJobQueueSnapshot": queues.get_job_queue_snapshot,
-    "CreateComputeEnvironment": environments.create_compute_environment,
-    "DescribeComputeEnvironments": environments.describe_compute_environments,
-    "UpdateComputeEnvironment": environments.update_compute_environment,
-    "DeleteComputeEnvironment": environments.delete_compute_environment,
-    "CreateSchedulingPolicy": environments.create_scheduling_policy,
-    "DescribeSchedulingPolicies": environments.describe_scheduling_policies,
-    "ListSchedulingPolicies": environments.list_scheduling_policies,
-    "UpdateSchedulingPolicy": environments.update_scheduling_policy,
-    "DeleteSchedulingPolicy": environments.delete_scheduling_policy,
+    "CreateComputeEnvironment": compute_environments.create_compute_environment,
+    "DescribeComputeEnvironments": compute_environments.describe_compute_environments,
+    "UpdateComputeEnvironment": compute_environments.update_compute_environment,
+    "DeleteComputeEnvironment": compute_environments.delete_compute_environment,
+    "CreateSchedulingPolicy": compute_environments.create_scheduling_policy,
+    "DescribeSchedulingPolicies": compute_environments.describe_scheduling_policies,
+    "ListSchedulingPolicies": compute_environments.list_scheduling_policies,
+    "UpdateSchedulingPolicy": compute_environments.update_scheduling_policy,
+    "DeleteSchedulingPolicy": compute_environments.delete_scheduling_policy,
     "TagResource": tags.tag_resource,
     "UntagResource": tags.untag_resource,
     "ListTagsForResource": tags.list_tags_for_resource,

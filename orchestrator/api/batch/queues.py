@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api import permissions
-from orchestrator.api.arns import environment_arn, job_arn, plain_name, policy_arn, queue_arn
+from orchestrator.api.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
@@ -175,7 +175,7 @@ def _policy(context: Context, arn: str) -> str:
 
 def _describe(queue: JobQueue) -> dict[str, Any]:
     order = [
-        {"order": i, "computeEnvironment": environment_arn(name)}
+        {"order": i, "computeEnvironment": compute_environment_arn(name)}
         for i, name in enumerate(queue.compute_environments, 1)
     ]
     return {

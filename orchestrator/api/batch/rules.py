@@ -12,10 +12,10 @@ from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_e
 from orchestrator.api.batch.members import check_consumables, check_members
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.limits import LARGEST_COMMANDS
-from orchestrator.domain.excerpts import shown
 from orchestrator.domain.gang import GangSpec, gang_needs, target_nodes
 from orchestrator.domain.native_options import MalformedOptions
 from shared_store.log_files import LEAST_LIMIT
+from shared_store.wording import shown
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")

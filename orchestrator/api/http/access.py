@@ -1,4 +1,4 @@
-"""Who is let in: by a token, by a key, by a session of the console, or as the controller's own user."""
+"""Authentication: by a token, by a key, by a session of the console, or as the controller's own user."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Access:
         return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
 
     def bearer(self, given: str) -> Identity:
-        """Who presents this token, or ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""
+        """The owner of this token, or of ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""
         if self.own_token and hmac.compare_digest(given.encode(), self.own_token.encode()):
             return THIS_PROCESS
         return self._proven(given)[1]
@@ -70,7 +70,7 @@ class Access:
         return f"{claim}.{self._seal(name, claim)}"
 
     def session(self, given: str) -> Identity | None:
-        """Whose session this is; None where it has expired, was closed, or its key is gone."""
+        """The owner of this session; None where it has expired, was closed, or its key is gone."""
         claim, _, seal = given.rpartition(".")
         name, _, rest = claim.partition(".")
         expected = self._seal(name, claim)
@@ -115,5 +115,5 @@ class Access:
 
 
 def identity_of(key: Key) -> Identity:
-    """Who uses a key."""
+    """The user of a key."""
     return Identity(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only)

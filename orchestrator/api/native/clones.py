@@ -22,7 +22,6 @@ from orchestrator.api.native.runs import spec_of
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
-from orchestrator.domain.excerpts import shown
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import first_description, forget_gone_run
@@ -33,7 +32,7 @@ from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
 from shared_store.parent import NewRun, RunExists, TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
-from shared_store.wording import Refused
+from shared_store.wording import Refused, shown
 
 
 def clone(

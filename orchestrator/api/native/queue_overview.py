@@ -79,11 +79,13 @@ def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
             }
             for row in rows
         ]
-        environments = [_environment(row, engine.names[0]) for row in session.scalars(select(ComputeEnvironment))]
+        compute_environments = [
+            _compute_environment(row, engine.names[0]) for row in session.scalars(select(ComputeEnvironment))
+        ]
         taken = _taken(held)
     return {
         "queues": found,
-        "computeEnvironments": environments,
+        "computeEnvironments": compute_environments,
         "engines": _engines(reconciler, capacities),
         "hosts": [
             {
@@ -161,7 +163,7 @@ def _taken(held: Held) -> dict[str, Resources]:
     return found
 
 
-def _environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
+def _compute_environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
     read = read_compute_environment(row, first)
     return {"name": read.name, "engine": read.engine, "state": row.state, "hosts": read.hosts, "cpus": read.max_cpus}
 

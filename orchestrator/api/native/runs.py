@@ -19,7 +19,7 @@ from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
-from orchestrator.domain.excerpts import LONGEST_REASON, excerpt, shown
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import AutomaticEvaluation, Job, RunRecord
@@ -33,7 +33,7 @@ from shared_store.layout import Run
 from shared_store.metrics import sampled
 from shared_store.parent import TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
-from shared_store.wording import counted
+from shared_store.wording import counted, shown
 
 
 def list_runs(

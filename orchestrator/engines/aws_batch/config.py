@@ -1,4 +1,4 @@
-"""What the ``aws-batch`` engine has to know of an account: ``$MUSTER_HOME/aws.json``, written by ``muster aws up``."""
+"""Facts about an account that the ``aws-batch`` engine needs: ``$MUSTER_HOME/aws.json``, written by ``muster aws up``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class AwsConfig(BaseModel):
     job_queue: str
     """Name or ARN."""
     image: str
-    """What the image ``muster`` of a job means there."""
+    """The image that stands for ``muster`` there."""
     log_group: str = "/aws/batch/job"
     file_system: str | None = None
     """EFS file system; without one ``store`` must be on the instances already."""
@@ -36,7 +36,7 @@ class AwsConfig(BaseModel):
     """Share identifier, where the queue has a fair-share policy."""
     efa: bool = False
     max_vcpus: int = Field(256, ge=1)
-    """What the compute environment may grow to, until AWS has said it."""
+    """vCPUs to which the compute environment may grow, until AWS has answered."""
     poll: float = Field(2.0, gt=0)
     """Seconds between two looks at a gang, and at its logs."""
     quiet: float = Field(6.0, ge=0)

@@ -22,6 +22,7 @@ from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, 
 from botocore.parsers import ResponseParserError
 
 from orchestrator.domain.hosts import Limit, Queued
+from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.resources import Resources
 from orchestrator.engines.api import (
     Cause,
@@ -43,7 +44,6 @@ from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen
 from shared_store.outcomes import EX_TEMPFAIL, Outcome
 from shared_store.wording import counted
 
-_OVER = ("SUCCEEDED", "FAILED")
 _PORT = 29500
 _GRACE = 25.0
 """Grace time [s] of a supervisor: AWS kills containers after 30, and it has to record what did not leave in time before that."""
@@ -69,7 +69,7 @@ _AWAY = 15.0
 
 @dataclass
 class _Watched:
-    """What is known of a gang between two looks."""
+    """The known state of a gang between two looks."""
 
     next: float = 0.0
     """When AWS is asked again (monotonic [s])."""
@@ -122,7 +122,7 @@ class AwsBatchEngine:
         self._check_queue()
 
     def capacity(self) -> Queued:
-        """What the queue's compute environments may grow to.
+        """The limits of the queue's compute environments.
 
         AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
         is taken as their number, and what does not exist waits there with AWS's own reason.
@@ -261,12 +261,12 @@ class AwsBatchEngine:
         return watched.status
 
     def _look(self, handle: Handle, watched: _Watched) -> GangStatus:
-        """What AWS says of every node."""
+        """AWS's status of every node."""
         count, main = handle.nodes, handle.facts["main"]
         parent, nodes = self._describe(handle)
         if parent is None:
             return [NodeStatus(NodePhase.ENDED, words=f"AWS Batch has no job {handle.facts['aws']} any more")] * count
-        if parent["status"] in _OVER and watched.over_since is None:
+        if parent["status"] in TERMINAL and watched.over_since is None:
             watched.over_since = time.monotonic()
         watched.main_stopped = (nodes.get(main) or {}).get("stoppedAt")
         status = [self._node(handle, watched, index, nodes.get(index) or parent, parent) for index in range(count)]
@@ -295,7 +295,7 @@ class AwsBatchEngine:
     ) -> NodeStatus:
         status, container = detail["status"], detail.get("container") or {}
         address = next((each.get("privateIpv4Address", "") for each in container.get("networkInterfaces") or []), "")
-        over = status in _OVER or watched.straggled
+        over = status in TERMINAL or watched.straggled
         log = self._follow(handle, watched, index, container.get("logStreamName"), over)
         if not over:
             if status == "RUNNING":
@@ -313,7 +313,7 @@ class AwsBatchEngine:
         return _ended(address, code, str(reason))
 
     def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, outcome: Outcome) -> bool:
-        """Whether the store has the node's outcome; it is written here where nobody else did."""
+        """Whether the store has the node's outcome; it is written here if it was missing."""
         if recorded(handle, outcome.node) is not None:
             return True
         since = time.monotonic() - watched.ended[outcome.node]

@@ -1,4 +1,4 @@
-"""What nodes on AWS print, copied from CloudWatch Logs into the run's logs; and their outcomes, which come the same way.
+"""The output of nodes on AWS, copied from CloudWatch Logs into the run's logs, and their outcomes, which come the same way.
 
 For a controller whose store is not the volume of the nodes, and for images without Muster. One thread a gang.
 """
@@ -125,7 +125,7 @@ class GangLogs:
         self._thread.start()
 
     def saw(self, index: int, stream: str | None, ended: bool) -> NodeLog:
-        """What AWS says of a node: the name of its stream, and whether it has ended."""
+        """AWS's facts about a node: the name of its stream, and whether it has ended."""
         node = self.nodes[index]
         node.stream = stream or node.stream
         if ended and node.ended is None:

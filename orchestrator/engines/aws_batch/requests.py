@@ -26,7 +26,7 @@ _NODE_FIELDS = ("node_index", "node_count", "main_index", "master_address", "add
 
 @dataclass(frozen=True)
 class Requests:
-    """What is sent for one gang."""
+    """The requests for one gang."""
 
     definition: Mapping[str, Any]
     """RegisterJobDefinition; the same for every attempt of a job of one size."""
@@ -93,7 +93,7 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
 
 
 def job_name(gang: Gang) -> str:
-    """One name for each attempt: by it a job is found again whose submission nobody could note."""
+    """One name for each attempt, by which a job is found again if the controller died before it noted the submission."""
     tail = f"-{gang.job}-{gang.attempt}-{gang.epoch}"
     return _name((gang.title or "muster")[:50] + tail, 128)
 
@@ -118,7 +118,7 @@ def _image(gang: Gang, index: int) -> str:
 
 
 def _like(gang: Gang, node: NodePlan) -> tuple[Any, ...]:
-    """What nodes of one range have in common."""
+    """The common part of the nodes of one range."""
     index = node.contract.node_index
     container = dict(gang.containers[index]) if gang.containers else {}
     placement = node.placement

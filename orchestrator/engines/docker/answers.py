@@ -1,4 +1,4 @@
-"""Where a Docker Engine does not answer: what is said of it, and that it is waited for."""
+"""The message about a Docker Engine that does not answer, and the decision to wait for it."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ log = logging.getLogger("muster.engines")
 _VERSION = "muster.version"
 """Label of images that have Muster in them."""
 _REMEMBERED = 256
-"""Gangs whose nodes' exit codes are told after their containers are gone: the controller asks once more when all has ended."""
+"""Number of gangs whose exit codes are kept after their containers are gone: the controller looks once more after the end."""
 _PORT = 29500
 _TRIES = 64
 """Subnets that are tried before a gang can't be started: others on this machine may hold some."""

@@ -1,4 +1,4 @@
-"""What a node's place and its ``containerProperties`` are as options of Docker."""
+"""A node's placement and ``containerProperties`` as options of Docker."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[s
 
 
 def linux(container: Mapping[str, Any]) -> dict[str, Any]:
-    """What else ``containerProperties`` say, as Docker's options."""
+    """The other members of ``containerProperties`` as options of Docker."""
     parameters = container.get("linuxParameters") or {}
     options: dict[str, Any] = {"init": bool(parameters.get("initProcessEnabled"))}
     if tmpfs := parameters.get("tmpfs"):

@@ -1,4 +1,4 @@
-"""What Docker is asked for, for one node of a gang: all but what only Docker knows, which is what the image has in it."""
+"""The request to Docker for one node of a gang: complete but for the contents of the image, which only Docker knows."""
 
 from __future__ import annotations
 

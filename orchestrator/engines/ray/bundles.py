@@ -1,4 +1,4 @@
-"""What Ray is asked for: a bundle for each node of a gang, each on a machine of its own."""
+"""Placement bundles for Ray: one for each node of a gang, each on a machine of its own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STRATEGY = "STRICT_SPREAD"
 
 
 def bundle_of(node: Mapping[str, Any]) -> dict[str, float]:
-    """What a node of a plan takes."""
+    """The resources of a node of a plan."""
     bundle = {"CPU": node["cpus"], "memory": node["memory"] * 2**20}
     if node["gpus"]:
         bundle["GPU"] = node["gpus"]

@@ -17,13 +17,13 @@ from orchestrator.engines.api import EngineError
 from orchestrator.engines.toolkit.environment import inherited
 
 _FRESH = 8.0
-"""Seconds after which what the watch said last is old: the head does not answer."""
+"""Seconds after which the last report is stale: the head does not answer."""
 _STARTING = 40.0
 """Seconds that the watch may take for its first word."""
 
 
 class Watch:
-    """What the cluster is like, as a process that imports Ray says again and again."""
+    """The state of the cluster, reported periodically by a process that imports Ray."""
 
     def __init__(self, head: str, environment: Mapping[str, str]) -> None:
         self.head, self._environment = head, environment
@@ -36,7 +36,7 @@ class Watch:
         threading.Thread(target=self._listen, name="ray watch", daemon=True).start()
 
     def first(self) -> dict[str, Any]:
-        """The first that is said; ``{"error": …}`` where the cluster can't be used."""
+        """The first report; ``{"error": …}`` where the cluster can't be used."""
         if not self._told.wait(_STARTING):
             self.close()
             return {"error": f"the Ray cluster at {self.head} does not answer"}

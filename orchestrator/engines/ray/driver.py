@@ -41,7 +41,7 @@ class Driver:
         self.gang: Gang | None = None
         self.group: Any = None
         self.key: Any = None
-        """What the placement group was made for."""
+        """The bundles and the pinned machines for which the placement group was made."""
         self.idle_since = time.monotonic()
         self._partial = b""
         self._draining: set[str] = set()

@@ -263,7 +263,7 @@ class RayEngine:
             os.close(commands)
 
     def _let_go(self, job: str) -> None:
-        """Drivers of other jobs that only keep a place for an attempt to come are told to leave; those that left are reaped."""
+        """Ask drivers that only hold resources for another job's next attempt to exit, and reap those that have."""
         for other, process in list(self._drivers.items()):
             if process.poll() is not None:
                 del self._drivers[other]
@@ -279,7 +279,7 @@ class RayEngine:
 
 
 def _request(gang: Gang, node: NodePlan, machines: Mapping[str, Mapping[str, Any]]) -> NodeRequest:
-    """What the driver is told of a node; ``machines``: those of the cluster, by host name. Raises EngineError."""
+    """A node's part of the request to the driver; ``machines``: those of the cluster, by host name. Raises EngineError."""
     index, placement = node.contract.node_index, node.placement
     container = gang.containers[index] if gang.containers else {}
     return NodeRequest(

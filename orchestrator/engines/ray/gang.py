@@ -52,7 +52,7 @@ class Gang:
         ]
         self.actors: list[Any] = []
         self.asked: dict[Any, tuple[str, int]] = {}
-        """What was asked of actors and is not answered: a kind and a node's index."""
+        """Calls of actors that are not answered: a kind and a node's index."""
         self.heard = [time.monotonic()] * len(self.nodes)
         self.broken: dict[int, float] = {}
         """Since when the connection to an actor is broken."""

@@ -1,4 +1,4 @@
-"""What runs in the actor that a gang's driver has on each node of a Ray cluster: it starts the node's supervisor and ends it.
+"""The actor of a gang's driver on each node of a Ray cluster: it starts the node's supervisor and ends it.
 
 It travels to the node by value, since that may have another version of Muster, or none: that has to be said in words. So it imports
 nothing but the standard library. Python and Muster are those of the node.
@@ -42,7 +42,7 @@ class Node:
         threading.Thread(target=self._keep, name="keeper", daemon=True).start()
 
     def facts(self, version: str, directory: str | None, store: str, run: str, epoch: int) -> dict[str, Any]:
-        """What the driver has to know before it starts anything: the version of Muster here, the GPUs, what is missing.
+        """Facts that the driver needs before it starts anything: the version of Muster here, the GPUs, what is missing.
 
         Args:
             version: Of Muster, the driver's; the driver refuses another one.

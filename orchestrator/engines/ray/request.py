@@ -1,4 +1,4 @@
-"""What the driver of a job is told of a gang."""
+"""The request for a gang to the driver of its job."""
 
 from __future__ import annotations
 

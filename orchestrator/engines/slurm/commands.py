@@ -1,4 +1,4 @@
-"""Slurm's own commands: calling them, and a picture of its jobs that is never older than a second while somebody asks."""
+"""Slurm's own commands: calling them, and a snapshot of its jobs that is at most a second old while it is used."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class SlurmJob:
 
 
 def call(*command: str, text: str | None = None) -> str:
-    """What one of Slurm's commands prints.
+    """The output of one of Slurm's commands.
 
     Raises:
         Unreachable: slurmctld does not answer.
@@ -106,7 +106,7 @@ def list_jobs() -> dict[str, SlurmJob]:
 
 
 class Jobs:
-    """A picture of this user's jobs, taken in the background: who asks is never held up for long by a Slurm that does not answer."""
+    """A snapshot of this user's jobs, refreshed in the background: a Slurm that does not answer delays no caller for long."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
@@ -114,12 +114,12 @@ class Jobs:
         self._jobs: Mapping[str, SlurmJob] = {}
         self._taken = 0.0
         self._late = False
-        """Somebody has waited for the newer picture in vain: nobody else needs to."""
+        """A caller has timed out on a refresh: later ones take the snapshot as it is."""
         self._lock, self._looked = threading.Lock(), threading.Event()
         self._looked.set()
 
     def get(self, number: str, since: float, age: float) -> SlurmJob | None:
-        """The job; None where Slurm does not know it any more. Raises Unreachable where that can't be told.
+        """The job; None if Slurm no longer knows it. Raises Unreachable if that can't be determined.
 
         Args:
             number: The job's.

@@ -46,7 +46,7 @@ from shared_store.layout import Store
 from shared_store.outcomes import Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
-"""What sbatch says where it would take the job later."""
+"""Errors of sbatch after which it would accept the job later."""
 _LOOK = 0.3
 """Seconds between two looks at a job that is being stopped."""
 _AGAIN = 2.0
@@ -61,7 +61,7 @@ _SAID = re.compile(r"^srun: error: \S+: tasks? ([\d,-]+): (?:Exited with exit co
 _STARVED = "Out Of Memory"
 _SIGNALS = {"Killed": 137, "Terminated": 143, "Segmentation fault": 139, "Aborted": 134, _STARVED: 137}
 _SCRIPT = re.compile(r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", re.MULTILINE)
-"""What the script itself says where it can't start the nodes."""
+"""Lines of the script itself when it can't start the nodes."""
 _MEETING = re.compile(r"^muster: meeting (\{.*\})$", re.MULTILINE)
 
 

@@ -1,6 +1,6 @@
-"""The sbatch script of a gang: what Slurm is asked for, one ``srun`` task a node, and what the nodes are told.
+"""The sbatch script of a gang: its request to Slurm, one ``srun`` task per node, and the input of the nodes.
 
-What the nodes are told goes in on ``srun``'s standard input, which every task gets, as JSON: values keep every character, and their
+The nodes' input is JSON on ``srun``'s standard input, which every task gets: values keep every character, and their
 size has no limit but the script's. Addresses and the port are known on the first node only: ``worker.slurm_node`` finds them there.
 """
 
@@ -54,10 +54,10 @@ wait "$step"
 
 @dataclass(frozen=True)
 class Submission:
-    """What Slurm is sent for a gang."""
+    """A gang's submission to Slurm."""
 
     script: str
-    """What ``sbatch`` reads on its standard input."""
+    """Standard input of ``sbatch``."""
     output: str
     """Where Slurm writes what ``srun`` and the nodes' supervisors say."""
     partition: str | None
@@ -149,7 +149,7 @@ def _nice(base: str, priority: int) -> int:
 
 
 def _told(gang: Gang) -> dict[str, Any]:
-    """What all tasks are told; nodes that are alike are described once."""
+    """Input of all tasks; nodes that are alike are described once."""
     plans = node_plans(gang, [""] * len(gang.placements), 0)
     kinds: list[Mapping[str, Any]] = []
     of = []

@@ -1,1 +1,1 @@
-"""What several engines need."""
+"""Code shared by several engines."""

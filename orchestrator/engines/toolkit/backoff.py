@@ -17,7 +17,7 @@ class _Trouble:
 
 
 class Backoff:
-    """What fails at present, by subject (a job, an engine, …). Any thread may call."""
+    """Present failures, by subject (a job, an engine, …). Any thread may call."""
 
     def __init__(self, log: logging.Logger, first: float = 1.0, most: float = 60.0) -> None:
         """``first``, ``most``: the shortest and the longest pause between two tries [s]; each failure doubles it."""

@@ -15,7 +15,7 @@ from shared_store.outcomes import Outcome, read_outcome, write_outcome
 
 
 def store_facts(gang: Gang) -> dict[str, Any]:
-    """What a handle has to hold for the other functions."""
+    """The facts that the other functions need in a handle."""
     return {name: getattr(gang, name) for name in ("job", "attempt", "epoch", "run", "store", "log_limit")}
 
 

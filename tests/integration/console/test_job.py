@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.client import ApiError
+from orchestrator.domain.errors import ApiError
 from shared_store.layout import Run, Store
 from shared_store.logs import format_line
 from shared_store.metrics import MetricsWriter
