@@ -14,6 +14,7 @@ from typing import Any
 from shared_store import races
 from shared_store.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.layout import LARGEST_DESCRIPTION, Run
+from shared_store.metrics import finite
 from shared_store.wording import counted
 
 TERMS_SHOWN = 6
@@ -55,7 +56,7 @@ def _read(run: Run, name: str) -> dict[str, Any] | None:
     except DamagedFile:
         return None
     numbers = [summary.get(key) for key in _NUMBERS] if summary else [None]
-    return summary if all(isinstance(number, int | float) for number in numbers) else None
+    return summary if all(finite(number) is not None for number in numbers) else None
 
 
 def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:

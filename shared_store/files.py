@@ -13,7 +13,7 @@ import os
 import shutil
 import stat
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,11 @@ LARGEST_JSON = 16 << 20
 """Bytes of a JSON file; Muster writes no larger one."""
 DEEPEST_JSON = 100
 """Levels of lists and objects in a JSON file."""
+LONGEST_WHOLE = 1000
+"""Bits of a whole number in a JSON file."""
+
+
+_INSIDE = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class DamagedFile(ValueError):
@@ -113,15 +118,15 @@ def refuse_links(path: Path, levels: int) -> None:
             )
 
 
-def open_regular(path: Path, *, write: bool = False) -> BufferedReader | BufferedRandom:
+def open_regular(path: Path, *, write: bool = False, within: int | None = None) -> BufferedReader | BufferedRandom:
     """Open a regular file of the store: a job may have put a link in its place, which leads out of the store, or a pipe, which never ends.
 
-    It is opened to read; with ``write``, an existing file also to write. Raises DamagedFile if it is not a regular file, OSError as
+    It is opened to read; with ``write``, an existing file also to write. ``within``: descriptor of the directory of a relative path. Raises DamagedFile if it is not a regular file, OSError as
     ``open`` does.
     """
     access = os.O_RDWR if write else os.O_RDONLY
     try:
-        descriptor = os.open(path, access | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(path, access | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=within)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
             raise DamagedFile(f"{path}: not a regular file") from None
@@ -130,6 +135,21 @@ def open_regular(path: Path, *, write: bool = False) -> BufferedReader | Buffere
         os.close(descriptor)
         raise DamagedFile(f"{path}: not a regular file")
     return open(descriptor, "rb+") if write else open(descriptor, "rb")
+
+
+def open_inside(directory: Path, parts: Sequence[str]) -> BufferedReader | BufferedRandom:
+    """Open a regular file below ``directory`` to read, whose ``parts`` are plain names, and follow no link, also none that comes meanwhile.
+
+    Raises DamagedFile if it is not a regular file, NotADirectoryError where a directory is a link, OSError as ``open`` does.
+    """
+    found = os.open(directory, _INSIDE)
+    try:
+        for part in parts[:-1]:
+            outer, found = found, os.open(part, _INSIDE, dir_fd=found)
+            os.close(outer)
+        return open_regular(Path(parts[-1]), within=found)
+    finally:
+        os.close(found)
 
 
 def _read_regular(path: Path, largest: int) -> bytes:
@@ -146,6 +166,8 @@ def _check_plain(value: object, data: bytes) -> None:
     for _ in range(DEEPEST_JSON):
         if any(isinstance(each, float) and not math.isfinite(each) for each in level):
             raise ValueError("a number is too large")
+        if any(isinstance(each, int) and each.bit_length() > LONGEST_WHOLE for each in level):
+            raise ValueError("a number is too large")  # no float can be made of it
         level = [
             inner
             for each in level

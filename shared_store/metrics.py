@@ -68,6 +68,12 @@ class MetricsWriter:
         self.close()
 
 
+def finite(value: Any) -> float | None:
+    """The value where it is a finite number, and no truth value: a job may have written anything into its records."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if is_number else None
+
+
 def scalars(record: Mapping[str, Any]) -> dict[str, float]:
     """A record's numbers by their names in TensorBoard, W&B and MLflow; without the iteration, which is the step, and the time."""
     numbers = {name: value for name, value in record.items() if isinstance(value, int | float)}

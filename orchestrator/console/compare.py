@@ -91,7 +91,12 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     chosen: dict[str, None] = {}
     known: list[str] | None = None
     reconciler = reconciler_of(request)
-    for pattern in (part for each in patterns for part in each.split()):
+    given = [part for each in patterns for part in each.split()]
+    if len(given) > MOST:
+        raise ClientError(
+            f"these are {len(given)} runs or patterns; {MOST} at most are compared at once, so give fewer"
+        )
+    for pattern in given:
         if not any(sign in pattern for sign in "*?["):
             chosen[pattern] = None
             continue

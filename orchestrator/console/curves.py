@@ -31,7 +31,7 @@ from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Recent
 from orchestrator.console.routing import page_router
 from shared_store.layout import Run
-from shared_store.metrics import history_of, sampled
+from shared_store.metrics import finite, history_of, sampled
 
 router = page_router()
 
@@ -117,6 +117,6 @@ def _single(record: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def number(value: Any) -> float | None:
     """The value in six digits, where it is a finite number, and no truth value."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if finite(value) is None:
         return None
     return value if isinstance(value, int) or abs(value) > 1e6 else float(f"{value:.6g}")

@@ -18,6 +18,7 @@ from orchestrator.persistence.ownership import born_at
 from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
 from shared_store.evaluations import by_checkpoint
 from shared_store.layout import Run
+from shared_store.metrics import finite
 from shared_store.wording import counted
 
 CHECKPOINTS = 30
@@ -32,7 +33,8 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
     is_over = Status(status).is_terminal
     training = (detail["spec"] or {}).get("train") or {}
     last = detail["progress"] or {}
-    iteration, iterations = last.get("iteration") or 0, training.get("iterations") or 0
+    iteration, iterations = int(finite(last.get("iteration")) or 0), training.get("iterations") or 0
+    seconds = finite(last.get("iteration_seconds"))
     attempts = detail["attempts"]
     started = next((each["startedAt"] for each in attempts if each["startedAt"]), detail["startedAt"])
     results = detail["results"] or {}
@@ -45,8 +47,8 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "done": iteration,
         "iterations": iterations or 1,
         "progress": f"{iteration} of {iterations}" if iterations and iteration else "",
-        "left": words.duration((iterations - iteration) * last["iteration_seconds"])
-        if not is_over and iteration and isinstance(last.get("iteration_seconds"), int | float)
+        "left": words.duration((iterations - iteration) * seconds)
+        if not is_over and iteration and seconds is not None
         else "",
         "rate": words.count(last.get("steps_per_second")) if not is_over else "",
         "reward": words.count(last.get("reward")),
@@ -122,16 +124,16 @@ def _attempt_of(detail: Mapping[str, Any]) -> str:
 
 
 def _straggler(last: Mapping[str, Any]) -> str:
-    rank, excess = last.get("slowest_rank"), last.get("slowest_excess")
-    if not isinstance(rank, int) or not isinstance(excess, int | float):
+    rank, excess = last.get("slowest_rank"), finite(last.get("slowest_excess"))
+    if not isinstance(rank, int) or excess is None:
         return ""
     return f"rank {rank}, {100 * excess:.0f} % over the median"
 
 
 def _with_error(value: Any, error: Any) -> str:
-    if not isinstance(value, int | float):
+    if finite(value) is None:
         return ""
-    return words.count(value) + (f" ± {words.count(error)}" if isinstance(error, int | float) else "")
+    return words.count(value) + (f" ± {words.count(error)}" if finite(error) is not None else "")
 
 
 def _evaluated(evaluation: Mapping[str, Any] | None) -> str:

@@ -28,6 +28,8 @@ router = page_router()
 
 ROWS = 50
 """Jobs of a page."""
+_LONGEST = 200
+"""Characters of a search."""
 _AT_ONCE = 50
 """Jobs that TerminateJobs takes."""
 GROUPS: Mapping[str, tuple[Status, ...]] = {
@@ -46,7 +48,7 @@ def jobs(
     request: Request,
     state: str = Query(default="", max_length=20),
     queue: str = Query(default="", max_length=128),
-    search: str = Query(default="", max_length=200),
+    search: str = Query(default="", max_length=_LONGEST),
     page: int = Query(default=1, ge=1, le=10**6),
 ) -> Response:
     """The table."""
@@ -76,7 +78,7 @@ def jobs_stream(
     request: Request,
     state: str = Query(default="", max_length=20),
     queue: str = Query(default="", max_length=128),
-    search: str = Query(default="", max_length=200),
+    search: str = Query(default="", max_length=_LONGEST),
     page: int = Query(default=1, ge=1, le=10**6),
 ) -> Response:
     """What changes in a window of the table."""
@@ -119,6 +121,8 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
 def _wanted(state: str, queue: str, search: str) -> Wanted:
     if state not in GROUPS:
         raise ClientError(f"state {state!r} is not known; it is one of {', '.join(filter(None, GROUPS))}")
+    if len(search) > _LONGEST:
+        raise ClientError(f"the text to search for has more than {_LONGEST} characters")
     return Wanted(GROUPS[state], queue, search)
 
 

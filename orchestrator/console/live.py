@@ -6,8 +6,9 @@ import asyncio
 import json
 import threading
 import time
-from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Hashable, Mapping, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Hashable, Mapping, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -17,6 +18,7 @@ from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
 from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import current_identity
 from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
 
@@ -26,6 +28,8 @@ _HEARTBEAT = 10.0
 """Seconds after which an idle stream says something, which is how a browser that left is noticed."""
 _LONGEST = 300.0
 """Seconds after which a stream ends; the browser comes back at once, and is admitted again, or not."""
+_MOST_OPEN = 100
+"""Streams of one key or user at once: each takes a share of the server's time."""
 _MOST_KEPT = 64
 _Value = TypeVar("_Value")
 
@@ -51,11 +55,32 @@ def last_id(request: Request) -> str:
 def stream(request: Request, look: Look, interval: float = INTERVAL) -> StreamingResponse:
     """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends."""
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
-    events = _events(look, interval, request.app.state.closing)
+    events = _admitted(current_identity.get().name, _events(look, interval, request.app.state.closing))
     return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 
 
-async def _events(look: Look, interval: float, closing: threading.Event) -> AsyncIterator[bytes]:
+_open: Counter[str] = Counter()
+"""Streams that are open, by who reads them; used by the event loop alone."""
+
+
+async def _admitted(name: str, events: AsyncGenerator[bytes, None]) -> AsyncIterator[bytes]:
+    """The events, where ``name`` has not too many streams."""
+    if _open[name] >= _MOST_OPEN:
+        yield format_sse_event(retry=30_000, comment="Muster")
+        yield _written(Event("trouble", f"{_open[name]} pages are open already; close some, and this one becomes live"))
+        return
+    _open[name] += 1
+    try:
+        async with aclosing(events):
+            async for each in events:
+                yield each
+    finally:
+        _open[name] -= 1
+        if not _open[name]:
+            del _open[name]
+
+
+async def _events(look: Look, interval: float, closing: threading.Event) -> AsyncGenerator[bytes, None]:
     begun = spoken = time.monotonic()
     yield format_sse_event(retry=1000, comment="Muster")
     while not closing.is_set() and time.monotonic() - begun < _LONGEST:

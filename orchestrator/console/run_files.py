@@ -6,6 +6,7 @@ import mimetypes
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,7 +17,7 @@ from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.routing import page_router
-from shared_store.files import DamagedFile, open_regular, refuse_links
+from shared_store.files import DamagedFile, open_inside
 from shared_store.layout import NAME, Run
 
 router = page_router()
@@ -24,6 +25,8 @@ router = page_router()
 PLACES = ("metrics", "recordings", "evaluations", "exports")
 """Directories of a run whose files are shown."""
 _MOST = 200
+_MOST_READ = 2000
+"""Entries of a directory that are looked at: a job may make any number of them."""
 _DEEPEST = 4
 _PICTURES = (".png", ".gif")
 _BLOCK = 256 << 10
@@ -65,7 +68,8 @@ def _in(run: Run, place: str) -> list[File]:
 
 def _walk(directory: Path, depth: int) -> Iterator[Path]:
     try:
-        entries = sorted(os.scandir(directory), key=lambda each: each.name)
+        with os.scandir(directory) as there:
+            entries = sorted(islice(there, _MOST_READ), key=lambda each: each.name)
     except (FileNotFoundError, NotADirectoryError):
         return
     for entry in entries:
@@ -84,10 +88,8 @@ def file(request: Request, name: str, path: str) -> Response:
     parts = path.split("/")
     if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):
         raise ClientError(f"run {run.name} shows no file {path[:100]!r}", 404)
-    place = run.path / path
     try:
-        refuse_links(place, len(parts) + 1)
-        opened = open_regular(place)
+        opened = open_inside(run.path, parts)
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         raise ClientError(f"run {run.name} has no file {path[:100]!r}", 404) from None
     except (DamagedFile, OSError) as error:

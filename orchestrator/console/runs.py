@@ -20,6 +20,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
 from shared_store.evaluations import flattened
+from shared_store.metrics import finite
 
 router = page_router()
 
@@ -206,7 +207,7 @@ def _evaluation(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     told = evaluation.get("return")
     interval = {**(told if isinstance(told, Mapping) else {}), "mean": evaluation.get("mean_return")}
     changes = evaluation.get("config")
-    share = success.get("share") if isinstance(success, Mapping) else None
+    share = finite(success.get("share")) if isinstance(success, Mapping) else None
     return {
         "key": evaluation.get("name", ""),
         "checkpoint": evaluation.get("checkpoint", ""),
@@ -218,17 +219,17 @@ def _evaluation(evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "episodes": str(evaluation.get("episodes", "")),
         "return": _interval(interval),
         "length": words.count(evaluation.get("mean_length")),
-        "success": f"{100 * share:.1f} %" if isinstance(share, int | float) else "",
+        "success": f"{100 * share:.1f} %" if share is not None else "",
         "when": words.moment(when * 1000 if isinstance(when, int | float) else None),
     }
 
 
 def _interval(told: Mapping[str, Any]) -> str:
     """A mean, and half of its 95 % interval where that is known."""
-    mean, high = told.get("mean"), told.get("high")
-    if not isinstance(mean, int | float):
+    mean, high = finite(told.get("mean")), finite(told.get("high"))
+    if mean is None:
         return ""
-    return f"{mean:.2f} ± {high - mean:.2f}" if isinstance(high, int | float) else f"{mean:.2f}"
+    return f"{mean:.2f} ± {high - mean:.2f}" if high is not None else f"{mean:.2f}"
 
 
 _TABLES = {"jobs": _job, "checkpoints": _checkpoint, "evaluations": _evaluation}

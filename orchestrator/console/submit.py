@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 from fastapi import Depends, Query, Request, Response
@@ -16,6 +16,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native import routes
 from orchestrator.api.native.routes import PlanRequest
 from orchestrator.api.permissions import Operation
+from orchestrator.api.turns import Turns
 from orchestrator.console.forms import TOKEN, Form, done, sent_form
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
@@ -40,8 +41,8 @@ train:
   worlds: 128
   iterations: 100
 """
-_AT_ONCE, _PATIENCE = threading.BoundedSemaphore(2), 20.0
-"""Reward functions that are tried at once, each in a process of its own; and seconds for which the others wait."""
+_turns = Turns("other reward functions are being tried")
+"""Each is tried in a process of its own."""
 
 
 @router.get("/submit")
@@ -163,15 +164,11 @@ def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     function is checked here, and the job's ranks try it.
     """
     tries = whole and permissions.current_identity.get().queues is None
-    if tries and not _AT_ONCE.acquire(timeout=_PATIENCE):
-        raise ClientError("other reward functions are being tried; try again in a moment", 429)
     try:
-        return from_text(text, SOURCE, whole=tries), None
+        with _turns.turn() if tries else nullcontext():
+            return from_text(text, SOURCE, whole=tries), None
     except SpecError as error:
         return None, problem_of(str(error), text)
-    finally:
-        if tries:
-            _AT_ONCE.release()
 
 
 def _text(request: Request, form: Form) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Numbers, times and attributes as the pages show them."""
+"""Numbers, times and attributes as the pages show them. What a job wrote may be anything: what is no number is shown as nothing."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from typing import Any
 
 from markupsafe import Markup
 
+from shared_store.metrics import finite
+
 _UNITS = ((86400, "d"), (3600, "h"), (60, "min"))
 _SPARK = (100.0, 24.0)
 """Width and height of a sparkline."""
 
 
-def duration(seconds: float | None) -> str:
-    """``4 s``, ``12 min``, ``3 h 5 min``, ``2 d 4 h``; empty for None."""
-    if seconds is None:
+def duration(seconds: Any) -> str:
+    """``4 s``, ``12 min``, ``3 h 5 min``, ``2 d 4 h``; empty for what is no number."""
+    known = finite(seconds)
+    if known is None:
         return ""
-    left = max(0, int(seconds))
+    left = max(0, int(known))
     if left < 60:
         return f"{left} s"
     parts: list[str] = []
@@ -47,8 +50,9 @@ def since(iso: str) -> str:
     return ago(int(datetime.fromisoformat(iso).timestamp() * 1000)) if iso else ""
 
 
-def count(value: float | None) -> str:
-    """A number in at most four digits: ``12``, ``3.46``, ``18.2 k``, ``1.07 M``; empty for None."""
+def count(given: Any) -> str:
+    """A number in at most four digits: ``12``, ``3.46``, ``18.2 k``, ``1.07 M``; empty for what is no number."""
+    value = finite(given)
     if value is None:
         return ""
     for size, unit in ((1e9, " G"), (1e6, " M"), (1e4, " k")):

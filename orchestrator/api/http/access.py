@@ -83,7 +83,9 @@ class Access:
     def sign_out(self, given: str) -> None:
         """Close a session; a restart of the server forgets that, and the session's own end does not."""
         now = time.time()
-        self._ended = {each: end for each, end in self._ended.items() if end > now}
+        for each, end in list(self._ended.items()):  # not a new dict: others close theirs meanwhile
+            if end <= now:
+                self._ended.pop(each, None)
         if self.session(given) is not None:
             self._ended[given] = now + SESSION
 

@@ -23,7 +23,7 @@ from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.model import KINDS
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
-from shared_store.metrics import sampled
+from shared_store.metrics import finite, sampled
 
 router = APIRouter()
 
@@ -148,12 +148,12 @@ def _told(reconciler: Reconciler, job: Job, main: int) -> dict[str, Any] | None:
     curve = curves.of(reconciler.store.run(job.run), job)
     live = reconciler.bus.progress(job.id, job.attempts[-1].number, main) or {}
     last = curve[-1] if curve else {}
-    iteration = max(live.get("iteration") or 0, last.get("iteration") or 0)
+    iteration = int(max(finite(live.get("iteration")) or 0, finite(last.get("iteration")) or 0))
     if not iteration:
         return None
-    rate = live.get("steps_per_second") or last.get("steps_per_second")
-    rewards = [each["reward"] for each in curve if isinstance(each.get("reward"), int | float)]
-    return {"iteration": iteration, "stepsPerSecond": rate, "reward": last.get("reward"), "rewards": rewards}
+    rate = finite(live.get("steps_per_second")) or finite(last.get("steps_per_second"))
+    rewards = [reward for each in curve if (reward := finite(each.get("reward"))) is not None]
+    return {"iteration": iteration, "stepsPerSecond": rate, "reward": finite(last.get("reward")), "rewards": rewards}
 
 
 class Curves:

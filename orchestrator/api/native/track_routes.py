@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,13 +13,13 @@ from orchestrator.api import permissions
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
+from orchestrator.api.turns import Turns
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.spec.tracks import ask
 
 router = APIRouter()
-_AT_ONCE, _PATIENCE = threading.BoundedSemaphore(2), 20.0
-"""Processes that answer at once, and seconds for which the others wait."""
+_turns = Turns("other tracks are being drawn")
 
 
 @router.get("/tracks")
@@ -47,13 +46,10 @@ def picture(reconciler: Reconciler, name: str) -> bytes:
 
 
 def _ask(reconciler: Reconciler, order: Mapping[str, Any]) -> Any:
-    if not _AT_ONCE.acquire(timeout=_PATIENCE):
-        raise ClientError("other tracks are being drawn; try again in a moment", 429)
     try:
-        return ask({**order, "store": str(reconciler.store.path)})
+        with _turns.turn():
+            return ask({**order, "store": str(reconciler.store.path)})
     except UsageError as error:
         raise ClientError(str(error), 404) from None
     except ServerError as error:
         raise ClientError(str(error), 503) from None
-    finally:
-        _AT_ONCE.release()

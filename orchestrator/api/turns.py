@@ -1,0 +1,36 @@
+"""Requests that take turns: their work is a process on the server's machine, and who waits for it holds a thread that others need."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from orchestrator.api.errors import ClientError
+
+
+class Turns:
+    """At most ``at_once`` work at a time, and at most ``waiting`` others wait, for ``patience`` seconds each. Any thread may call."""
+
+    def __init__(self, what: str, at_once: int = 2, waiting: int = 6, patience: float = 20.0) -> None:
+        """``what``: what is done now, for those who are refused."""
+        self._what, self._patience = what, patience
+        self._there, self._working = threading.Semaphore(at_once + waiting), threading.Semaphore(at_once)
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Raises ClientError (429) where too many wait already, or it takes too long."""
+        if not self._there.acquire(blocking=False):
+            raise self._refusal()
+        try:
+            if not self._working.acquire(timeout=self._patience):
+                raise self._refusal()
+            try:
+                yield
+            finally:
+                self._working.release()
+        finally:
+            self._there.release()
+
+    def _refusal(self) -> ClientError:
+        return ClientError(f"{self._what}; try again in a moment", 429)
