@@ -9,7 +9,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,20 @@ def call_muster(*arguments: str, home: Path, **env: str) -> subprocess.Completed
         except SystemExit as ended:
             code = ended.code
     return subprocess.CompletedProcess(arguments, int(code or 0), said.getvalue(), errors.getvalue())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Write out half characters in what a test logged: the processes of a parallel run can't send them to one another."""
+    report = yield
+    report.sections = [(name, _written_out(text)) for name, text in report.sections]
+    if _written_out(report.longreprtext) != report.longreprtext:
+        report.longrepr = _written_out(report.longreprtext)
+    return report
+
+
+def _written_out(text: str) -> str:
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
