@@ -130,7 +130,7 @@ def test_a_reason_that_no_column_can_hold_is_written_out(bench: Bench) -> None:
     bench.runs_and_ends("good")
 
 
-@pytest.mark.parametrize("part", ["begin", "advance"])
+@pytest.mark.parametrize("part", ["begin", "advance", "preempt"])
 @pytest.mark.parametrize("words", ["no words for it", HALF], ids=["plain", "half a character"])
 def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: str, words: str
@@ -144,7 +144,10 @@ def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
         whole(attempts, session, found, *more)
 
     monkeypatch.setattr(Attempts, part, poisoned)
-    bench.submit("bad", node_properties=properties(5))
+    bench.submit("bad", node_properties=properties(5, MUSTER_PREEMPTIBLE="1"))
+    if part == "preempt":
+        bench.wait("bad", Status.RUNNING)
+        bench.submit("urgent", node_properties=properties(8), queue="urgent")
     shown = words.replace("\udcff", "\\udcff")
     bench.explains("bad", f"the controller failed on this job (RuntimeError: {shown}); trying again")
     bench.runs_and_ends("good-0", "good-1")
@@ -155,7 +158,7 @@ def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
     tracebacks = [record.getMessage() for record in caplog.records if record.exc_info]
     assert tracebacks == [f"job bad: the controller failed on this job (RuntimeError: {shown}); trying again"]
     monkeypatch.undo()
-    bench.wait("bad", Status.RUNNING)
+    bench.wait("urgent" if part == "preempt" else "bad", Status.RUNNING)
 
 
 @pytest.mark.parametrize("damaged", [{}, {"numNodes": 1}, {"numNodes": "x", "mainNode": 0}], ids=str)
