@@ -319,10 +319,11 @@ class Reconciler:
 
     def reason(self, job: Job) -> str | None:
         """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
-        shortage = self.disk.shortage()
-        if job.status in (Status.STARTING, Status.RUNNING) and shortage is not None:
-            return f"{job.status_reason}; {shortage}"
-        report = self._report
+        shortage, report = self.disk.shortage(), self._report
+        if job.status in (Status.STARTING, Status.RUNNING):
+            failed = self._backoff.said(("preempt", job.id)) if report and report.preempts(job.id) else None
+            said = failed.removeprefix(f"job {job.id}: ") if failed else job.status_reason
+            return f"{said}; {shortage}" if shortage is not None else failed and said
         if job.status != Status.RUNNABLE or self.work_queue.since(job.id) is None:
             return None
         if shortage is not None or report is None:

@@ -76,6 +76,10 @@ class WaitReport:
             self._orders[queue] = tuple(job.job for job in queue_order.jobs) if queue_order else ()
         return self._orders[queue]
 
+    def preempts(self, job: str) -> bool:
+        """Whether the pass has decided to preempt this job."""
+        return job in self._preempted
+
     def reason(self, job: str) -> str:
         """The ``statusReason`` of a job that waits. Raises KeyError for one that starts, is cancelled or was not waiting."""
         queue, position = self._positions[job]

@@ -154,8 +154,13 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
     try:
         assert client.type_hash == MESSAGES.type_hash(RESET)
         with open_session(running.endpoint, None) as session:
-            keys = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**", timeout=5)]
-        ours, theirs = (next(key for key in keys if f"/{kind}/%/%/" in key) for kind in ("SS", "SC"))
+
+            def announced() -> list[str]:
+                keys = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**", timeout=5)]
+                found = [key for kind in ("SS", "SC") for key in keys if f"/{kind}/%/%/" in key]
+                return found if len(found) == 2 else []
+
+            ours, theirs = wait_for(announced, 20, "the tokens of the server and of the client")
         assert ours.split("/")[-4:] == theirs.split("/")[-4:], (
             "name, type, hash and quality of service are written alike"
         )

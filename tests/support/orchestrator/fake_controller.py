@@ -64,7 +64,13 @@ class FakeController(Generic[E]):
         return found
 
     def explains(self, name: str, said: str) -> None:
-        wait_for(lambda: said in (self.job(name).status_reason or ""), 30, f"{name} says {said!r}")
+        """Wait until a job's reason, as every answer shows it, has these words."""
+
+        def reason() -> str:
+            found = self.job(name)
+            return self.reconciler.reason(found) or found.status_reason or ""
+
+        wait_for(lambda: said in reason(), 30, f"{name} says {said!r}")
 
     def runs_and_ends(self, *names: str) -> None:
         """Submit jobs, and have them end well once they run."""
