@@ -46,6 +46,7 @@ PAGES = (
     "job",
     "job_log",
     "job_actions",
+    "job_view",
     "run_files",
     "curves",
     "queues",

@@ -20,6 +20,7 @@ from orchestrator.console.curves import columns
 from orchestrator.console.job_config import before_it, differences, text_of
 from orchestrator.console.job_facts import attempts_of, checkpoints_of, facts_of
 from orchestrator.console.job_log import ChosenLog, LiveLog
+from orchestrator.console.job_view import is_near, views
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
@@ -53,9 +54,13 @@ def job(request: Request, reference: str) -> Response:
     is_visible = detail["results"] is not None
     files = _files(reconciler, detail["run"]) if is_visible else []
     rows = _rows(reconciler, detail)
+    view = views.state(detail["id"])
     return render(
         request,
         "job.html",
+        frame=view.url,
+        view=view,
+        is_near=is_near(request),
         job=detail,
         short=short_id(detail["id"]),
         facts=facts_of(detail),
@@ -93,7 +98,8 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 def _look(request: Request, job_id: str) -> dict[str, Any]:
     """The parts of the page that change; shared by all who look at it."""
     detail = job_detail(request, job_id)
-    return {"facts": facts_of(detail), **_rows(reconciler_of(request), detail)}
+    facts = {**facts_of(detail), "view": views.state(job_id, is_seen=True).text}
+    return {"facts": facts, **_rows(reconciler_of(request), detail)}
 
 
 def _rows(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:

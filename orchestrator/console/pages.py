@@ -70,8 +70,11 @@ templates.filters |= {
 }
 
 
-def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
-    """A page of ``templates/``, with what all pages show: who is looking, the navigation, the theme, the form's token."""
+def render(request: Request, template: str, status: int = 200, frame: str = "", **values: Any) -> HTMLResponse:
+    """A page of ``templates/``, with the parts that all pages show: who is looking, the navigation, the theme, the form's token.
+
+    ``frame``: the one other origin whose page it shows in a frame.
+    """
     theme = request.cookies.get(THEME)
     shared: dict[str, Any] = {
         "identity": current_identity.get(),
@@ -83,7 +86,10 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
         "has_session": bool(session(request)),
     }
     text = templates.get_template(template).render(shared | values)
-    return HTMLResponse(text, status, dict(_HEADERS))
+    headers = dict(_HEADERS)
+    if frame:
+        headers["Content-Security-Policy"] = POLICY.replace("frame-src 'self'", f"frame-src 'self' {frame}")
+    return HTMLResponse(text, status, headers)
 
 
 def may_change() -> bool:

@@ -19,6 +19,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from pathlib import Path
@@ -60,6 +61,7 @@ class Page:
         port: Of the page; None: 9090, or a free one.
         memory: What Rerun's server may keep for pages that are opened later, such as ``"256MB"``; then the oldest goes.
         file: An .rrd file to be served as it is.
+        framed_by: Origins whose pages may show this one in a frame, such as ``"http://127.0.0.1:8080"``.
 
     Attributes:
         url: Of the page, for people.
@@ -69,7 +71,7 @@ class Page:
         UserError: Rerun is missing or does not start, or the port is taken.
     """
 
-    def __init__(self, port: int | None, memory: str, file: Path | None = None) -> None:
+    def __init__(self, port: int | None, memory: str, file: Path | None = None, framed_by: Sequence[str] = ()) -> None:
         program = need_rerun()
         self._http = _listen(port)
         self._home = Path(tempfile.mkdtemp(prefix="muster-view-"))
@@ -94,7 +96,10 @@ class Page:
             stderr=self._log,
         )
         self._http.__dict__.update(
-            assets=f"http://{own}:{assets}", stream=f"http://{own}:{stream}", query=self._query()
+            assets=f"http://{own}:{assets}",
+            stream=f"http://{own}:{stream}",
+            query=self._query(),
+            frames=" ".join(["'self'", *framed_by]),
         )
         try:
             self._wait(own, stream, assets)
@@ -220,7 +225,7 @@ class _Handler(BaseHTTPRequestHandler):
             "default-src": "'self' 'unsafe-inline' blob: data:",
             "script-src": "'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
             "connect-src": f"'self' {stream} blob: data:",
-            "frame-ancestors": "'self'",
+            "frame-ancestors": self.server.__dict__["frames"],
         }
         self.send_response(200)
         self.send_header("Content-Type", kind)

@@ -305,7 +305,7 @@ def _line(line: LogLine) -> tuple[int, str, str]:
 
 def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | None], Page]:
     def start(file: Path | None) -> Page:
-        page = Page(given.port, given.memory, file)
+        page = Page(given.port, given.memory, file, given.framed_by)
         activity.end()
         print(f"the view is at {page.url}", flush=True)
         if given.browser:
@@ -328,6 +328,7 @@ def main() -> int:
     parser.add_argument("--port", type=int)
     parser.add_argument("--memory", default="256MB")
     parser.add_argument("--browser", action="store_true")
+    parser.add_argument("--framed-by", action="append", default=[])
     given = parser.parse_args()
     stop: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):

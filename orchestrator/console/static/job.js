@@ -19,6 +19,8 @@ function follow() {
   stream = subscribe(url.pathname + url.search, {
     facts: (data) => {
       if (data.run && !page.dataset.curves) location.reload(); // it has started: now there is more to see
+      const view = page.querySelector("[data-view]");
+      if (view && "view" in data && data.view !== view.dataset.view) location.reload(); // a frame needs a policy of its own
       page.querySelectorAll("[data-facts]").forEach((place) => fill(place, data));
     },
     attempts: (data) => renewed("[data-attempts]", data),

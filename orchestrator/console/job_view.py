@@ -1,0 +1,159 @@
+"""The live view of a training inside the page of its job: `muster view` on the server's machine, in a frame.
+
+The viewer has an origin of its own on loopback, since Rerun's page needs inline scripts, which the console's policy forbids. A browser
+on another machine does not reach it; its page says so and names the command.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from urllib.parse import urlsplit
+
+from fastapi import Request, Response
+
+from orchestrator.api.checkpoints import CONFLICT
+from orchestrator.api.context import permitted_run, reconciler_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http.auth import is_loopback
+from orchestrator.api.native.routes import job_detail
+from orchestrator.api.permissions import Operation
+from orchestrator.console.forms import done
+from orchestrator.console.routing import page_router
+from shared_store.tied import start_tied
+
+router = page_router()
+
+_MOST = 2
+"""Views at once on a server: each takes a share of a processor and some 0.8 GB of memory."""
+_UNSEEN = 300.0
+"""Time after which a view ends whose job nobody looks at [s]."""
+_AT = "the view is at "
+"""The words of `muster view` before its address."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Of one job's view: of all fields at most one is filled."""
+
+    is_starting: bool = False
+    url: str = ""
+    problem: str = ""
+    """The reason for which the last view ended."""
+
+    @property
+    def text(self) -> str:
+        """A different text for each state."""
+        return "starting" if self.is_starting else self.url or self.problem
+
+
+@dataclass
+class _View:
+    job: str
+    command: list[str]
+    state: State = field(default_factory=lambda: State(is_starting=True))
+    seen: float = field(default_factory=time.monotonic)
+    process: subprocess.Popen[bytes] | None = None
+    is_wanted: bool = True
+
+    def run(self) -> None:
+        """Run the viewer until it ends; it dies with this thread, however the server ends."""
+        said: deque[str] = deque(maxlen=5)
+        self.process = process = start_tied(
+            self.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        if not self.is_wanted:
+            process.terminate()
+        threading.Thread(target=self._watch, args=[process], name=f"view {self.job}", daemon=True).start()
+        assert process.stdout is not None
+        for raw in process.stdout:
+            line = raw.decode(errors="replace").strip()
+            if line.startswith(_AT):
+                self.state = State(url=line.removeprefix(_AT))
+            elif line:
+                said.append(line)
+        code = process.wait()
+        last = said[-1].removeprefix("muster: ") if said else f"exit code {code}"
+        self.state = State(problem=last[:500] if self.is_wanted and code else "")
+
+    def _watch(self, process: subprocess.Popen[bytes]) -> None:
+        while process.poll() is None:
+            if time.monotonic() - self.seen > _UNSEEN:
+                self.end()
+            time.sleep(1.0)
+
+    def end(self) -> None:
+        self.is_wanted = False
+        if self.process is not None:
+            self.process.terminate()
+
+
+class Views:
+    """The views of a server's jobs. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._views: dict[str, _View] = {}
+
+    def state(self, job: str, *, is_seen: bool = False) -> State:
+        """Of the job's view; ``is_seen``: somebody looks at its page."""
+        view = self._views.get(job)
+        if view is None:
+            return State()
+        if is_seen:
+            view.seen = time.monotonic()
+        return view.state
+
+    def start(self, job: str, command: list[str]) -> None:
+        """Start the view of a job that has none. Raises ClientError where too many are open."""
+        with self._lock:
+            running = [name for name, view in self._views.items() if view.state.is_starting or view.state.url]
+            if job in running:
+                return
+            if len(running) >= _MOST:
+                raise ClientError(f"{_MOST} live views are open on this server; close one first", CONFLICT)
+            self._views = {name: self._views[name] for name in running}
+            view = self._views[job] = _View(job, command)
+        threading.Thread(target=view.run, name=f"viewer {job}", daemon=True).start()
+
+    def end(self, job: str) -> None:
+        """Close the job's view, where it has one."""
+        if (view := self._views.get(job)) is not None:
+            view.end()
+
+
+views = Views()
+
+
+@router.post("/jobs/{reference}/view")
+def show(request: Request, reference: str) -> Response:
+    """Start the live view of a training that runs on this machine."""
+    detail = job_detail(request, reference)
+    if not is_near(request):
+        raise ClientError("the live view is reached from the server's machine alone; open the console there", CONFLICT)
+    if detail["kind"] != "train" or detail["status"] != "RUNNING":
+        raise ClientError(f"job {detail['name']} is no training that runs; its checkpoints can be recorded", CONFLICT)
+    if find_spec("newton") is None:
+        raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
+    run = permitted_run(reconciler_of(request), detail["run"], Operation.READ_RUN)
+    command = [sys.executable, "-P", "-m", "worker.telemetry.view", "--training", str(run.path), "--job", detail["id"]]
+    views.start(detail["id"], [*command, "--port", "0", "--framed-by", f"http://{request.headers['host']}"])
+    return done(request, f"/jobs/{detail['id']}", "the live view starts")
+
+
+@router.post("/jobs/{reference}/view/close")
+def close(request: Request, reference: str) -> Response:
+    """Close the live view of a job."""
+    detail = job_detail(request, reference)
+    views.end(detail["id"])
+    return done(request, f"/jobs/{detail['id']}", "the live view is closed")
+
+
+def is_near(request: Request) -> bool:
+    """Whether the browser names this machine as its own, so that it reaches other ports of loopback too."""
+    return is_loopback(urlsplit(f"//{request.headers.get('host', '')}").hostname or "")
