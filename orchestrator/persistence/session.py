@@ -61,7 +61,7 @@ class Database:
         self._lock: Connection | None = None
         self._file_lock: IO[bytes] | None = None
         self._damage: str | None = None
-        """What was said when a damaged page was first met."""
+        """Message about the first damaged page that was met; None before."""
         self._file: Path | None = None
         self._identity: tuple[int, int] | None = None
         """Device and inode of the file, once it is open."""
