@@ -135,7 +135,7 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     )
 
 
-def test_what_aws_is_sent_is_the_request_of_the_plan(bench: AwsBench) -> None:
+def test_aws_gets_the_request_of_the_plan(bench: AwsBench) -> None:
     sent: dict[str, dict[str, Any]] = {}
     for client, name in ((bench.engine._batch, "RegisterJobDefinition"), (bench.engine._submitting, "SubmitJob")):
         client.meta.events.register(
@@ -162,7 +162,7 @@ def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: AwsBench) -> No
         bench.engine.plan(bench.gang(nodes=6, commands=many))
 
 
-def test_what_was_submitted_by_a_controller_that_died_is_found(bench: AwsBench) -> None:
+def test_a_job_that_a_dead_controller_submitted_is_found(bench: AwsBench) -> None:
     gang = bench.gang()
     handle = bench.launch(gang)
     successor = AwsBatchEngine(bench.home)
@@ -203,7 +203,7 @@ def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_d
     assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
 
 
-def test_where_a_child_s_death_is_ignored_it_is(bench: AwsBench) -> None:
+def test_a_gang_that_ignores_a_child_s_death_continues(bench: AwsBench) -> None:
     script = f"[ $NODE_RANK = 1 ] && exit 3; {LAST}; sleep 1; echo done without it"
     handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
     assert bench.ended(handle)[0].exit_code == 0
@@ -323,7 +323,7 @@ def test_a_store_that_is_mounted_from_the_volume_is_the_volume(path: str, volume
     assert is_mounted_from(Path(path), volume, MOUNTS) is found
 
 
-def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
+def test_a_missing_configuration_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"aws\.json is missing: .*muster aws up"):
         AwsBatchEngine(tmp_path)
 
@@ -347,7 +347,7 @@ def test_a_damaged_configuration_is_refused_in_one_line(tmp_path: Path, text: st
     assert str(refused.value) == f"{tmp_path / 'aws.json'}: {message}"
 
 
-def test_what_is_wrong_from_the_start_is_said_at_the_start(aws: Serving, tmp_path: Path) -> None:
+def test_an_unusable_endpoint_queue_or_key_is_reported_at_the_start(aws: Serving, tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"127\.0\.0\.1:9\) does not answer: .*endpoint_url in aws\.json"):
         AwsBench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
     with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):
