@@ -59,7 +59,7 @@ class Key(_Document):
 
     @property
     def rights(self) -> str:
-        """What it may do, in words."""
+        """Its permissions, in words."""
         queues = "all queues" if self.queues is None else f"queues {', '.join(self.queues)}"
         return f"{queues}, {'read only' if self.read_only else 'read and write'}"
 

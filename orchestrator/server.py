@@ -50,7 +50,7 @@ _FEWEST_CHARACTERS = 6
 _CLIENT = re.compile(r"(MSTR[A-Z2-7]{16}):")
 _INVALID = Seldom("Invalid HTTP request received")
 _NO_DESCRIPTOR = Seldom("socket.accept() out of system resource")
-"""What any client can have uvicorn and asyncio log at any rate."""
+"""Log lines of uvicorn and asyncio that any client can cause at any rate."""
 
 
 class Server:
@@ -171,7 +171,7 @@ class Server:
         self._lock.publish(self.url)
 
     def close(self) -> None:
-        """Stop serving; running gangs go on, and the next controller of this home finds them."""
+        """Stop serving; running gangs continue, and the next controller of this home finds them."""
         self.app.state.closing.set()
         self._uvicorn.should_exit = True
         if self._thread.is_alive():

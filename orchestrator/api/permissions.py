@@ -55,7 +55,7 @@ class Refusal(ClientError):
 
 @dataclass(frozen=True)
 class Identity:
-    """Who sends a request. ``queues``: names of those that it may use; None means all."""
+    """The sender of a request. ``queues``: names of the queues that it may use; None means all."""
 
     name: str
     queues: frozenset[str] | None = None

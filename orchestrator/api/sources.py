@@ -40,7 +40,7 @@ class Source:
 
 
 def sources_of(gang: GangSpec) -> list[Source]:
-    """What a job reads; each node reads the spec of its own environment. Raises ClientError."""
+    """The sources that a job reads; each node reads the spec of its own environment. Raises ClientError."""
     nodes = {id(node): node for node in gang.nodes}
     return sorted({source for node in nodes.values() for source in _sources(node)})
 

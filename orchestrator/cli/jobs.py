@@ -331,11 +331,11 @@ def stop(
     if lost := lost_iterations(detail):
         echo(lost)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
-        echo(f"go on with: muster resume {detail['run']}")
+        echo(f"continue with: muster resume {detail['run']}")
 
 
 def slow_iteration(detail: Mapping[str, Any]) -> str:
-    """What may become of the present iteration of a training whose iterations last long; empty for others."""
+    """A warning about the present iteration of a training whose iterations last long; empty for others."""
     seconds = (detail["progress"] or {}).get("iteration_seconds") or 0.0
     if detail["kind"] != "train" or detail["status"] != "RUNNING" or seconds < _PATIENCE:
         return ""

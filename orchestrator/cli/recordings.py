@@ -169,7 +169,7 @@ def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
 
 
 def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
-    """What the job has of the one that trained: its queue, image and environment; a CPU is enough."""
+    """The parts of a job's spec that come from the training: queue, image and environment; a CPU is enough."""
     spec = run.get("spec") or {}
     kept = {key: spec[key] for key in ("queue", "share", "image", "environment") if spec.get(key)}
     memory = (spec.get("resources") or {}).get("memory", 2048)

@@ -1,4 +1,4 @@
-"""What a person does with a job and with a checkpoint of its run: what the commands do, through the same functions of the API."""
+"""Actions on a job and on a checkpoint of its run: those of the commands, through the same functions of the API."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def export(request: Request, reference: str, form: Form = Depends(sent_form)) ->
 
 @router.post("/jobs/{reference}/record")
 def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
-    """Submit a job that records what a checkpoint's policy does."""
+    """Submit a job that records a checkpoint's policy at work."""
     return _beside(request, reference, form, "record")
 
 
@@ -157,7 +157,7 @@ def _trained(request: Request, run: Run) -> Mapping[str, Any]:
 
 
 def _checkpoint(form: Form) -> _Wanted:
-    """The checkpoint that was marked; None: the newest. Raises ClientError."""
+    """The marked checkpoint: an iteration, ``best``, or None for the newest. Raises ClientError."""
     given = form.one("checkpoint")
     if given in ("", "latest"):
         return None

@@ -1,4 +1,4 @@
-"""How a node ended: by its outcome in the store, else as its engine saw it."""
+"""The end of a node: by its outcome in the store, else as its engine saw it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KILLED = 137
 
 
 def node_end(run: Run, record: Node, node: NodeStatus, is_native: bool, moment: int) -> tuple[NodeEnd, int]:
-    """How and when (Unix time [ms]) a node ended. Raises OSError.
+    """The end of a node, and its time (Unix time [ms]). Raises OSError.
 
     Args:
         run: Of its job.

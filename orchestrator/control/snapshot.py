@@ -1,4 +1,4 @@
-"""From the database to a scheduling pass's snapshot, and what is known of the queues after the pass."""
+"""The snapshot of a scheduling pass, read from the database, and the facts about queues after the pass."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def take_snapshot(
     leading: Mapping[str, Leading] | None = None,
     first: str = "local",
 ) -> Snapshot:
-    """Everything that the pass depends on, as it is now.
+    """Read everything that the pass depends on.
 
     Args:
         session: The session.
@@ -95,7 +95,7 @@ def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Atte
 
 
 def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:
-    """What the queue would have for a gang if nothing ran; ``patience``: seconds to wait for the engines' newest hosts."""
+    """Where a gang would start in the queue if nothing else ran, or why it never could; ``patience``: seconds to wait for the engines' newest hosts."""
     first = engine.names[0]
     rows = [
         row for name in queue.compute_environments if (row := session.get(models.ComputeEnvironment, name)) is not None

@@ -21,7 +21,7 @@ class Fit:
     """The answer of an idle queue to a gang."""
 
     allocation: Allocation | None
-    """Where it would start; None if the hosts known now don't suffice."""
+    """Hosts on which it would start; None if the hosts known now don't suffice."""
     problem: str | None
     """Why it could never start; None if it could, perhaps on hosts that are added later."""
 

@@ -19,7 +19,7 @@ from orchestrator.scheduling.snapshot import Waiting
 
 NO_COMPUTE_ENVIRONMENT = "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
 _NAMED = 3
-"""How many jobs a reason names."""
+"""Greatest number of jobs that a reason names."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class Reservation:
     hosts: frozenset[str]
     """Those hosts, and all on the same machines."""
     allocation: Allocation
-    """Where it could start at ``window.at``, with its smallest number of nodes."""
+    """Hosts on which it could start at ``window.at``, with its smallest number of nodes."""
     window: BackfillWindow
     awaits: tuple[Holder, ...]
     """The gangs that occupy it, in the order of their ends."""
@@ -178,7 +178,7 @@ def _fits_after(gangs: Sequence[Running], shape: Shape, ces: tuple[str, ...], fr
 def _fewest(
     shape: Shape, ces: tuple[str, ...], free: FreeResources, ends: Sequence[tuple[str, tuple[Placement, ...]]]
 ) -> int:
-    """How many of the gangs (compute environment and placements, in the order in which they end) have to end until the shape fits.
+    """Number of gangs (compute environment and placements, in the order in which they end) that have to end until the shape fits.
 
     By bisection; all of them where the shape fits at no time before.
     """

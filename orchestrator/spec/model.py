@@ -77,7 +77,7 @@ class _Train(Section):
 
     @property
     def section(self) -> str:
-        """Where the algorithm's settings belong."""
+        """Name of the section that holds the algorithm's settings."""
         return self.algorithm if self.algorithm in ALGORITHMS else "settings"
 
     @model_serializer(mode="wrap")
@@ -377,9 +377,9 @@ def _of_another_algorithm(train: _Train) -> _Problem | None:
 
 
 def _problem_of(train: _Train) -> _Problem | None:
-    """What the rank would refuse of the task's configuration or of the algorithm's settings.
+    """A value of the task's configuration or of the algorithm's settings that the rank would refuse, and why; None where there is none.
 
-    A task that is not installed says it on its rank: what it sets of the algorithm is not known here.
+    The settings of a task that is not installed here are checked by its rank.
     """
     kind = task_config(train.task)
     if kind is None:

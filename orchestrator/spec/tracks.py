@@ -13,7 +13,7 @@ from orchestrator.domain.errors import ServerError, UsageError
 
 
 def ask(order: Mapping[str, Any]) -> Any:
-    """What :mod:`worker.racer` answers to an order.
+    """Give an order to :mod:`worker.racer`, and return its answer.
 
     Args:
         order: ``action``, ``store`` (its path), ``output`` (a path, or None), and what the action takes.

@@ -147,7 +147,7 @@ class Guard:
         )
 
     def _of_session(self, request: _Request) -> Identity | None:
-        """Who is logged in to the console, where that counts and nothing else is presented."""
+        """The identity of the console's session, where a session counts and nothing else is presented."""
         if "authorization" in request.headers or not (request.method in ("GET", "HEAD") or request.is_of_console):
             return None
         return self.access.session(session_of(request.first_of_each(), request.port))

@@ -54,7 +54,7 @@ class LiveTail:
         self._read: dict[str, int] = {}
         """Bytes of each stream that were looked through."""
         self._begun: dict[str, int] = {}
-        """How often each stream had begun when it was looked at last."""
+        """Each stream's number of beginnings when it was looked at last."""
         self._open: dict[str, LogFile] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""

@@ -80,7 +80,7 @@ class AutomaticEvaluations:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop looking; what was submitted goes on."""
+        """Stop looking; submitted evaluations continue."""
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(timeout=10)

@@ -129,7 +129,7 @@ def _check_submission(reconciler: Reconciler, spec: Spec, changes: Changes, name
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:
-    """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
+    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another run."""
     job = answered(context, name)
     if job is None:
         return None

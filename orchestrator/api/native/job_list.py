@@ -98,7 +98,7 @@ def ids_of(session: Session, wanted: Wanted) -> list[str]:
 
 
 def kind_of(spec: Mapping[str, Any] | None) -> str:
-    """What a job does, by its spec: one of :data:`orchestrator.spec.model.KINDS`."""
+    """The kind of a job, by its spec: one of :data:`orchestrator.spec.model.KINDS`, or ``command``."""
     return next((kind for kind in KINDS if (spec or {}).get(kind)), "command")
 
 
@@ -142,7 +142,7 @@ def _row(reconciler: Reconciler, job: Job, is_visible: bool) -> dict[str, Any]:
 
 
 def _told(reconciler: Reconciler, job: Job, main: int) -> dict[str, Any] | None:
-    """How far a training is: what its main node said last, and its curve; None before its first iteration."""
+    """Progress of a training: the last report of its main node, and its curve; None before its first iteration."""
     if not job.attempts:
         return None
     curve = curves.of(reconciler.store.run(job.run), job)

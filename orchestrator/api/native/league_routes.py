@@ -58,7 +58,7 @@ class CreateRequest(_Strict):
     track: list[str] = Field(min_length=1, max_length=64, description="a preset, random:SEED, or a track of the store")
     laps: int = Field(default=3, ge=1, le=100)
     ranking: Ranking = "total"
-    continuous: bool = Field(default=False, description="a car that leaves the road is put back and goes on")
+    continuous: bool = Field(default=False, description="a car that leaves the road is put back and continues")
     off_track_penalty: _Seconds = 1.0
     crash_penalty: _Seconds = 1.0
     max_resets: int = Field(default=100, ge=0, le=10_000, description="in one lap")
@@ -87,7 +87,7 @@ class EnterRequest(RaceRequest):
 
 
 class RerunRequest(_Strict):
-    """Where an entry is raced once more."""
+    """The request for another race of an entry."""
 
     directory: str = Field(default="", description="working directory of the job")
 
@@ -305,7 +305,7 @@ def _caller() -> str:
 
 
 def _racer(body: RaceRequest) -> str:
-    """Who races: the caller, unless it says another name. Raises ClientError."""
+    """Name of the racer: the caller's, unless the request gives another. Raises ClientError."""
     if body.racer is None:
         return _caller().removeprefix("key ").removeprefix("user ")
     if not _RACER.fullmatch(body.racer):

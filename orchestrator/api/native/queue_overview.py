@@ -155,7 +155,7 @@ def _amounts(attempts: Iterable[Attempt]) -> dict[str, float]:
 
 
 def _taken(held: Held) -> dict[str, Resources]:
-    """What the nodes of all gangs hold, by host."""
+    """The resources that the nodes of all gangs hold, by host."""
     found: dict[str, Resources] = defaultdict(Resources)
     for _, attempt in held:
         for each in placements_of(attempt):
