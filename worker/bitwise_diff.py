@@ -34,7 +34,7 @@ class Difference(Exception):
 
 
 def compare(first: Run, second: Run) -> str:
-    """What is equal. Raises Difference where something is not, UserError where a run has nothing to compare."""
+    """A description of the equal parts. Raises Difference where any part differs, UserError where a run has nothing to compare."""
     one, two = _newest(first), _newest(second)
     if one.iteration != two.iteration:
         raise Difference(f"checkpoints: {one.name} of {first.name}, {two.name} of {second.name}: other iterations")

@@ -25,7 +25,7 @@ from shared_store.files import read_json, sync_file, write_json
 from shared_store.layout import Run
 
 GATHER_SECONDS = 120.0
-"""How long the main rank's writer waits for the files of the other ranks [s]."""
+"""Time that the main rank's writer waits for the files of the other ranks [s]."""
 _POLL = 0.02
 """Seconds between two looks at what the main rank's writer waits for."""
 _CHUNK = 1 << 20
@@ -126,7 +126,7 @@ def _write(path: Path, memory: int, start: int, size: int) -> dict[str, Any]:
 
 
 def _gather(directory: Path, rank: int, iteration: int, orders: Orders) -> dict[str, Any]:
-    """What rank ``rank`` wrote. Raises Abandoned where it does not come."""
+    """The file of rank ``rank``. Raises Abandoned where it does not come."""
     deadline = time.monotonic() + GATHER_SECONDS
     name = f".rank-{rank}.json"
     while name not in os.listdir(directory):  # a listing, because NFS remembers that a name was not there

@@ -26,16 +26,16 @@ from worker.deferred import defer_compiler
 from worker.errors import GangError
 
 REPORT_SECONDS = 60.0
-"""How long the ranks of a gang may take to report, from the first to the last [s]."""
+"""Longest time between the first and the last report of a gang's ranks [s]."""
 COLLECTIVE_SECONDS = 600.0
 """After how long without an answer a collective fails [s]; a peer that *died* is noticed at once, by its closed connection."""
 BUILD_SECONDS = 1800.0
-"""How long one rank may compile kernels while others wait for its cache [s]."""
+"""Longest time that one rank may compile kernels while others wait for its cache [s]."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where this process stands in its gang (torchrun's variables)."""
+    """This process's place in its gang (torchrun's variables)."""
 
     rank: int = 0
     local_rank: int = 0

@@ -105,7 +105,7 @@ def main(kind: str = "evaluate") -> int:
 
 
 def _race_changes(job: Job, task_type: type[Task], ranks: int) -> dict[str, Any]:
-    """What the race changes of the training's configuration. Raises UserError for a task that drives no laps, and for several ranks."""
+    """The race's changes to the training's configuration. Raises UserError for a task without laps, and for several ranks."""
     if not task_type.config_type.races:
         raise UserError(f"race: run {job.section.get('run')} trained {task_type.__name__}, {NO_RACER}")
     if ranks > 1:

@@ -157,7 +157,7 @@ def _results(run: Run) -> tuple[dict[str, float], list[Path]]:
 
 
 def tracked_of(run: Run, train: Mapping[str, Any], facts: Mapping[str, Any]) -> Tracked:
-    """What a service learns of the run: the training's settings, ``facts``, the git commit of the working directory, versions."""
+    """The configuration that a service receives: settings, ``facts``, the working directory's git commit, versions."""
     versions = {}
     for name in _PACKAGES:
         with contextlib.suppress(PackageNotFoundError):

@@ -83,7 +83,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Target:
-    """What a choice asks of one joint: the value of a command of this kind [unit]."""
+    """The value of one joint's command for a choice [unit]."""
 
     joint: str
     kind: str
@@ -113,7 +113,7 @@ class Action:
 
 @dataclass(frozen=True)
 class Command:
-    """What the operator asks for."""
+    """The operator's command."""
 
     name: str
     names: tuple[str, ...]

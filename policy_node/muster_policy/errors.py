@@ -1,4 +1,4 @@
-"""What ends the node in one line, and the nearest of several names."""
+"""Errors that end the node in one line, and the nearest of several names."""
 
 from __future__ import annotations
 

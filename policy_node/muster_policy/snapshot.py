@@ -68,7 +68,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a quantity is measured.
+    """The place where a quantity is measured.
 
     Attributes:
         arm: Of the frame's origin, from the root's [m], shape ``(3,)``.
@@ -103,7 +103,7 @@ def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def place_of(frame: Frame | None, unit: Frame | None) -> Place:
-    """Where a quantity is measured.
+    """The place where a quantity is measured.
 
     Args:
         frame: Of the quantity, on the root's body; None: the root's own.

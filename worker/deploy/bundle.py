@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 COPIED = ("iteration", "reward", "score", "score_error", "score_episodes", "env_steps", "algorithm")
-"""What a bundle's manifest repeats of its checkpoint's."""
+"""Keys that a bundle's manifest repeats from its checkpoint's."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Files:
     parity: bytes
     """``parity.npz``."""
     report: dict[str, Any]
-    """How they were compared."""
+    """Method and result of the comparison."""
 
 
 def bundle_files(

@@ -22,7 +22,7 @@ RECORDED_WORLDS, RECORDED_STEPS = 4, 256
 LARGEST = 128 << 20
 """Bytes of a recording; of large images it has fewer steps."""
 SHARE, ERRORS = 0.01, 2.0
-"""How far the mean return of the bundle may be from the trained policy's: this share of it, or so many standard errors."""
+"""Tolerance between the mean returns of the bundle and of the trained policy: a share of it, or a number of standard errors."""
 
 
 class Acting(Protocol):

@@ -151,7 +151,7 @@ def _one_round(
 
 
 def _end(task: Task) -> torch.Tensor:
-    """What ended the last episode of each world and what its terms were, shape ``(worlds, 3 + terms)``; of others old numbers."""
+    """Cause of end and terms of the episodes that ended in this step, shape ``(worlds, 3 + terms)``; old numbers for the other worlds."""
     time_outs = task.time_outs != 0
     if (ended := task.ended) is None:
         cause = torch.where(time_outs, 0.0, 2.0)

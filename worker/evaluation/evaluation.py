@@ -56,7 +56,7 @@ class Evaluation:
 
     @property
     def episodes(self) -> int:
-        """How many there are."""
+        """Number of episodes."""
         return len(self.played.rows)
 
     @property
@@ -136,7 +136,7 @@ class Evaluation:
         return Sample.of(self.played.term(term)).describe()
 
     def _compared(self, run: Run, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-        """How this one differs from an earlier one of the run: episode by episode where both played the same ones."""
+        """The differences to an earlier evaluation of the run: episode by episode where both played the same ones."""
         std = old.get("std_return")
         before = Sample(int(old["episodes"]), float(old["mean_return"]), float(std or 0.0))
         return {

@@ -32,7 +32,7 @@ COMPLETE = "lap_complete"
 _CALLED = {"off_tracks": "off_track", "crashes": "crashed", "immobilized": "immobilized", "reversed": "reversed"}
 """A trial's names for the counts of mishaps."""
 _STATUS = {"time_out": "time_up"}
-"""What SimTrace files call an end otherwise."""
+"""SimTrace's names of ends where they differ from ours."""
 
 
 @dataclass(frozen=True)

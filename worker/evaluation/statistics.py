@@ -57,7 +57,7 @@ def share(hits: int, count: int) -> dict[str, float]:
 
 
 def difference(new: Sample, old: Sample) -> dict[str, Any]:
-    """How far ``new`` is above ``old``: ``difference``, its Welch interval ``low`` to ``high``, and the ``verdict``.
+    """The rise from ``old`` to ``new``: ``difference``, its Welch interval ``low`` to ``high``, and the ``verdict``.
 
     The verdict is ``better`` or ``worse`` where the interval leaves 0 out, else ``within noise``; ``unknown`` of samples of one value.
     """

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import nn
 
 SAMPLES, IMAGES = 1024, 16
-"""How many are made up: numbers, or with images, for which ONNX's evaluator takes its time."""
+"""Number of made-up observations: of numbers, or with images, for which ONNX's evaluator takes its time."""
 
 
 def to_numbers(images: torch.Tensor) -> torch.Tensor:

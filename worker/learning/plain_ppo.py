@@ -239,11 +239,11 @@ class PlainPPO:
         return [] if self.rate == state["learning_rate"] else [f"learning rate set to {self.rate:g}"]
 
     def world_state(self) -> dict[str, torch.Tensor]:
-        """There is no state per world."""
+        """This algorithm keeps no state per world."""
         return {}
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
-        """There is no state per world."""
+        """This algorithm keeps no state per world."""
 
     @classmethod
     def build_policy(cls, config: PPOConfig, spaces: Spaces, device: str) -> Actor:

@@ -17,7 +17,7 @@ from shared_store.contract import NodeContract
 from shared_store.outcomes import EX_TEMPFAIL
 
 PORT = 29499
-"""Where the main node listens: below the port of torch.distributed."""
+"""Port of the main node, one below torch.distributed's."""
 _IDLE, _INTERVAL, _PROBES = 5, 5, 3
 """Keepalive: a host that is gone is noticed after ``_IDLE + _INTERVAL * _PROBES`` seconds."""
 _WORDS = {"gang": str, "node": int, "code": int, "reason": str}

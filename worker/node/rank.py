@@ -54,9 +54,9 @@ class Rank:
         self.progress: dict[str, Any] = {}
         """The newest of everything that it told (:mod:`worker.learning.beacon`)."""
         self.heard: float | None = None
-        """When it last told of an iteration (monotonic [s]); None before the first, and after the last."""
+        """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()
-        """When it was started, or last told of anything (monotonic [s])."""
+        """Time of its start or of its last message (monotonic [s])."""
         self._process: subprocess.Popen[bytes]
         self._beacon = b""
         self._partial = {"o": b"", "e": b""}
@@ -158,7 +158,7 @@ class Rank:
         return [self._keep(stream, line) for line in whole]
 
     def listen(self) -> list[str] | None:
-        """What it said of saves since the last call; notes its progress. None at the end of its messages.
+        """Its messages about saves since the last call; notes its progress. None at the end of its messages.
 
         The program itself may write here: anything but a message of scalars is dropped.
         """

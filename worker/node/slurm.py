@@ -26,7 +26,7 @@ from worker.node.network import address_towards
 
 
 def meet() -> str:
-    """Where the nodes of this job meet. Raises OSError where an address or a port can't be found."""
+    """The address at which the nodes of this job meet. Raises OSError where an address or a port can't be found."""
     names = _lines("scontrol", "show", "hostnames", os.environ["SLURM_JOB_NODELIST"])
     told = "\n".join(_lines("scontrol", "--oneliner", "show", "node", os.environ["SLURM_JOB_NODELIST"]))
     by_name = {m[1]: m[2] for m in re.finditer(r"^NodeName=(\S+) .*?NodeAddr=(\S+)", told, re.MULTILINE)}

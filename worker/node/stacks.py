@@ -1,4 +1,4 @@
-"""Where a process is: its Python and native stacks, taken from outside, also of one that is frozen."""
+"""The Python and native stacks of a process, taken from outside, even of a frozen one."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class Supervisor:
         self._kept: Path | None = None
         """Directory that the job keeps when it is over."""
         self._complain = 0.0
-        """When standard error may be told again of a log that can't be written (monotonic [s])."""
+        """Time at which standard error may again report a log that can't be written (monotonic [s])."""
 
     # -- life ---------------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""What a policy may ask of the car: the action space of a ``model_metadata.json``, as DeepRacer has it. Imported without numpy and torch."""
+"""The car's action space, as in DeepRacer's ``model_metadata.json``. Imported without numpy and torch."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ActionSpace:
     lidar: str | None = None
 
     def metadata(self, sensors: Sequence[str], algorithm: str) -> dict[str, Any]:
-        """What a ``model_metadata.json`` says of a policy with these actions.
+        """The content of ``model_metadata.json`` for a policy with these actions.
 
         Args:
             sensors: By DeepRacer's names.

@@ -55,7 +55,7 @@ def cross(first: Floats, second: Floats) -> Floats:
 
 
 def meetings(start: Floats, end: Floats, points: Floats) -> NDArray[np.int64]:
-    """How many of the segments from ``start`` (N, 2) to ``end`` a ray to the right meets, from each of ``points`` (P, 2), as (P,).
+    """Number of segments from ``start`` (N, 2) to ``end`` that a ray to the right from each of ``points`` (P, 2) meets, as (P,).
 
     Of a closed ring it is odd for a point inside.
     """

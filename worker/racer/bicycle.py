@@ -1,4 +1,4 @@
-"""How the car moves: a kinematic bicycle whose steering and speed follow what is asked with a lag, integrated on the device.
+"""The car's motion: a kinematic bicycle whose steering and speed follow their commands with a lag, integrated on the device.
 
 The rear axle's centre moves where the car points, with speed v; the heading turns by v tan(steering) / wheelbase. Steering and speed
 come closer to what is asked as exp(-t / lag).
@@ -35,7 +35,7 @@ class Motion:
 
 @wp.func
 def remaining(seconds: float, lag: float) -> float:
-    """What is left after a time of the difference between what is asked and what is."""
+    """Share of the difference between command and value that is left after a time."""
     left = float(0.0)
     if lag > 0.0:
         left = wp.exp(-seconds / lag)
@@ -44,7 +44,7 @@ def remaining(seconds: float, lag: float) -> float:
 
 @wp.func
 def turning(speed: float, steering: float, grip: float) -> float:
-    """How fast the heading turns [rad/s]: tyres bear no more than a lateral acceleration of ``grip`` [m/s²]; 0: any."""
+    """Rate of turn of the heading [rad/s]; tyres bear a lateral acceleration of at most ``grip`` [m/s²]; 0: no limit."""
     found = speed * wp.tan(steering) / WHEELBASE
     if grip > 0.0:
         most = grip / wp.max(wp.abs(speed), 1.0e-3)

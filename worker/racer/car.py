@@ -29,7 +29,7 @@ LASTING = (
     *("tracks", "backwards", "poses", "speeds", "steerings", "factors", "commands", "fronts", "rows", "along"),
     *("travelled", "steps", "standing", "falling"),
 )
-"""What the next control step reads; the rest follows from it."""
+"""The state that the next control step reads; the rest follows from it."""
 SHAPED = {
     wp.vec2: ("commands", "fronts"),
     wp.vec3: ("poses", "put_poses"),
@@ -116,7 +116,7 @@ class Cars:
     traced: bool = False
     arrays_type: ClassVar[Any] = CarArrays
     meaning: ClassVar[str] = "Cars"
-    """What a policy's contract says of it: what is measured is the same on every track."""
+    """The car's part of a policy's contract: its measurements are the same on every track."""
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """None: a term that reads the car is called once."""
@@ -169,7 +169,7 @@ class Driving:
         wp.launch(_move, dim=self._count, inputs=self._moving, device=self._device)
 
     def advance(self) -> None:
-        """Where the cars are after a control step."""
+        """Updates the places of the cars after a control step."""
         wp.launch(_follow, dim=self._count, inputs=[self.arrays], device=self._device)
         if self._traced:
             self.note()
@@ -179,9 +179,9 @@ class Driving:
         wp.launch(_trace, dim=self._count, inputs=[self.arrays], device=self._device)
 
     def settle(self) -> None:
-        """Where the cars are that were put down, or back."""
+        """Updates the places of the cars that were put down or back."""
         wp.launch(_begin, dim=self._count, inputs=[self._episodes, self.arrays], device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """What the next control step reads."""
+        """The state that the next control step reads."""
         return views_of(self.arrays, *self._lasting)

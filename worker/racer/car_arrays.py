@@ -1,4 +1,4 @@
-"""What is known of every world's car, and the Warp functions that fill it in: motion, place on the track, ends, obstacles."""
+"""The state of every world's car, and the Warp functions that fill it in: motion, place on the track, ends, obstacles."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ X, Y, HEADING, STEERING, STEERING_RIGHT, WHEELS = (wp.constant(joint) for joint 
 
 @wp.struct
 class ResetRules:
-    """When a car is put back, and where.
+    """Conditions and place of putting a car back.
 
     Attributes:
         continuous: Whether it is put back at all; else its episode ends.
@@ -211,7 +211,7 @@ def move_car(
 
 @wp.func
 def wheels_on_road(car: CarArrays, track: int, pose: wp.vec3) -> int:
-    """How many of the four wheels are between the borders. The caller knows that not all of them are near the centre line."""
+    """Number of wheels, of four, between the borders. The caller knows that not all of them are near the centre line."""
     found = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
     for wheel in range(4):
         forward, sideward = 0.5 * WHEELBASE, 0.5 * GAUGE
@@ -296,7 +296,7 @@ def look_at_obstacles(world: int, car: CarArrays):
 
 @wp.func
 def gap_to(world: int, car: CarArrays, number: int, length: float) -> float:
-    """How far ahead an obstacle is along the centre line, once round the track at most [m]."""
+    """Distance to an obstacle ahead along the centre line, at most once round the track [m]."""
     there = car.obstacle_along[car.tracks[world], number]
     if car.backwards[world]:
         there = length - there
@@ -327,7 +327,7 @@ def follow_car(world: int, car: CarArrays):
 
 @wp.func
 def begin_car(world: int, car: CarArrays):
-    """Where a car was put down: look everywhere, and forget what was before."""
+    """Finds the place of a car that was put down: searches the whole track, and forgets its past."""
     look_round(world, car, 0, car.road.count[car.tracks[world]])
     car.commands[world] = wp.vec2(0.0, 0.0)
     car.travelled[world] = 0.0
@@ -339,5 +339,5 @@ def begin_car(world: int, car: CarArrays):
 
 @wp.func
 def progress_of(world: int, car: CarArrays) -> float:
-    """How much of a lap the car has driven since the episode began, 0 to 100 [%]."""
+    """Share of a lap that the car has driven since the episode began, 0 to 100 [%]."""
     return 100.0 * wp.clamp(car.travelled[world] / car.road.length[car.tracks[world]], 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What a track has to be before a car may drive on it; each refusal is one line: what, in which row, at which place."""
+"""Requirements of a track before a car may drive on it; each refusal is one line: the fault, its row and its place."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from worker.errors import UserError
 from worker.racer.arithmetic import Floats, cross, meetings, norm
 
 WAYPOINTS = (20, 5000)
-"""How many there may be; the car looks at all of them in every step."""
+"""Greatest number; the car looks at all of them in every step."""
 LENGTHS = (4.0, 1000.0)
 """Of the centre line [m]."""
 WIDTHS = (0.3, 5.0)
@@ -111,10 +111,10 @@ def inside(ring: Floats, points: Floats) -> NDArray[np.bool_]:
 
 
 def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | None:
-    """Where rings touch or cross: ring, row, other ring, other row; None where they nowhere do. First where one crosses itself.
+    """The first place where rings touch or cross: ring, row, other ring, other row; None without one.
 
-    A row stands for the segment from it to the next. Neighbours in a ring meet where they should; points of a border that stand
-    there several times (a hairpin turns about one point) count once.
+    A ring that crosses itself comes first. A row stands for the segment from it to the next. Neighbours in a ring meet where they
+    should; points of a border that stand there several times (a hairpin turns about one point) count once.
     """
     kept = [np.flatnonzero(steps_of(ring) > SHORTEST_STEP) for ring in rings]
     start = np.concatenate([ring[rows] for ring, rows in zip(rings, kept, strict=True)])

@@ -1,4 +1,4 @@
-"""What all worlds of a task share: tracks that lie side by side, and boxes that stand on them."""
+"""The scene that all worlds of a task share: tracks side by side, and boxes on them."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _pose(track: Track, obstacle: ObstacleConfig) -> Floats:
 
 
 def side_by_side(tracks: Sequence[Track]) -> Floats:
-    """Where each track's own origin is in a world, (tracks, 2) [m]: in rows and columns, :data:`GAP` apart; that of one track alone is 0."""
+    """Each track's origin in a world, (tracks, 2) [m]: in rows and columns, :data:`GAP` apart; that of one track alone is 0."""
     corners = np.zeros((len(tracks), 2))
     if len(tracks) == 1:
         return corners

@@ -24,7 +24,7 @@ Setting = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Job:
-    """What a hyperparameter's meaning depends on.
+    """The facts on which a hyperparameter's meaning depends.
 
     Attributes:
         algorithm: ``ppo`` or ``sac``.

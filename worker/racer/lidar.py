@@ -29,7 +29,7 @@ def meets_slab(start: float, way: float, half: float) -> wp.vec2:
 
 @wp.func
 def distance_along(pose: wp.vec3, angle: float, box: wp.vec3, half: wp.vec2) -> float:
-    """How far from a pose a ray in the direction ``angle`` [rad] meets a box [m]; 0 from inside it, 1e9 where it does not."""
+    """Distance from a pose to a box along the direction ``angle`` [rad] [m]; 0 from inside it, 1e9 where the ray misses it."""
     cosine = wp.cos(box[2])
     sine = wp.sin(box[2])
     x = pose[0] - box[0]

@@ -1,4 +1,4 @@
-"""What a job calls a track: a preset (``oval``), a seed (``random:7``), or a name in the store."""
+"""Names of tracks in a job: a preset (``oval``), a seed (``random:7``), or a name in the store."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ WIDTH = 1.0
 SPACING = 0.15
 """Of a made road's waypoints [m]."""
 SPACINGS = (0.02, 0.5)
-"""What may be asked for [m]."""
+"""Allowed range [m]."""
 _INSIDE = 0.1
 """Least radius of the inner border of a made curve [m]."""
 
@@ -146,7 +146,7 @@ def check_room(what: str, radius: float, length: float, width: float) -> None:
 
 
 def waypoints(length: float, spacing: float) -> int:
-    """How many waypoints a made track has."""
+    """Number of waypoints of a made track."""
     return round(length / spacing)
 
 

@@ -28,9 +28,9 @@ from worker.simulation.worlds import WorldArrays
 wp.set_module_options({"enable_backward": False})
 
 MISHAPS = ("crashed", "off_track", "immobilized", "reversed")
-"""What may go wrong, by the name of the termination; number n is n + 1 in ``CarArrays.mishaps``. Of several at once the first one counts."""
+"""Mishaps, by the name of their termination; number n is n + 1 in ``CarArrays.mishaps``. Of several at once the first one counts."""
 COUNTS = (*MISHAPS, "resets")
-"""What is counted in an episode: the columns of ``CarArrays.counts``."""
+"""Counters of an episode: the columns of ``CarArrays.counts``."""
 CRASHED, OFF_TRACK, IMMOBILIZED, REVERSED = (wp.constant(number + 1) for number in range(len(MISHAPS)))
 RESETS = wp.constant(COUNTS.index("resets"))
 
@@ -63,7 +63,9 @@ def note_mishap(world: int, car: CarArrays):
 
 @wp.func
 def find_place(world: int, car: CarArrays):
-    """Where a car is put: its front ``put_back`` behind where it was, on the centre line, or beside it where a box is in the way there.
+    """Finds the place where a car is put down: its front is ``put_back`` behind its last place.
+
+    It stands on the centre line, or beside it where a box is in the way.
 
     The lanes are the centre line, the middle of that half of the road on which the front was, and that of the other half; the first one
     is taken that is clear, and the centre line where none is.
@@ -127,7 +129,7 @@ def put_back(world: int, worlds: WorldArrays, robot: RobotArrays, car: CarArrays
 
 @wp.func
 def go_on(world: int, car: CarArrays):
-    """Where a car is that was put back: it lost what it has to drive again."""
+    """Updates the progress of a car that was put back: it loses the distance that it has to drive again."""
     look_round(world, car, 0, car.road.count[car.tracks[world]])
     car.commands[world] = wp.vec2(0.0, 0.0)
     car.travelled[world] = car.travelled[world] - car.set_back[world]
@@ -138,7 +140,7 @@ def go_on(world: int, car: CarArrays):
 
 @wp.func
 def forget_mishaps(world: int, car: CarArrays):
-    """When an episode begins."""
+    """Resets the counters at the beginning of an episode."""
     car.mishaps[world] = 0
     car.put[world] = False
     car.set_back[world] = 0.0

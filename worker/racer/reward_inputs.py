@@ -1,4 +1,4 @@
-"""What a learner's reward function is told of every car, filled on the device after each control step, and the function itself."""
+"""The arguments of a learner's reward function for every car, filled on the device after each control step, and the function itself."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ HALF_HEIGHT = wp.constant(BOX[2] / 2)
 
 @wp.struct
 class CameraView:
-    """What is in the image of the camera on the car.
+    """The objects in the image of the camera on the car.
 
     Attributes:
         place: On the car: ahead of its middle, to the left, above the road [m].
@@ -161,7 +161,7 @@ def _tell(
 
 @dataclass(frozen=True)
 class RewardInputs:
-    """What a reward function is told of every car, and how it is called.
+    """The arguments of a reward function for every car, and its call.
 
     Attributes:
         circuit: The tracks.

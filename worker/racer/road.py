@@ -288,7 +288,7 @@ def road_arrays(tracks: Sequence[Track], corners: np.ndarray, device: str) -> Ro
 
 
 def window_of(track: Track) -> int:
-    """How many segments are at least :data:`REACH` long together, wherever they begin; all of a track that is shorter."""
+    """Number of segments that together are at least :data:`REACH` long, wherever they begin; all of them on a shorter track."""
     count = len(track.steps)
     ends = np.concatenate(([0.0], np.cumsum(np.tile(track.steps, 2))))
     needed = np.searchsorted(ends, ends[:count] + REACH) - np.arange(count)

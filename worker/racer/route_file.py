@@ -21,7 +21,7 @@ from worker.racer.track import Track
 
 _MAGIC = b"\x93NUMPY"
 _CLOSED = 1e-3
-"""How far the last row may be from the first one [m]."""
+"""Greatest distance of the last row from the first one [m]."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a camera on the car sees: asphalt, white borders, a yellow dashed line in the middle, grass and boxes; and the car itself."""
+"""The scene around the car: asphalt, white borders, a yellow dashed line in the middle, grass and boxes; and the car itself."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BORDER_WIDTH = 0.05
 DASH = (0.04, 0.3, 0.3)
 """Width of the line in the middle, length of a dash, and of the gap behind it [m]."""
 FIELD = 30.0
-"""How far the grass goes on behind the tracks [m]."""
+"""Width of the grass beyond the tracks [m]."""
 _BELOW, _ABOVE = -0.01, (0.002, 0.003)
 
 CAR = """<mujoco model="racer"><compiler angle="radian"/><worldbody><body name="car">

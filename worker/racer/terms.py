@@ -14,7 +14,7 @@ from worker.simulation.worlds import WorldArrays
 wp.set_module_options({"enable_backward": False})
 
 STARTS = ("line", "round_robin", "random")
-"""Where an episode begins, by the number that :func:`place_car` is given."""
+"""Starting places of an episode, by the number that :func:`place_car` receives."""
 ROUND_ROBIN = wp.constant(STARTS.index("round_robin"))
 RANDOM = wp.constant(STARTS.index("random"))
 GRAVITY = wp.constant(9.81)
@@ -41,7 +41,7 @@ def waypoint_ahead(world: int, car: CarArrays, index: int, spacing: float) -> wp
 
 @wp.func
 def lateral_error(world: int, car: CarArrays) -> float:
-    """How far the front is left of the centre line [m]."""
+    """Distance of the front to the left of the centre line [m]."""
     side = car.distances[world]
     if not car.left[world]:
         side = -side
@@ -86,7 +86,7 @@ def obstacle_ahead(world: int, car: CarArrays) -> wp.vec2:
 
 @wp.func
 def progress_made(world: int, car: CarArrays) -> float:
-    """How far the car came on in this step, as a share of the track [%]; less than 0 where it came back, or is put back."""
+    """Progress of the car in this step, as a share of the track [%]; negative where it drove back or was put back."""
     return 100.0 * (car.moved[world] - car.set_back[world]) / car.road.length[car.tracks[world]]
 
 
@@ -134,14 +134,14 @@ def reversed_course(world: int, car: CarArrays, steps: int) -> bool:
 
 @wp.func
 def final_progress(world: int, car: CarArrays) -> float:
-    """How much of a lap the car has driven since the episode began [%], less what it loses by being put back."""
+    """Share of a lap that the car has driven since the episode began [%], less the losses from being put back."""
     length = car.road.length[car.tracks[world]]
     return 100.0 * wp.clamp((car.travelled[world] - car.set_back[world]) / length, 0.0, 1.0)
 
 
 @wp.func
 def lap_time(world: int, car: CarArrays, seconds: float) -> float:
-    """How long a lap took [s]; 0 of one that is not complete."""
+    """Duration of a lap [s]; 0 for an incomplete one."""
     time = float(0.0)
     if progress_of(world, car) >= 100.0:
         time = float(car.steps[world]) * seconds

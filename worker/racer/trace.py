@@ -1,4 +1,4 @@
-"""What race results and SimTrace files have of each control step, noted on the device before an episode that ended begins anew."""
+"""The values of each control step for race results and SimTrace files, noted on the device before an ended episode begins anew."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class Track:
         return Track(self.name, self.center[order], self.inner[order], self.outer[order])
 
     def facts(self) -> dict[str, Any]:
-        """What people want to know of it, as JSON values; lengths in metres."""
+        """The track's facts as JSON values; lengths in metres."""
         return {
             "name": self.name,
             "length": self.length,

@@ -45,7 +45,7 @@ def displace(
     given: wp.array(dtype=wp.transformf),
     poses: wp.array(dtype=wp.transformf),
 ):
-    """Where one world's camera stands: drawn once from stream ``number``, that is from the seed and the world alone."""
+    """Pose of one world's camera: drawn once from stream ``number``, that is from the seed and the world alone."""
     world = wp.tid()
     poses[world] = displaced(given[world], numbered_stream(episodes, world, number), position, angle)
 
@@ -67,7 +67,7 @@ def _paint(colors: float, episodes: EpisodeArrays, shape_colors: wp.array2d(dtyp
 
 @wp.kernel
 def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array(dtype=wp.float32)):
-    """How bright one world's image is."""
+    """Brightness of one world's image."""
     world = wp.tid()
     light[world] = wp.randf(numbered_stream(episodes, world, _STREAM - 1), ends[0], ends[1])
 

@@ -29,7 +29,7 @@ Friction = float | tuple[float, ...]
 
 @dataclass(frozen=True)
 class Collision:
-    """How some geoms of a robot collide. It overrides the robot's file.
+    """Collision settings of some geoms of a robot. They override the robot's file.
 
     Each argument except the patterns is one value for all matching geoms, or values by geom pattern; the first matching pattern wins.
 

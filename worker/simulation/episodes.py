@@ -105,7 +105,7 @@ def clear_row(rows: wp.array2d(dtype=wp.float32), world: int):
 
 @wp.func
 def clipped_action(episodes: EpisodeArrays, world: int, action: int) -> float:
-    """What the policy asked for, within the limits of an action."""
+    """The policy's action, clipped to the limits."""
     return wp.clamp(episodes.actions[world, action], -ACTION_LIMIT, ACTION_LIMIT)
 
 

@@ -211,5 +211,5 @@ def body_origin_velocity(bodies: BodyArrays, world: int, body: int) -> wp.vec3:
 
 @wp.func
 def body_point(bodies: BodyArrays, world: int, body: int, point: wp.vec3) -> wp.vec3:
-    """Where a point that is fixed to a body is, in the world frame [m]; ``point`` is in the body's frame [m]."""
+    """Position in the world frame [m] of a point fixed to a body; ``point`` is in the body's frame [m]."""
     return wp.transform_point(bodies.poses[world, body], point)

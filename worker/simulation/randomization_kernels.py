@@ -57,7 +57,7 @@ class Entries:
 
 @wp.struct
 class Changes:
-    """How draws change numbers of the model. Changes ``starts[i]`` to ``starts[i + 1]`` apply to number ``i``, in order.
+    """The changes that draws make to numbers of the model. Changes ``starts[i]`` to ``starts[i + 1]`` apply to number ``i``, in order.
 
     Attributes:
         columns: Column of each number in its array, or body, shape ``(numbers,)``.
@@ -181,7 +181,7 @@ def draw_due(
 
 @wp.func
 def _combined(operation: int, value: float, number: float) -> float:
-    """What a drawn number makes of a value."""
+    """Applies a drawn number to a value."""
     if operation == _SCALE:
         return value * number
     if operation == _ADD:

@@ -68,7 +68,7 @@ def ground_height(terrain: TerrainArrays, x: float, y: float) -> float:
 
 @wp.func
 def terrain_origin(terrain: TerrainArrays, world: int) -> wp.vec3:
-    """Where a world's robot begins [m]: the middle of its patch, on the ground."""
+    """Starting place of a world's robot [m]: the middle of its patch, on the ground."""
     return terrain.origins[terrain.levels[world], terrain.kinds[world]]
 
 

@@ -1,4 +1,4 @@
-"""What action terms drive: joints, with one action each, or a frame of a robot, by inverse kinematics."""
+"""Targets of action terms: joints, with one action each, or a frame of a robot, by inverse kinematics."""
 
 from __future__ import annotations
 

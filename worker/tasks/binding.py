@@ -204,7 +204,7 @@ class Binder:
             view.need_efforts(bound.elements, purpose)
 
     def _memory(self, bound: Bound) -> int:
-        """How many numbers of its own a term keeps.
+        """Number of values that a term keeps for itself.
 
         Raises:
             ValueError: Neither function nor declaration says how many, or the declaration says too few.

@@ -60,7 +60,7 @@ def _check_noise(value: Any, inner: Callable[[Any], Any]) -> Any:
 
 @dataclass(frozen=True, config=STRICT)
 class Randomization:
-    """How the worlds of a task differ from one another. Factors are uniform in ``[least, greatest]``, one for each world.
+    """Randomisation of a task's worlds. Factors are uniform in ``[least, greatest]``, one for each world.
 
     Raises:
         ValueError: A range is malformed, or a number is out of range.
@@ -168,7 +168,7 @@ class _Common:
     rewards: Mapping[str, Finite] = reward_weights()
     """Weight of each reward term. Terms that are not named keep the task's defaults."""
     randomize: Annotated[Randomization, from_mapping(Randomization)] = Randomization()
-    """How the worlds differ from one another; by default not at all. A mapping of its fields is accepted."""
+    """Randomisation of the worlds; none by default. A mapping of its fields is accepted."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
     """Changes during training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated and held constant
     outside their range. Each is named after a reward term, whose weight it sets; the place of a number of a declared task, such as
@@ -181,7 +181,7 @@ class _Common:
     nan_limit: Amount = 0.1
     """Training stops when one iteration has more resets of failed worlds than this share of the number of worlds."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    """How the task is trained."""
+    """Settings of the task's training."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -252,8 +252,9 @@ class TaskConfig(_Common):
 
     @property
     def policy_sizes(self) -> Mapping[str, str]:
-        """What decides the sizes of the policy's inputs and outputs, by key of the configuration, in words; a clone can't change it.
-        Empty where only the task knows.
+        """The settings that decide the sizes of the policy's inputs and outputs, by key of the configuration, in words.
+
+        A clone can't change them. Empty where only the task knows.
         """
         return {}
 

@@ -23,7 +23,7 @@ EXPRESSIONS: Mapping[Any, str] = {
     wp.transform: "wp.transform(wp.vec3(numbers[{0}], numbers[{1}], numbers[{2}]), "
     "wp.quat(numbers[{3}], numbers[{4}], numbers[{5}], numbers[{6}]))",
 }
-"""How a kernel reads a value of each type from the array."""
+"""The expression by which a kernel reads a value of each type from the array."""
 
 
 Check = Callable[[list[float]], str | None]

@@ -100,7 +100,7 @@ class Racer(DeclaredTask):
             self.sensors["race"].follow(self.sensors["car"].arrays)
 
     def notes(self) -> list[str]:
-        """Where a learner's reward function runs (device or host), and the reason."""
+        """The place where a learner's reward function runs (device or host), and the reason."""
         if self.race is None:
             return []
         if not self.race.reason:

@@ -119,7 +119,7 @@ class Randomize:
     range: Ends | Mapping[str, Ends]
     """Least and greatest drawn value, or for ``normal`` mean and standard deviation; or one pair per axis, by its name."""
     operation: Operation = "scale"
-    """How the drawn number changes the model's own value. Changes never compound: each draw applies to the model's original value."""
+    """The operation by which the drawn number changes the model's original value; changes never compound."""
     distribution: Distribution = "uniform"
     """``log_uniform`` is uniform in the logarithm: half and double are equally likely."""
     when: When = "startup"
@@ -160,7 +160,7 @@ class Randomize:
 
     @property
     def quantity(self) -> Quantity:
-        """What :attr:`what` is."""
+        """The kind of :attr:`what`."""
         return QUANTITIES[self.what]
 
     @property

@@ -54,7 +54,7 @@ def energy(
 
 @wp.func
 def limits(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, strongest: float) -> float:
-    """How far a joint is into the last hundredth at an end of its range, from 0 to 1, x its motor's share of the strongest motor."""
+    """Depth of a joint in the last hundredth at an end of its range, from 0 to 1, x its motor's share of the strongest motor."""
     ends = robot.ranges[joint]
     place = (2.0 * worlds.joint_q[world, robot.coordinates[joint]] - ends[0] - ends[1]) / (ends[1] - ends[0])
     return wp.clamp((wp.abs(place) - 0.98) / 0.02, 0.0, 1.0) * robot.efforts[joint] / strongest

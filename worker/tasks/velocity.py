@@ -41,7 +41,7 @@ COMMANDED = ("forward", "left", "turn")
 FARTHEST_SCAN = 5.0
 """Range of the scan of the ground below the trunk [m]; heights are divided by it."""
 FOOT_HEIGHT = 0.1
-"""How high a foot should swing [m]."""
+"""Target height of a swinging foot [m]."""
 MOVES = 0.05
 """Smaller commands mean standing: speed [m/s] + turning velocity [rad/s]."""
 UNSEEN = 0.3

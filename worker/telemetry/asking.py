@@ -22,12 +22,12 @@ PATIENCE = 180.0
 
 
 def request_of(run: Run) -> Path:
-    """Where a reader asks."""
+    """Path of a reader's request."""
     return run.telemetry / "request.json"
 
 
 def answer_of(run: Run) -> Path:
-    """Where the training answers."""
+    """Path of the training's answer."""
     return run.telemetry / "tap.json"
 
 

@@ -107,7 +107,7 @@ class Recording:
         return self.ended(episodes) == episodes * self._stage.worlds
 
     def ended(self, episodes: int) -> int:
-        """How many episodes have ended, of each world at most ``episodes``."""
+        """Number of episodes that have ended, at most ``episodes`` for each world."""
         return int(np.minimum(self._ended, episodes).sum())
 
     def say(self, text: str, level: int = 20, name: str = "muster") -> None:
@@ -139,7 +139,7 @@ class Recording:
             self._writer.add_attachment(self._began, self._began, name, kind, data)
 
     def _begin(self) -> None:
-        """What stands once at the beginning: the places of the worlds, and what is seen on the links.
+        """The messages at the beginning: the places of the worlds and the shapes of the links.
 
         A robot from URDF is described by its file. No ROS tool reads MJCF: such a file is attached, and the links have their shapes.
         """

@@ -154,7 +154,7 @@ class Rows:
         return self.marks[:, :, MARKS.index(name)]
 
     def cause(self, step: int, world: int) -> str:
-        """What ended the episode that ended in this step; of another step, the world's last episode."""
+        """Cause of the end of the episode that ended in this step; in any other step, of the world's last episode."""
         return self.layout.causes[int(self.mark("cause")[step, world])]
 
     def pictures(self, step: int) -> dict[str, np.ndarray]:

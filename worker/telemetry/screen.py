@@ -231,7 +231,7 @@ def _frame(world: int, link: str) -> str:
 
 
 def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the eye looks, and where it is, so that all worlds fit; ``placed``: shape ``(worlds, links, 7)``."""
+    """Target and position of a camera that sees all worlds; ``placed``: shape ``(worlds, links, 7)``."""
     low, high = placed[..., :3].min((0, 1)), placed[..., :3].max((0, 1))
     center = (low + high) / 2
     span = max(1.0, float(np.linalg.norm(high - low)))

@@ -18,7 +18,7 @@ from shared_store.files import remove_tree
 from shared_store.metrics import scalars
 
 OUTCOMES = {"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}
-"""How a training can end, and MLflow's word for it."""
+"""The possible ends of a training, and MLflow's word for each."""
 _METRICS, _PARAMETERS = 1000, 100
 """Most that MLflow takes in one request."""
 _LONGEST = 6000
@@ -43,7 +43,7 @@ class Tracked:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a training ended, and what is uploaded then."""
+    """The end of a training and the files uploaded then."""
 
     outcome: str
     """One of :data:`OUTCOMES`."""
@@ -68,7 +68,7 @@ class Service(Protocol):
 
     @property
     def place(self) -> str:
-        """Where a person finds the open run."""
+        """Address of the open run for a browser."""
 
     def send(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Send whole iterations, in order."""

@@ -84,7 +84,7 @@ class Stage:
         self._apart = 0.0 if isinstance(stands_on, Terrain) else APART
 
     def places(self) -> np.ndarray:
-        """Where the worlds are shown [m], shape ``(worlds, 3)``: beside each other along y; on a terrain where they are."""
+        """Places of the worlds in the picture [m], shape ``(worlds, 3)``: beside each other along y, or their own places on a terrain."""
         places = np.zeros((self.worlds, 3))
         places[:, 1] = self._apart * (np.arange(self.worlds) - (self.worlds - 1) / 2)
         return places
@@ -104,7 +104,7 @@ class Stage:
         return poses
 
     def meshes(self) -> dict[str, bytes]:
-        """What is seen of one world, each link in its own frame, as binary glTF (y up, as glTF has it).
+        """The visible shapes of one world, each link in its own frame, as binary glTF (y up, as glTF has it).
 
         Returns:
             By link; ``""`` is what a world has that is fixed to it, ``"ground"`` what no world has for itself. A plane is a square of

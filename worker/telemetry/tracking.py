@@ -20,7 +20,7 @@ from worker.errors import UserError
 from worker.learning.job import Job
 
 READY_SECONDS = 60.0
-"""How long a training waits for a service's package to be imported [s]; it goes on without knowing whether there is a key."""
+"""Time that a training waits for the import of a service's package [s]; then it continues without knowing whether a key exists."""
 FAREWELL = {"finished": 30.0, "failed": 5.0, "stopped": 5.0}
 """Seconds that the end of a training waits for what is left to be sent."""
 

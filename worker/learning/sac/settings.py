@@ -74,7 +74,7 @@ class SACConfig:
     v_max: float = 20.0
     """The greatest of these values [discounted return]; greater returns can't be distinguished from it."""
     combine: Literal["mean", "min"] = "mean"
-    """How the critics' predictions are combined in targets and for the policy: ``"mean"``, or ``"min"``, the most cautious one."""
+    """Combination of the critics' predictions in targets and for the policy: ``"mean"``, or ``"min"``, the most cautious one."""
 
     gamma: Annotated[float, Field(ge=0.0, le=1.0)] = 0.97
     """Discount of the reward per control step; 0.97 looks half a second ahead at 50 Hz."""

@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RaceArrays:
-    """What a step tells the reward functions of all cars.
+    """Arguments of all cars' reward functions in one step.
 
     Attributes:
         numbers: A row a car, shape ``(worlds, NUMBERS)``: :data:`~worker.racer.rewards.parameters.NUMBER_COLUMNS`, then how many objects
@@ -102,7 +102,7 @@ def _run(text: str, name: str, scope: dict[str, Any]) -> None:
 
 
 def told_errors(errors: np.ndarray) -> dict[str, Failure]:
-    """What ``race.errors`` says: the calls that gave no reward, by their message."""
+    """Content of ``race.errors``: the calls that gave no reward, by their message."""
     found: dict[str, Failure] = {}
     for car in np.flatnonzero(errors[:, 1]).tolist():
         code, count = errors[car].tolist()

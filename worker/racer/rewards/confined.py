@@ -98,7 +98,7 @@ def load(source: str, file: str) -> Reward:
 
 
 def told_result(result: Any) -> str:
-    """What is wrong with what a function returned; empty: nothing is.
+    """The fault of a function's return value; empty without one.
 
     A truth value is no reward: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
     """
@@ -123,7 +123,7 @@ def told_result(result: Any) -> str:
 
 
 def told_error(error: BaseException) -> str:
-    """What an exception that a function raised is told as."""
+    """The message for an exception that a function raised."""
     if isinstance(error, ModuleNotFoundError):
         return f"{error.name} is not installed here"
     if isinstance(error, MemoryError):
@@ -170,7 +170,7 @@ class Alarm:
 
 @contextlib.contextmanager
 def printing(printed: Printed) -> Any:
-    """What is printed meanwhile goes to ``printed``."""
+    """Redirects standard output to ``printed`` meanwhile."""
     kept = sys.stdout, sys.stderr
     sys.stdout = sys.stderr = printed
     try:

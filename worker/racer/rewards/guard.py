@@ -56,7 +56,7 @@ _OWN = {"self", "cls"}
 
 
 def check(path: Path) -> Problem | None:
-    """What is wrong with a reward function in a file; None: nothing is.
+    """The first fault of a reward function in a file, or None.
 
     Args:
         path: The file.
@@ -98,7 +98,7 @@ def check_source(source: str, file: str = "reward_function.py") -> Problem | Non
 
 
 def read(source: str, file: str) -> Problem | None:
-    """What is wrong with the text itself; nothing of it is run."""
+    """Faults of the text itself, which is not run."""
     if len(source) > LARGEST:
         return Problem("SYNTAX_ERROR", f"{len(source):,} characters; a reward function has at most {LARGEST:,}", file)
     try:
@@ -198,7 +198,7 @@ def _function(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
 
 
 def try_out(source: str, file: str) -> Problem | None:
-    """What goes wrong with sample inputs, in a process of its own with limits."""
+    """Faults with sample inputs, found in a process of its own with limits."""
     root = str(Path(__file__).parents[3])
     asked = {"source": source, "file": file, "samples": samples(), "seconds": SECONDS, "root": root}
     command = [sys.executable, "-I", "-B", str(Path(__file__).with_name("trial.py"))]
@@ -221,7 +221,7 @@ def try_out(source: str, file: str) -> Problem | None:
 
 
 def _last(said: str) -> str:
-    """What the process was trying when it was last heard of."""
+    """The last step that the process reported."""
     lines = [json.loads(line) for line in said.splitlines() if line.startswith('{"trying"') and line.endswith("}")]
     return str(lines[-1]["trying"]) if lines else "the file"
 

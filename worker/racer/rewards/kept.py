@@ -25,7 +25,7 @@ class RewardFile:
     file: Annotated[str, Field(min_length=1, max_length=1000)] = "reward_function.py"
     """Name of the file, in messages."""
     text: Annotated[str, Field(max_length=LARGEST)] = ""
-    """What it holds."""
+    """Its content."""
 
     def __post_init__(self) -> None:
         if problem := read(self.text, self.file):

@@ -1,4 +1,4 @@
-"""What a reward function is given: the keys of ``params``, and the arrays in which a step of all cars holds them.
+"""Arguments of a reward function: the keys of ``params``, and the arrays that hold them for all cars in a step.
 
 One table says it all. The dictionaries of the interpreter, the columns of the arrays, the checks and the page of the documentation
 follow from it.

@@ -1,4 +1,4 @@
-"""What is wrong with a reward function, in one line."""
+"""Faults of a reward function, in one line each."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def _degrees(angle: float) -> float:
 def sample(
     line: Line, car: Placed, objects: Sequence[Placed] = (), *, is_reversed: bool = False, **known: Any
 ) -> dict[str, Any]:
-    """What a car's reward function is given.
+    """Sample arguments of a reward function.
 
     Args:
         line: Centre line of the track.

@@ -78,7 +78,7 @@ def _points(params: dict[str, Any]) -> None:
 
 
 def _last_line(function: Any) -> int:
-    """Where a function begins: of what it gave, no line is the cause."""
+    """First line of a function, for a fault of its return value, which no single line causes."""
     code = getattr(function, "__code__", None)
     return code.co_firstlineno if code else 0
 

@@ -71,7 +71,7 @@ def _redraw(
     usual: wp.array(dtype=wp.transform),
     mounts: wp.array(dtype=wp.transform),
 ):
-    """Where the camera of a world that begins an episode is mounted."""
+    """Draws the camera's mount for a world that begins an episode."""
     world = wp.tid()
     if episodes.ages[world] == 0:
         mounts[world] = displaced(usual[world], random_stream(episodes, world), position, angle)

@@ -181,7 +181,7 @@ def _gather(solved: _Solved, columns: wp.array(dtype=wp.int32), others: wp.array
 
 @wp.kernel
 def _measure(sums: _Sums, contacts: ContactArrays, norms: wp.array3d(dtype=wp.float32)):
-    """What the contacts of one physics step mean for one column; ``norms`` is the past of the net force."""
+    """Reduces the contacts of one physics step to one column; ``norms`` is the past of the net force."""
     world, column = wp.tid()
     found = sums.found[world, column]
     force = sums.forces[world, column]

@@ -141,7 +141,7 @@ class DifferentialIK:
         return views[self.robot].find_joints(self.joints)
 
     def said(self, views: Mapping[str, RobotView]) -> str:
-        """How the columns are used, in words, with every number."""
+        """Describes the use of the columns in words, with every number."""
         view = views[self.robot]
         joints = ", ".join(view.joint_names[joint] for joint in self.driven(views))
         names = ("position_weight", "orientation_weight", "damping", "max_step", "posture_weight", "limit_weight")

@@ -70,7 +70,7 @@ def _gravity(dynamics: _Dynamics, world: int) -> wp.vec3:
 
 @wp.func
 def _motion_cross(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.spatial_vector:
-    """How ``motion`` changes in a frame that moves with ``velocity`` (Featherstone's cross product; angular part first)."""
+    """Rate of change of ``motion`` in a frame that moves with ``velocity`` (Featherstone's cross product; angular part first)."""
     turn = wp.spatial_top(velocity)
     return wp.spatial_vector(
         wp.cross(turn, wp.spatial_top(motion)),
@@ -80,7 +80,7 @@ def _motion_cross(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.
 
 @wp.func
 def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vector:
-    """What a body accelerates beyond its parent though its joints don't: sum of d/dt(axis) times rate over its joints.
+    """Acceleration of a body beyond its parent's from the joints' rates alone: sum of d/dt(axis) times rate over its joints.
 
     The rates are those before the step, which has overwritten them since: they are taken from the bodies' velocities. Several joints
     on one body can't be told apart there, and their rates are calculated back from the acceleration.
@@ -105,7 +105,7 @@ def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vector:
 
 @wp.kernel
 def _accelerate(dynamics: _Dynamics, chain: wp.array(dtype=wp.int32), local: wp.transform, imu: ImuArrays):
-    """What the accelerometer says of the last physics step: as ``mj_rnePostConstraint`` and ``mj_objectAcceleration`` of MuJoCo.
+    """The accelerometer's reading for the last physics step: as ``mj_rnePostConstraint`` and ``mj_objectAcceleration`` of MuJoCo.
 
     Everything is in the state before that step, about the centre of mass of the whole tree.
     """
@@ -130,7 +130,7 @@ def _accelerate(dynamics: _Dynamics, chain: wp.array(dtype=wp.int32), local: wp.
 
 @wp.kernel
 def _rest(ages: wp.array(dtype=wp.int32), dynamics: _Dynamics, imu: ImuArrays):
-    """What the accelerometer of a world that was placed afresh says."""
+    """The accelerometer's reading for a world that was placed afresh."""
     world = wp.tid()
     if ages[world] == 0:
         imu.accelerometer[world] = -wp.quat_rotate_inv(imu.rotations[world], _gravity(dynamics, world))
@@ -138,7 +138,7 @@ def _rest(ages: wp.array(dtype=wp.int32), dynamics: _Dynamics, imu: ImuArrays):
 
 @wp.kernel
 def _move(bodies: BodyArrays, body: int, local: wp.transform, imu: ImuArrays):
-    """What gyro and velocimeter say, and how the unit is turned, now."""
+    """The current readings of gyro and velocimeter, and the unit's orientation."""
     world = wp.tid()
     pose = place_pose(bodies, world, body, local)
     turn = wp.transform_get_rotation(pose)

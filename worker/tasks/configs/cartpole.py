@@ -51,7 +51,7 @@ class CartpoleConfig(TaskConfig):
             steps=16, hidden_sizes=(32, 32), epochs=4, minibatches=2, learning_rate=1.0e-3, desired_kl=0.01
         )
     )
-    """How the task is trained: a small network, since the task is easy and often runs on a CPU."""
+    """Settings of the task's training: a small network, since the task is easy and often runs on a CPU."""
     sac: SACConfig = field(
         default_factory=lambda: SACConfig(
             actor_sizes=(64, 64),
@@ -65,7 +65,7 @@ class CartpoleConfig(TaskConfig):
             critic_learning_rate=1.0e-3,
         )
     )
-    """How ``algorithm: sac`` trains it."""
+    """Settings of ``algorithm: sac``."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -92,4 +92,4 @@ class CartpolePixelsConfig(CartpoleConfig):
             normalize_observations=False,
         )
     )
-    """How the task is trained."""
+    """Settings of the task's training."""

@@ -42,7 +42,7 @@ class LiftCubeConfig(TaskConfig):
     cube_x: Range = (0.2, 0.4)
     """Positions of the cube along x [m], uniform."""
     cube_y: Range = (-0.2, 0.2)
-    """Where the cube is put along y [m], uniform."""
+    """Range of the cube's first place along y [m], uniform."""
     cube_z: Range = (0.02, 0.05)
     """Height from which the cube drops [m], uniform; it lies at 0.02."""
     cube_yaw: Range = (-3.14, 3.14)
@@ -75,7 +75,7 @@ class LiftCubeConfig(TaskConfig):
             entropy_coef=0.005,
         )
     )
-    """How the task is trained."""
+    """Settings of the task's training."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -88,6 +88,6 @@ class LiftCubesConfig(LiftCubeConfig):
     cubes: Annotated[int, Field(ge=1, le=6)] = 3
     """Number of cubes, 1 to 6."""
     cube_x: Range = (0.25, 0.4)
-    """Where each cube is put along x [m], uniform."""
+    """Range of each cube's first place along x [m], uniform."""
     cube_y: Range = (-0.15, 0.15)
-    """Where each cube is put along y [m], uniform."""
+    """Range of each cube's first place along y [m], uniform."""

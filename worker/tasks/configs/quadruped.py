@@ -94,4 +94,4 @@ class QuadrupedConfig(TaskConfig):
             init_std=0.6,
         )
     )
-    """How the task is trained."""
+    """Settings of the task's training."""

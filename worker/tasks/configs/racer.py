@@ -190,7 +190,7 @@ class RacerConfig(TaskConfig):
             steps=32, hidden_sizes=(64, 64), epochs=5, minibatches=4, learning_rate=1.0e-3, entropy_coef=0.002
         )
     )
-    """How the task is trained."""
+    """Settings of the task's training."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -296,7 +296,7 @@ class RacerPixelsConfig(RacerConfig):
             normalize_observations=True,
         )
     )
-    """How the task is trained: the critic also sees the numbers."""
+    """Settings of the task's training; the critic also sees the numbers."""
 
     @property
     def policy_sizes(self) -> Mapping[str, str]:

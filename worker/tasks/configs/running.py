@@ -70,9 +70,9 @@ class RunningConfig(TaskConfig):
             desired_kl=0.01,
         )
     )
-    """How the task is trained."""
+    """Settings of the task's training."""
     sac: SACConfig = field(default_factory=lambda: SAC)
-    """How ``algorithm: sac`` trains it."""
+    """Settings of ``algorithm: sac``."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -99,7 +99,7 @@ class HumanoidConfig(RunningConfig):
     start_height: float = 1.34
     """Height of the torso at the start [m]: the feet are 5 cm above the ground."""
     sac: SACConfig = field(default_factory=lambda: dataclasses.replace(SAC, gamma=0.99, v_max=1400.0))
-    """How ``algorithm: sac`` trains it: with a longer horizon than the ant."""
+    """Settings of ``algorithm: sac``: a longer horizon than the ant's."""
     rewards: Mapping[str, float] = reward_weights(
         forward=1.0, heading=0.5, up=0.1, alive=2.0, action=-0.01, energy=-0.05, limits=-0.25, fall=-1.0
     )

@@ -125,9 +125,9 @@ class VelocityConfig(TaskConfig):
     solver_line_search: Count = 20
     """Limit of the iterations of its line search."""
     ppo: PPOConfig = field(default_factory=lambda: PPO)
-    """How the task is trained."""
+    """Settings of the task's training."""
     sac: SACConfig = field(default_factory=lambda: SAC)
-    """How ``algorithm: sac`` trains it."""
+    """Settings of ``algorithm: sac``."""
 
 
 _WALK: Mapping[str, float] = {

@@ -58,7 +58,7 @@ class Emitting:
         self.lines.append(line)
 
     def at(self, node: ast.AST) -> str:
-        """What helpers are told of the line, with a note that they may fail."""
+        """The arguments that pass the line to helpers, with a note that they may fail."""
         self.may_fail = True
         return str(16 * getattr(node, "lineno", 0))
 
@@ -69,7 +69,7 @@ class Emitting:
             self.may_fail = False
 
     def captured(self, make: Callable[[], Any]) -> tuple[Any, list[str]]:
-        """What ``make`` gives, and the lines that it added, which are taken away again."""
+        """The result of ``make`` and the lines that it added, which are removed again."""
         before, self.lines = self.lines, []
         try:
             return make(), self.lines
@@ -107,7 +107,7 @@ class Emitting:
         return value
 
     def lookup(self, name: str, node: ast.AST) -> Value:
-        """What a name stands for."""
+        """The value of a name."""
         for known in reversed(self.overlay):
             if name in known:
                 return known[name]

@@ -135,7 +135,7 @@ class Items(Emitting):
     # loops
 
     def iterated(self, value: Value, node: ast.AST) -> Iterated:
-        """What a loop goes through."""
+        """The items of a loop."""
         if isinstance(value, Constant) and isinstance(value.value, dict):
             value = Group(tuple(self.program.wrap(key, node) for key in value.value))
         if isinstance(value, Group):

@@ -1,4 +1,4 @@
-"""What C++ lacks of Python's numbers: checked division, remainders and powers with Python's signs, rounding, indices.
+"""Python's arithmetic in C++: checked division, remainders and powers with Python's signs, rounding, indices.
 
 Each entry is a lambda of the generated function. ``at`` is 16 times the line; :data:`ERRORS` has what is added to it.
 """
@@ -22,7 +22,7 @@ ERRORS = {
     12: "KeyError: no such key",
     13: "ValueError: range() steps by 0",
 }
-"""What a compiled function reports: the number that is left in ``errors``, less 16 times the line."""
+"""Errors of a compiled function: the number in ``errors``, less 16 times the line."""
 ZERO, DOMAIN, OVERFLOW, INDEX, LOOP, NOT_FINITE, NO_INT, COMPLEX, UNBOUND, NO_RESULT, EMPTY, KEY, STEP = ERRORS
 MOST_ROUNDS = 1_000_000
 """Times that the loops of one call go round at most: a kernel that never ends would take the device with it."""

@@ -1,4 +1,4 @@
-"""What all functions of one file share while they are translated, and the names that the file itself gives values."""
+"""State shared by all functions of one file during translation, and the names to which the file itself assigns values."""
 
 from __future__ import annotations
 

@@ -84,6 +84,6 @@ def _translate(tree: ast.Module) -> Translated:
 
 
 def told(code: int) -> str:
-    """What an entry of ``errors`` says, in one line."""
+    """The meaning of an entry of ``errors``, in one line."""
     line, kind = divmod(code, 16)
     return f"line {line}: {ERRORS[kind]}" if line else ERRORS[kind]

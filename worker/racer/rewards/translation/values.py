@@ -1,4 +1,4 @@
-"""What an expression of a reward function is while it is translated: its type, and the C++ text that gives it."""
+"""Expressions of a reward function during translation: their type and their C++ text."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Thing:
-    """What has no value: ``params`` itself, a module, a built-in function or a function of the file.
+    """A name without a value: ``params`` itself, a module, a built-in function or a function of the file.
 
     Attributes:
         kind: ``params``, ``module``, ``builtin``, ``function`` or ``refused``.
