@@ -94,7 +94,7 @@ def _closed(directory: Path) -> bool:
 
 
 class ControllerRuns(ServerError):
-    """Another controller has this home directory; the message says which."""
+    """Another controller has this home directory; the message names it."""
 
 
 class HomeLock:

@@ -1,4 +1,4 @@
-"""A controller with its HTTP server in this process: what ``muster serve`` runs, and ``muster run`` where none is running."""
+"""A controller with its HTTP server in this process, for ``muster serve``, and for ``muster run`` where none is running."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def _check_token(token: str | None) -> None:
 
 
 def _check_proxies(addresses: Sequence[str]) -> None:
-    """Raises UsageError for what is neither an address nor a network."""
+    """Raises UsageError for a text that is neither an address nor a network."""
     for address in addresses:
         try:
             ipaddress.ip_network(address)

@@ -200,7 +200,7 @@ def check_all_queues(operation: Operation) -> None:
 
 
 def is_visible(thing: Object) -> bool:
-    """Whether the caller may read all of it; what is not visible is left out of lists."""
+    """Whether the caller may read all of it; lists leave out the rest."""
     return _allowed(current_identity.get(), Operation.LIST_JOBS, thing)
 
 

@@ -173,7 +173,7 @@ def _counted(summary: dict[str, int]) -> str:
 
 
 def _used(attempt: dict[str, Any], saves: bool) -> str:
-    """GPU time of an attempt (CPU time without GPUs), and the lost part if known: only for what ``saves``."""
+    """GPU time of an attempt (CPU time without GPUs), and the lost part if known, which only a job that ``saves`` has."""
     kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
     used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
     if not used:

@@ -163,7 +163,7 @@ def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
 
 
 def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
-    """The iteration of the checkpoint that is meant. Raises UsageError where there is none."""
+    """The iteration of the requested checkpoint. Raises UsageError where there is none."""
     iteration: int = chosen(client, run["run"], split_reference(source)[1])["iteration"]
     return iteration
 
@@ -179,7 +179,7 @@ def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
 
 
 def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> None:
-    """Run the job and bring what it made to ``output``. Raises typer.Exit, ServerError."""
+    """Run the job and bring its file to ``output``. Raises typer.Exit, ServerError."""
     job = submit_spec(client, spec, spec.name)["jobId"]
     with Activity() as told:
         told.wait(client, job)

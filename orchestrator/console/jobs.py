@@ -109,7 +109,7 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     if not ids:
         raise ClientError("no job that could be stopped is chosen; mark some in the table first")
     several = counted(len(ids), "job")
-    text = "Trainings save a checkpoint before they leave, and can be resumed. What waits is cancelled."
+    text = "Trainings save a checkpoint before they leave, and can be resumed. Waiting jobs are cancelled."
     form.confirm(Question(f"Stop {several}?", text, f"Stop {several}"))
     errors = []
     reason = f"stopped in the console by {current_identity.get().name}"

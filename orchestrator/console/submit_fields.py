@@ -140,14 +140,14 @@ def groups(task: str, queues: Sequence[str]) -> list[Group]:
     found += _racer(task) if races(task) else []
     config = config_schema(task)
     if config is None:
-        hint = "What this task accepts is not published here; its ranks check it."
+        hint = "This task publishes no schema; its ranks check the settings."
         found.append(Group("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
     else:
         left_out = {*kept_files(task_config(task)), *(("track",) if races(task) else ())}
         found += _groups("Task", config["properties"], "train.config", left_out)
     for name in ALGORITHMS:
         section = job_schema()["$defs"][f"Settings_{name}"]
-        hint = "What is left empty stays as the task has it."
+        hint = "Empty fields keep the task's own values."
         found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", (), name, hint)
     return [*found, Group("More", job(*_MORE))]
 

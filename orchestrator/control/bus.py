@@ -1,7 +1,7 @@
 """The bus's router, inside the controller: which nodes are present, their progress, and commands to them.
 
 Every node may connect; access rules in the router let a node publish below node keys and answer commands, and nothing else: it
-can neither send a command nor read a message. What a node says counts only with the proof of its attempt's credential, and
+can neither send a command nor read a message. A node's message counts only with the proof of its attempt's credential, and
 commands carry that proof to the node (:mod:`shared_store.bus`).
 
 The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval;

@@ -3,7 +3,7 @@
 A wall clock steps: a person sets it, NTP corrects it, a machine that was suspended wakes up hours later. The kernel's monotonic clock
 does not, and it is the same for every process until the machine boots again. Steady time is Unix time as the wall clock had it when a
 database was first used, and from there on what the monotonic clock counts: time for which the machine is suspended is not part of it.
-What people and clients read (``createdAt``, logs) stays wall-clock time.
+Times for people and clients (``createdAt``, logs) stay wall-clock times.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def take_snapshot(
         capacities: All that the engines have, by their names.
         waiting: The jobs that wait for room.
         active: Ids of the jobs that may hold some.
-        leading: What the last pass found at the head of each queue.
+        leading: The job that the last pass found at the head of each queue.
         first: The controller's first engine.
     """
     policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}

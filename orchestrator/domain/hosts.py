@@ -1,4 +1,4 @@
-"""Machines, what engines have of them, and the placement of a gang's nodes."""
+"""Machines, the capacity of engines, and the placement of a gang's nodes."""
 
 from __future__ import annotations
 

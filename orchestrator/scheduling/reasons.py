@@ -54,8 +54,8 @@ class WaitReport:
         now: Time of the pass [ms].
         lines: By queue.
         reservations: In the order in which they came.
-        free: What is free after the pass.
-        preempts: Who is preempted, by whom.
+        free: The free resources after the pass.
+        preempts: The preempted jobs, and the jobs for which they leave.
         drift: Difference of Unix time to the pass's clock [ms].
         """
         self._drift = drift

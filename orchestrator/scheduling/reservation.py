@@ -70,8 +70,8 @@ def reserve(job: Waiting, ces: tuple[str, ...], free: FreeResources, holders: It
 
     Args:
         job: It does not fit now.
-        ces: Where it would fit if nothing ran.
-        free: What is free now; not changed.
+        ces: The compute environments in which it would fit if nothing ran.
+        free: The free resources now; not changed.
         holders: Every gang that holds resources.
     """
     hosts = free.reach(ces)
@@ -117,9 +117,9 @@ def victims(
 
     Args:
         job: A job with a reservation, or about to get one.
-        share_score: What its share has used when its turn comes (:func:`orchestrator.scheduling.order.share_score`).
-        ces: Where it would fit if nothing ran.
-        free: What is free now; not changed.
+        share_score: The usage of its share when its turn comes (:func:`orchestrator.scheduling.order.share_score`).
+        ces: The compute environments in which it would fit if nothing ran.
+        free: The free resources now; not changed.
         snapshot: The pass.
         ending: Jobs that are being stopped: what they hold counts as coming free.
     """

@@ -1,4 +1,4 @@
-"""Tracks of the racer, by a process of the worker's: this package never imports what they are made of."""
+"""Tracks of the racer, by a process of the worker's: this package never imports their code."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
 
 
 def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any], GangSpec]:
-    """RegisterJobDefinition, and what the definition asks for. Raises ClientError."""
+    """RegisterJobDefinition: its answer, and the gang of the definition. Raises ClientError."""
     name, kind = request["jobDefinitionName"], request["type"]
     rules.check_name("jobDefinitionName", name)
     rules.check_tries(request)

@@ -94,7 +94,7 @@ def retry_strategy(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_defaults(container: Mapping[str, Any]) -> dict[str, Any]:
-    """``containerProperties`` with the empty lists that AWS shows for what was left out."""
+    """``containerProperties`` with the empty lists that AWS shows for missing members."""
     return {**{name: [] for name in _LISTS}, **container}
 
 
@@ -104,7 +104,7 @@ def node_ranges(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def ecs_with_defaults(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """``ecsProperties`` with the empty lists of what was left out."""
+    """``ecsProperties`` with empty lists for missing members."""
     in_task = [name for name in _LISTS if name != "volumes"]
     tasks = [
         {
@@ -163,7 +163,7 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
 
 
 def describe_damaged(job: Job, reason: str | None) -> dict[str, Any]:
-    """JobSummary of a job whose row is damaged: what can be read, and in its reason that the rest can't be."""
+    """JobSummary of a job whose row is damaged: the readable facts, and a reason that tells of the damage."""
     summary = _common(job, reason)
     said = summary["statusReason"] or ""
     summary["statusReason"] = said if DAMAGED in said else f"{said}; {DAMAGED}" if said else DAMAGED

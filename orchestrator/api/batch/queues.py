@@ -1,4 +1,4 @@
-"""Job queues: create, describe, update, delete, and what GetJobQueueSnapshot shows of them."""
+"""Job queues: create, describe, update, delete, and GetJobQueueSnapshot."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 
 
 def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and what is in use."""
+    """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and the resources in use."""
     queue = context.queue(request["jobQueue"], deleting=True)
     permissions.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
     order, times = context.reconciler.front(queue.name, 100)

@@ -64,7 +64,7 @@ class Access:
         return self._proven(given)[1]
 
     def sign_in(self, given: str) -> str:
-        """A session for whoever presents the server's token or a key; what identifies it says nothing of the secret. Raises Refusal."""
+        """Open a session for the server's token or a key; its text reveals nothing of the secret. Raises Refusal."""
         name, _ = self._proven(given)
         claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
         return f"{claim}.{self._seal(name, claim)}"
@@ -102,7 +102,7 @@ class Access:
         return hmac.new(self.console_secret, f"session\0{secret}\0{claim}".encode(), sha256).hexdigest()
 
     def _proven(self, given: str) -> tuple[str, Identity]:
-        """The credential's name in sessions, and who has it. Raises Refusal."""
+        """The credential's name in sessions, and its owner. Raises Refusal."""
         if self.token and hmac.compare_digest(given.encode(), self.token.encode()):
             return _TOKEN, Identity("MUSTER_TOKEN")
         access_key_id, _, secret = given.partition(":")

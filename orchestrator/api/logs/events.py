@@ -226,7 +226,7 @@ class View:
 
 @lru_cache(maxsize=4096)
 def log_file(path: Path, stream: str) -> LogFile:
-    """The log at ``path``, with what is known of it from earlier looks."""
+    """The log at ``path``, with the facts known from earlier looks."""
     return LogFile(path, stream)
 
 

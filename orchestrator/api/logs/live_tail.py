@@ -105,7 +105,7 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
 
     Args:
         tail: The session, which has begun already: the client may write as soon as it sees the first message.
-        start: What was asked for, to be told back in ``sessionStart``.
+        start: The request, which ``sessionStart`` repeats.
         group: Log group of the events, with the account.
         closing: Set when the server ends.
     """

@@ -239,7 +239,7 @@ def describe_log_streams(reconciler: Reconciler, request: dict[str, Any]) -> dic
 
 
 def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
-    """DescribeLogGroups: the one group, where it fits what is asked for."""
+    """DescribeLogGroups: the one group, where it fits the request."""
     prefix, pattern = request.get("logGroupNamePrefix"), request.get("logGroupNamePattern")
     if prefix is not None and pattern is not None:
         raise invalid("logGroupNamePrefix and logGroupNamePattern are mutually exclusive.")

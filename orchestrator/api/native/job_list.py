@@ -37,7 +37,7 @@ _MOST_CURVES = 4096
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which jobs: those of some states and of a queue whose name, id, run or owner has a text. Empty fields mean all."""
+    """A filter of jobs: by states, by queue, and by a text in their name, id, run or owner. Empty fields mean all."""
 
     statuses: tuple[Status, ...] = ()
     queue: str = ""
@@ -76,7 +76,7 @@ def find_jobs(
 
 
 def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE) -> dict[str, Any]:
-    """``jobs``, ``total`` and ``counts`` (by state, of all states) of what is wanted."""
+    """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter."""
     conditions = wanted.conditions()
     with reconciler.database.session() as session:
         grouped = select(Job.status, func.count()).where(*conditions).group_by(Job.status)

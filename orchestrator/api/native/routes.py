@@ -95,7 +95,7 @@ def permitted_job(session: Session, reference: str, operation: Operation) -> Job
 
 
 def _jobs_of_run(session: Session, reference: str) -> str:
-    """Which jobs made the run of this name, for who names it where a job is meant; empty where no visible job did."""
+    """A hint at the jobs that made the run of this name, for a caller who gives it in place of a job; empty without a visible job."""
     query = select(Job).where(Job.run == reference).order_by(Job.created_at)
     made = [job for job in session.scalars(query) if permissions.is_visible(job)]
     if not made:

@@ -134,7 +134,7 @@ def resume_run(
     body: ResumeRequest,
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
-    """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
+    """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.RESUME_RUN)
     return runs.resume(reconciler, run, body.changes(), idempotency_key)
@@ -147,7 +147,7 @@ def clone_run(
     body: CloneRequest,
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
-    """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key answers what the first one did."""
+    """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key gets the answer of the first one."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.CLONE_RUN)
     if body.dry_run:

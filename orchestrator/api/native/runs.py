@@ -94,7 +94,7 @@ def describe_run(reconciler: Reconciler, session: Session, run: Run) -> dict[str
 
 
 def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
-    """Name, iteration, size [bytes], reward and creation time [Unix s]; with ``verify`` also what is wrong with it."""
+    """Name, iteration, size [bytes], reward and creation time [Unix s]; with ``verify`` also its ``problem``."""
     facts: dict[str, Any] = {"name": checkpoint.name, "iteration": checkpoint.iteration, "epoch": checkpoint.epoch}
     facts["path"] = str(checkpoint.path)
     try:
@@ -307,7 +307,7 @@ def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint)
 
 
 def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
-    """Number of worlds with which the run continues: those that it has, whatever ranks there are. Raises ClientError where they don't fit."""
+    """Number of worlds with which the run continues: those that it has, whatever the number of ranks. Raises ClientError where they don't fit."""
     assert before.train is not None and after.train is not None
     ranks = after.nodes.max * after.ranks_per_node
     wanted = after.train.worlds * ranks
