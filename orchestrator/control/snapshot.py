@@ -95,7 +95,7 @@ def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Atte
 
 
 def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:
-    """Where a gang would start in the queue if nothing else ran, or why it never could; ``patience``: seconds to wait for the engines' newest hosts."""
+    """The hosts for a gang in the queue if nothing else ran, or why it could never start; ``patience``: seconds to wait for the engines' newest hosts."""
     first = engine.names[0]
     rows = [
         row for name in queue.compute_environments if (row := session.get(models.ComputeEnvironment, name)) is not None

@@ -14,8 +14,8 @@ import pytest
 from fastapi import Request
 
 from orchestrator.api.errors import ClientError
-from orchestrator.api.turns import Turns
 from orchestrator.api.http.access import Access
+from orchestrator.api.turns import Turns
 from orchestrator.console.live import Event, stream
 from shared_store.files import DamagedFile, open_inside
 from shared_store.layout import Store
