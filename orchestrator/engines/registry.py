@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import wait
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
@@ -25,6 +26,8 @@ from orchestrator.engines.secrets import Secrets, SecretsError
 
 FRESH = 2.0
 """Seconds that a request waits for the engines' newest hosts."""
+START = 5.0
+"""Seconds that a controller's start waits for the first answers of its engines; it goes on without those that are later."""
 
 _GIVEN = ("local", "docker")
 """Engines that hand the controller's secrets to their nodes."""
@@ -43,13 +46,14 @@ class EngineSet:
     """Engines by their names, each on its own thread; the first is the one that jobs of the queue ``default`` go to."""
 
     def __init__(self, engines: Sequence[Engine]) -> None:
-        """Takes the engines over: :meth:`close` closes them."""
+        """Takes the engines over: :meth:`close` closes them. Waits a little for their first answers."""
         self.secrets = Secrets()
         """The source of the jobs' secrets; none at first."""
         self.changed: Callable[[], None] = lambda: None
         """Called (on an engine's thread) when an engine has something new to tell."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
         self._runners = {engine.name: Runner(engine, lambda: self.changed()) for engine in engines}
+        wait([runner.first for runner in self._runners.values()], START)
 
     def close(self) -> None:
         """Close every engine; gangs go on."""
@@ -71,19 +75,21 @@ class EngineSet:
         return sorted({engine.address for engine in self.engines.values() if engine.address})
 
     def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Mapping[str, Capacity]:
-        """The capacity of all engines, or of these, by their names, as each told it last.
+        """The capacity of all engines, or of these, by their names, as each told it last; without those that have not told it yet.
 
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
         deadline = time.monotonic() + patience
-        return {
-            name: self._runners[name].capacity(max(0.0, deadline - time.monotonic()))
-            for name in (self.engines if names is None else names)
-            if name in self._runners
-        }
+        asked = [name for name in (self.engines if names is None else names) if name in self._runners]
+        told = {name: self._runners[name].capacity(max(0.0, deadline - time.monotonic())) for name in asked}
+        return {name: capacity for name, capacity in told.items() if capacity is not None}
+
+    def unknown(self) -> Mapping[str, str]:
+        """Why it is not known what an engine has, by the names of those that have not told it yet."""
+        return {name: why for name, runner in self._runners.items() if (why := runner.unknown) is not None}
 
     def health(self) -> Mapping[str, Health]:
-        """How each engine answers, by its name."""
+        """The answers of each engine, by its name."""
         return {name: runner.health for name, runner in self._runners.items()}
 
     def plan(self, gang: Gang) -> Plan[Any]:
