@@ -19,8 +19,11 @@ from orchestrator.engines.api import (
     NodeStatus,
     NotYet,
     Plan,
+    SecretValues,
+    Traits,
     read_handle,
 )
+from orchestrator.engines.installed import traits_of
 from orchestrator.engines.runner import Health, Runner
 from orchestrator.engines.secrets import Secrets, SecretsError
 
@@ -28,11 +31,6 @@ FRESH = 2.0
 """Seconds that a request waits for the engines' newest hosts."""
 START = 5.0
 """Seconds that a controller's start waits for the first answers of its engines; it goes on without those that are later."""
-
-_GIVEN = ("local", "docker")
-"""Engines that hand the controller's secrets to their nodes."""
-_PASSED_ON = ("aws-batch",)
-"""Engines that are sent the job's ``secrets`` as they are: AWS has its own."""
 
 
 class NotServed(NotYet):
@@ -67,7 +65,7 @@ class EngineSet:
 
     def is_elastic(self, names: Iterable[str]) -> bool:
         """Whether one of these engines may have more hosts later."""
-        return any(self.engines[name].elastic for name in names if name in self.engines)
+        return any(self.engines[name].traits.elastic for name in names if name in self.engines)
 
     @property
     def addresses(self) -> Sequence[str]:
@@ -96,17 +94,18 @@ class EngineSet:
         """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""
         runner = self._runner(engine_of(gang.placements[0].host))
         engine = runner.engine
+        traits = engine.traits
         named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
-        if named and not engine.images and gang.options.get("images") == "refuse":
+        if named and not traits.images and gang.options.get("images") == "refuse":
             raise EngineError(
                 f"image {min(named)}: the {engine.name} engine runs commands in its nodes' own environment, and compute environment "
                 f"{gang.compute_environment} refuses other images (tag muster:images)"
             )
-        if any(container.get("secrets") for container in gang.containers) and engine.name not in (*_GIVEN, *_PASSED_ON):
+        if any(container.get("secrets") for container in gang.containers) and traits.secrets is SecretValues.NONE:
             raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
-        if engine.images:  # its containers are what others have to imitate
+        if traits.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
-        elif engine.name != "local" and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
+        elif not traits.users and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
             raise EngineError(
                 f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out"
             )
@@ -121,7 +120,7 @@ class EngineSet:
         """
         if not any(container.get("secrets") for container in gang.containers):
             return gang
-        if engine_of(gang.placements[0].host) not in _GIVEN:
+        if self._traits(engine_of(gang.placements[0].host)).secrets is not SecretValues.ENVIRONMENT:
             return gang
         try:
             given = [self.secrets.of(container, gang.queue) for container in gang.containers]
@@ -132,7 +131,7 @@ class EngineSet:
 
     def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
         """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
-        if any(name not in _PASSED_ON for name in names):
+        if any(self._traits(name).secrets is not SecretValues.REFERENCES for name in names):
             self.secrets.check(containers, queue)
 
     def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]]) -> str:
@@ -165,6 +164,10 @@ class EngineSet:
         """The gang, one of whose nodes was placed on ``host``, is over; ``handle``: None where it was never launched."""
         if runner := self._runners.get(engine_of(host)):
             runner.forget(gang, read_handle(handle) if handle else None)
+
+    def _traits(self, name: str) -> Traits:
+        """Those of an engine, also of one that is not served."""
+        return self.engines[name].traits if name in self.engines else traits_of(name)
 
     def _runner(self, name: str) -> Runner:
         try:

@@ -37,6 +37,7 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.aws_batch import TRAITS
 from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
@@ -105,8 +106,7 @@ class AwsBatchEngine:
     """One account's AWS Batch, as ``$MUSTER_HOME/aws.json`` describes it."""
 
     name = "aws-batch"
-    elastic = True
-    images = True
+    traits = TRAITS
     address: str | None = None  # nodes on AWS do not reach this machine
 
     def __init__(self, home: Path) -> None:

@@ -43,6 +43,7 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.docker import TRAITS
 from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
@@ -75,8 +76,7 @@ class DockerEngine:
     """One machine's Docker Engine."""
 
     name = "docker"
-    elastic = False
-    images = True
+    traits = TRAITS
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
         """Args:

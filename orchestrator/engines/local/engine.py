@@ -34,6 +34,7 @@ from orchestrator.engines.api import (
     Transient,
     node_plans,
 )
+from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.environment import inherited
@@ -76,8 +77,7 @@ class LocalEngine:
     """One machine as an engine."""
 
     name = "local"
-    elastic = False
-    images = False
+    traits = TRAITS
     address: str | None = None
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:

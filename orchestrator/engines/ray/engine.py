@@ -36,6 +36,7 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.ray import TRAITS
 from orchestrator.engines.ray.bundles import in_words
 from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray.folder import LEASE, NEW, Folder
@@ -59,8 +60,7 @@ class RayEngine:
     """One Ray cluster."""
 
     name = "ray"
-    elastic = True
-    images = False
+    traits = TRAITS
 
     def __init__(self, home: Path, address: str | None = None) -> None:
         """Args:

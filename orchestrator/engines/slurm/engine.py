@@ -37,6 +37,7 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.slurm import TRAITS
 from orchestrator.engines.slurm.commands import (
     SlurmJob,
     Unreachable,
@@ -83,8 +84,7 @@ class SlurmEngine:
     """A Slurm cluster, by the commands of this machine."""
 
     name = "slurm"
-    elastic = True
-    images = False
+    traits = TRAITS
 
     def __init__(self) -> None:
         """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""

@@ -32,6 +32,7 @@ from orchestrator.engines.api import (
     NodeStatus,
     NotYet,
     Plan,
+    Traits,
     Transient,
     read_handle,
 )
@@ -56,7 +57,7 @@ def gang(directory: Path, name: str = "job", host: str = HOST, script: str = "ex
 class Fake:
     """An engine whose calls do what a test wants, and note on which thread they did."""
 
-    name, elastic, images, address = "engine", False, False, None
+    name, traits, address = "engine", Traits(), None
 
     def __init__(self) -> None:
         self.free, self.threads, self.closed = threading.Event(), set[str](), 0
