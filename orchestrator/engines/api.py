@@ -300,7 +300,7 @@ class SecretValues(StrEnum):
     """The way of the values of a job's secrets to its nodes."""
 
     NONE = "none"
-    """There is no safe one: a job with secrets is refused."""
+    """None is safe: a job with secrets is refused."""
     ENVIRONMENT = "environment"
     """The controller puts them into the nodes' environments when it launches the gang."""
     REFERENCES = "references"

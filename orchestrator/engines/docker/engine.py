@@ -288,7 +288,7 @@ class DockerEngine:
         return status
 
     def _settle(self, handle: Handle, index: int, state: Mapping[str, Any], words: str) -> bool:
-        """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written.
+        """Record the end of a node without a supervisor, as a supervisor does: the log is whole, then the outcome is written.
 
         False while the log is not whole yet.
         """
@@ -384,7 +384,7 @@ def _addresses(subnet: str, count: int) -> list[str]:
 
 
 def _uncopied(copies: Sequence[FollowedLog]) -> str:
-    """How many of the copies are under way, in words; empty once all have ended."""
+    """The number of copies that are under way, in words; empty once all have ended."""
     left = sum(not copy.wait(0.0) for copy in copies)
     return f"{counted(left, 'log')} not copied to the end" if left else ""
 

@@ -309,7 +309,7 @@ def _request(gang: Gang, node: NodePlan, machines: Mapping[str, Mapping[str, Any
 
 
 def _status(node: Mapping[str, Any], state: Mapping[str, Any], driven: bool) -> NodeStatus:
-    """How a node is, by what its driver says; ``driven``: the driver is there, or had nothing more to do."""
+    """The status of a node, by its driver's report; ``driven``: the driver is there, or had nothing more to do."""
     gpus = tuple(filter(None, node.get("gpus", "").split(",")))
     if not (node["running"] and driven):
         over = ended(node["address"], node["code"], node["detail"], gpus)

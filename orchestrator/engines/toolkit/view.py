@@ -50,7 +50,7 @@ class View(Generic[T]):
                 self._answer, self._missed = (value, at), None
 
     def missed(self, why: str) -> None:
-        """There is no answer now; the last value stays, and is stale."""
+        """Note that no answer came; the last value stays, and is stale."""
         with self._lock:
             self._missed = why, time.monotonic()
 
