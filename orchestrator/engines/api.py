@@ -355,7 +355,8 @@ class Engine(Protocol):
     def capacity(self) -> Capacity:
         """``Hosts`` to place gangs on, or ``Queued`` of an engine that queues and places them by itself: always the same of the two.
 
-        Names of hosts begin with the engine's and a slash.
+        Names of hosts begin with the engine's and a slash. Until the first answer the engine's jobs wait, and its controller goes
+        on without it. Raises EngineError where it can't be told now: the last answer counts, and the engine's health says why.
         """
         ...
 
@@ -380,7 +381,11 @@ class Engine(Protocol):
         ...
 
     def stop(self, handle: Handle, grace: float) -> None:
-        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left. Raises EngineError."""
+        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left.
+
+        Raises EngineError, which is the job's reason until the next try. It never waits for an answer without end: see
+        :func:`orchestrator.engines.toolkit.stopping.stop_within`.
+        """
         ...
 
     def close(self) -> None:
