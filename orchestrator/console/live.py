@@ -18,7 +18,9 @@ from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
 from orchestrator.api.errors import ClientError
+from orchestrator.api.http.access import Access
 from orchestrator.api.permissions import current_identity
+from orchestrator.console.pages import session
 from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
 
@@ -53,9 +55,20 @@ def last_id(request: Request) -> str:
 
 
 def stream(request: Request, look: Look, interval: float = INTERVAL) -> StreamingResponse:
-    """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends."""
+    """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends.
+
+    It also ends where its reader would not be admitted any more: a deleted key, a session that is over. The browser comes back, and is
+    sent to the login.
+    """
+    access: Access = request.app.state.access
+    identity = current_identity.get()
+    given = "" if "authorization" in request.headers else session(request)
+
+    def admitted() -> bool:
+        return access.still_admits(identity, given)
+
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
-    events = _admitted(current_identity.get().name, _events(look, interval, request.app.state.closing))
+    events = _admitted(identity.name, _events(look, interval, admitted, request.app.state.closing))
     return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 
 
@@ -80,10 +93,12 @@ async def _admitted(name: str, events: AsyncGenerator[bytes, None]) -> AsyncIter
             del _open[name]
 
 
-async def _events(look: Look, interval: float, closing: threading.Event) -> AsyncGenerator[bytes, None]:
+async def _events(
+    look: Look, interval: float, admitted: Callable[[], bool], closing: threading.Event
+) -> AsyncGenerator[bytes, None]:
     begun = spoken = time.monotonic()
     yield format_sse_event(retry=1000, comment="Muster")
-    while not closing.is_set() and time.monotonic() - begun < _LONGEST:
+    while not closing.is_set() and time.monotonic() - begun < _LONGEST and admitted():
         try:
             found = await run_in_threadpool(look)
         except (ClientError, DatabaseError, DamagedFile, OSError) as error:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import secrets
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from typing import Any
 
@@ -41,6 +44,7 @@ train:
   worlds: 128
   iterations: 100
 """
+_MOST_KEPT = 1000
 _turns = Turns("other reward functions are being tried")
 """Each is tried in a process of its own."""
 
@@ -122,14 +126,58 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
         return _editor(request, text, problem, 400)
     fields = [(name, value) for name, values in form.fields.items() for value in values if name != TOKEN]
     return render(
-        request, "submit_review.html", spec=spec, text=text, plan=plan, unplanned=unplanned, task=task, fields=fields
+        request,
+        "submit_review.html",
+        spec=spec,
+        text=text,
+        plan=plan,
+        unplanned=unplanned,
+        task=task,
+        fields=fields,
+        once=secrets.token_urlsafe(16),
     )
 
 
 @router.post("/submit")
 def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
-    """Submit the job of a YAML, as ``muster submit`` does."""
+    """Submit the job of a YAML, as ``muster submit`` does; a form that is sent again leads to the job that it made."""
     permissions.check(Operation.SUBMIT_JOB)
+    sender = permissions.current_identity.get().name
+    job, name, is_new = _sent.once((sender, form.one("once")), lambda: _submitted(request, form))
+    return done(
+        request, f"/jobs/{job}", f"{'submitted' if is_new else 'this form has already submitted'} {name} as {job[:8]}"
+    )
+
+
+class _Sent:
+    """The jobs of the forms that were sent last: a second click, or a form that a browser sends again, makes no second job."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[tuple[str, str], tuple[threading.Lock, list[tuple[str, str]]]] = OrderedDict()
+
+    def once(self, form: tuple[str, str], make: Callable[[], tuple[str, str]]) -> tuple[str, str, bool]:
+        """The id and the name of the form's job, and whether ``make`` has made it just now. What ``make`` raises is not kept.
+
+        ``form``: its sender and its random name; a form without one makes a job each time.
+        """
+        if not form[1]:
+            return *make(), True
+        with self._lock:
+            lock, made = self._kept.setdefault(form, (threading.Lock(), []))
+            while len(self._kept) > _MOST_KEPT:
+                self._kept.popitem(last=False)
+        with lock:
+            if is_new := not made:
+                made.append(make())
+            return *made[0], is_new
+
+
+_sent = _Sent()
+
+
+def _submitted(request: Request, form: Form) -> tuple[str, str]:
+    """Submit the job of a form; its id and its name."""
     text = _lines(form.one("yaml"))
     spec, problem = _checked(text, whole=True)
     if spec is None:
@@ -141,7 +189,7 @@ def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
         raise ClientError(unfit.message)
     registered = batch.call(reconciler, "RegisterJobDefinition", definition)
     answer = batch.call(reconciler, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
-    return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']} as {answer['jobId'][:8]}")
+    return answer["jobId"], answer["jobName"]
 
 
 def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:

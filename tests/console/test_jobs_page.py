@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from playwright.sync_api import Locator, expect
 
-from tests.support.console.fixtures import Console
+from tests.support.console.fixtures import Console, secret_of
 from tests.support.console.person import People, Person
 from tests.support.orchestrator.jobs import await_status
 
@@ -58,6 +58,42 @@ def test_a_job_is_stopped_without_a_mouse(console: Console, people: People, wait
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     expect(row(person, job).locator(".badge")).to_have_text("FAILED")
+
+
+def test_a_job_is_submitted_by_the_wizard_without_a_mouse(console: Console, people: People) -> None:
+    person = people(console.url, console.secrets["admin"])
+    page = person.goto("/")
+    for link in ('nav a[href="/submit"]', 'a[href="/submit/task/Cartpole"]'):
+        tab_to(person, link)
+        page.keyboard.press("Enter")
+        page.wait_for_url(f"**{link.split(chr(34))[1]}")
+    tab_to(person, "input[name=name]")
+    page.keyboard.press("Control+A")
+    page.keyboard.type("typed")
+    tab_to(person, "aside button.main", backwards=True)
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="Review typed")).to_be_visible()
+    tab_to(person, 'form[action="/submit"] button')
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/jobs/*")
+    expect(page.get_by_role("heading", level=1)).to_contain_text("typed")
+    console.client.batch("TerminateJob", jobId=page.url.rpartition("/")[2], reason="seen")
+
+
+def test_an_open_page_leads_to_the_login_when_its_key_is_deleted_and_back_with_another(
+    console: Console, people: People, waiting: str
+) -> None:
+    person = people(console.url, secret_of(console.keys.create("passing")))
+    page = person.goto("/?search=shared")
+    job = console.submit(waiting, "shared-later")
+    expect(row(person, job)).to_be_visible()
+    console.keys.delete("passing")
+    page.wait_for_url("**/login?next=*")
+    page.get_by_label("Key, as").fill(console.secrets["admin"])
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/?search=shared")
+    expect(row(person, job)).to_be_visible()
+    console.client.batch("TerminateJob", jobId=job, reason="seen")
 
 
 def tab_to(person: Person, selector: str, backwards: bool = False) -> None:

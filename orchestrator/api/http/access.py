@@ -80,6 +80,15 @@ class Access:
             return None
         return Identity("MUSTER_TOKEN") if name == _TOKEN else identity_of(self.known()[name])
 
+    def still_admits(self, identity: Identity, session: str) -> bool:
+        """Whether a caller who was admitted as ``identity`` would be admitted now; ``session``: the caller's, empty without one."""
+        if session:
+            return self.session(session) == identity
+        if not self.demanded() or identity == THIS_PROCESS:
+            return True
+        of_token = self.token is not None and identity == Identity("MUSTER_TOKEN")
+        return of_token or any(identity_of(key) == identity for key in self.known().values())
+
     def sign_out(self, given: str) -> None:
         """Close a session; a restart of the server forgets that, and the session's own end does not."""
         now = time.time()

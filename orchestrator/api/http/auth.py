@@ -382,7 +382,7 @@ def cookie_name(port: int | None) -> str:
 def _refused(request: _Request, refusal: ClientError) -> Response:
     """The refusal; a person's browser without a session is sent to the login instead."""
     wanted = request.first("accept") or ""
-    if request.method == "GET" and "text/html" in wanted and kind_of(refusal) in _UNKNOWN:
+    if request.method in ("GET", "HEAD") and "text/html" in wanted and kind_of(refusal) in _UNKNOWN:
         there = request.raw_path.decode("latin-1") + ("?" + request.query.decode("latin-1") if request.query else "")
         return RedirectResponse(f"{LOGIN}?next={quote(there, safe='')}", 303)
     return error_response(str(refusal), refusal.status, kind_of(refusal))

@@ -54,7 +54,11 @@ export function subscribe(address, handlers) {
 
   async function returned() {
     try {
-      const answer = await fetch(location.href, { method: "HEAD", redirect: "manual" });
+      const answer = await fetch(location.href, {
+        method: "HEAD",
+        redirect: "manual",
+        headers: { Accept: "text/html" },
+      });
       if (answer.type === "opaqueredirect") return location.reload(); // to the login
     } catch {
       // the server is still away

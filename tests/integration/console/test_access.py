@@ -82,6 +82,27 @@ def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_pa
         server.close()
 
 
+@pytest.mark.parametrize("way", ["deleted key", "logout"])
+def test_a_stream_ends_with_its_readers_session(console: Console, way: str) -> None:
+    visitor = Visitor(console.url, secret_of(console.keys.create("passing")))
+    other = httpx.Client(base_url=console.url, cookies=visitor.http.cookies, headers={"Accept": "text/html"})
+    with visitor.http.stream("GET", "/jobs/stream", headers={"Accept": "text/event-stream"}) as answer:
+        lines = answer.iter_lines()
+        assert next(lines).startswith(":"), "the stream is open"
+        if way == "logout":
+            token = Page(other.get("/").text).form_token
+            assert other.post("/logout", data={"form_token": token}).status_code == 303
+        else:
+            console.keys.delete("passing")
+        assert "event: end" not in list(lines), "the browser comes back, and is asked who it is"
+    asked = other.head("/jobs/stream", headers={"Accept": "text/html"})
+    assert asked.status_code == 303 and asked.headers["location"].startswith("/login")
+    if way == "logout":
+        console.keys.delete("passing")
+    other.close()
+    visitor.close()
+
+
 def test_a_session_reads_the_api_and_changes_nothing_through_it(console: Console) -> None:
     visitor = console.visitor()
     assert visitor.http.get("/api/jobs").json()["jobs"] == []

@@ -15,6 +15,7 @@ from fastapi import Request
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.turns import Turns
+from orchestrator.api.http.access import Access
 from orchestrator.console.live import Event, stream
 from shared_store.files import DamagedFile, open_inside
 from shared_store.layout import Store
@@ -61,7 +62,8 @@ def test_a_form_searches_for_no_longer_text_than_the_page(console: Console) -> N
 
 
 def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends() -> None:
-    request = cast(Request, SimpleNamespace(app=SimpleNamespace(state=SimpleNamespace(closing=threading.Event()))))
+    state = SimpleNamespace(closing=threading.Event(), access=Access())
+    request = cast(Request, SimpleNamespace(app=SimpleNamespace(state=state), headers={"authorization": ""}))
 
     def opened() -> AsyncIterator[bytes]:
         return cast(AsyncIterator[bytes], aiter(stream(request, lambda: [Event("rows", {})]).body_iterator))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -94,6 +95,24 @@ def test_the_wizard_shows_the_yaml_that_it_submits(console: Console) -> None:
     assert "gamma" not in console.visitor("lab").page(f"/submit/yaml?job={id_}", 403).text
     back = Page(visitor.http.post("/submit/task/Cartpole", data=fields).text)
     assert inputs(back)["train.ppo.gamma"] == "0.9" and inputs(back)["nodes"] == "{min: 1, max: 2}"
+
+
+def test_a_form_that_is_sent_again_leads_to_the_job_that_it_made(console: Console) -> None:
+    visitor, other = console.visitor(), console.visitor("lab")
+    answer = visitor.http.post("/submit/review", data={"form_token": visitor.page("/").form_token, "yaml": COMMAND})
+    (once,) = Page(answer.text).all("input", name="once")
+    fields = {"yaml": yaml_of(Page(answer.text)), "once": str(once["value"])}
+    with ThreadPoolExecutor(4) as pool:
+        answers = [each.json() for each in pool.map(lambda _: visitor.submit("/submit", **fields), range(4))]
+    (place,) = {each["location"] for each in answers}
+    assert sum(each["message"].startswith("submitted") for each in answers) == 1
+    assert sum(each["message"].startswith("this form has already submitted") for each in answers) == 3
+    lab = {**fields, "yaml": COMMAND.replace("works", "works-too")}
+    others = [(other, lab), (visitor, {**fields, "once": "another"}), (visitor, {**fields, "once": ""})]
+    jobs = [place, *(who.submit("/submit", **sent).json()["location"] for who, sent in others)]
+    assert len(set(jobs)) == 4, "another person's form, another form, a form without a name"
+    for each in jobs:
+        console.client.batch("TerminateJob", jobId=each.rpartition("/")[2], reason="seen")
 
 
 @pytest.mark.parametrize(
