@@ -306,7 +306,11 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(
         bench.engine.stop(handle, 0)
     [node] = bench.engine.observe(handle)
     assert "500" in node.words and "does not answer" in node.stale, "the last status, told as an old one"
+    monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
+    with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):
+        bench.engine.capacity()
     bench.engine._batch = there
+    assert bench.engine.capacity().limits == limit
     with pytest.raises(NotYet, match="does not answer"):
         away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
 

@@ -10,6 +10,8 @@ from queue import SimpleQueue
 import pytest
 
 from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.engines.slurm import commands
+from orchestrator.engines.slurm import engine as slurm
 from orchestrator.engines.toolkit.view import CachedView, View
 from tests.conftest import wait_for
 
@@ -102,3 +104,31 @@ def test_a_bug_in_the_reading_is_trouble_and_not_the_end_of_the_view(
     wait_for(lambda: [type(each) for each in seen] == [KeyError], 10, "its traceback")
     backend.answers.put("first")
     assert view.get(0.0, patience=60.0) == "first"
+
+
+def test_a_slurm_that_went_away_can_t_tell_its_hosts_and_its_last_answer_is_not_taken_for_the_truth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answers = ["NodeName=n1 CPUTot=4 RealMemory=1000 State=IDLE"]
+
+    def call(*command: str, **_: object) -> str:
+        if not answers:
+            raise commands.Unreachable("slurmctld does not answer")
+        return answers[0] if "nodes" in command else ""
+
+    monkeypatch.setattr(commands, "call", call)
+    monkeypatch.setattr(slurm, "_HOSTS_AGE", 0.0)
+    engine = slurm.SlurmEngine()
+    assert [host.name for host in engine.capacity().machines] == ["slurm/n1"]
+    answers.clear()
+
+    def problem() -> str:
+        try:
+            engine.capacity()
+        except NotYet as error:
+            return str(error)
+        return ""
+
+    assert wait_for(problem, 10, "the trouble") == "Slurm: slurmctld does not answer"
+    answers.append("NodeName=n2 CPUTot=4 RealMemory=1000 State=IDLE")
+    wait_for(lambda: not problem() and engine.capacity().machines[0].name == "slurm/n2", 10, "the recovery")
