@@ -211,9 +211,10 @@ class RayEngine:
         def step() -> str:
             nonlocal asked
             state = read_json(folder.state(gang))
-            if state["phase"] == "stopped" if state is not None else not folder.plan(gang).exists():
+            phase = state["phase"] if state is not None else ""
+            if phase == "stopped" or (state is None and not folder.plan(gang).exists()):
                 return ""
-            if state is not None and state["phase"] == "stopping" and state["why"]:
+            if state is not None and phase == "stopping" and state["why"]:
                 raise EngineError(f"{state['why']}; its CPUs and GPUs are not given to other jobs until it is gone")
             now = time.monotonic()
             if now > patience and state is not None:  # frozen; its actors have missed it for long enough
@@ -223,7 +224,7 @@ class RayEngine:
                 asked = now
                 if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
                     self._outwait(folder, gang)
-            return f"its driver says {state['phase']}" if state is not None else "its driver has said nothing yet"
+            return f"its driver says {phase}" if phase else "its driver has said nothing yet"
 
         stop_within(grace + _ENDING, step, engine=self.name, gang=gang, pause=0.02)
         with self._lock:
