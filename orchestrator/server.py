@@ -129,8 +129,7 @@ class Server:
             stack.callback(self.reconciler.close)
             self.evaluations = AutomaticEvaluations(self.reconciler)
             stack.callback(self.evaluations.close)
-            if "local" in nodes.names:
-                _name_lost_gangs(home, found)
+            _name_lost_gangs(home, found)
             bound = self._socket.getsockname()[1]
             self.url = (
                 f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"

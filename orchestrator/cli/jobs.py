@@ -16,7 +16,7 @@ from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.hosts import engine_of
-from orchestrator.engines.installed import ENGINES
+from orchestrator.engines.installed import ENGINES, traits_of
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.json_schema import contract_schema, schema
@@ -185,7 +185,7 @@ def _gpus(node: dict[str, Any]) -> str:
     """The GPUs of a node, or their number if only its engine knows them."""
     if not node["gpus"]:
         return ""
-    known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
+    known = node.get("devices") or (node["gpus"] if traits_of(engine_of(node["host"])).gpu_ids else None)
     if known:
         return f", GPUs {','.join(known)}"
     return f", {counted(len(node['gpus']), 'GPU')}"

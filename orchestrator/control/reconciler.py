@@ -260,6 +260,7 @@ class Reconciler:
         if not waiting:
             self._report, self._passed = None, (version, started, 0.0)
             return
+        unknown = self.engine.unknown()  # before the capacity: an engine may tell it in between
         with self.database.session() as session:
             snapshot = take_snapshot(
                 session,
@@ -269,6 +270,7 @@ class Reconciler:
                 self.work_queue.active(),
                 self._leading,
                 self.engine.names[0],
+                unknown,
             )
         decisions = decide(snapshot)
         self._report, self._leading = decisions.report, decisions.leading

@@ -102,6 +102,9 @@ class WaitReport:
         """The reason shared by all jobs of a shape in a queue, and whether it is another job."""
         if reason := cache.impossible(shape) or cache.barred(shape):
             return False, reason
+        unknown = [cache.compute_environments[ce].unknown for ce in cache.possible(shape)]
+        if all(unknown):
+            return False, f"{NO_ROOM} - {needs(shape)}; {unknown[0]}"
         before = self._before(queue, cache, shape)
         if before is None:
             return False, f"{NO_ROOM} - {self._free(shape, cache.possible(shape)[0])}"

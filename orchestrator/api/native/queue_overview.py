@@ -176,7 +176,7 @@ def _engines(reconciler: Reconciler, capacities: Mapping[str, Capacity]) -> list
             "name": name,
             "queue": own[name],
             "elastic": engine.is_elastic([name]),
-            "queuesByItself": isinstance(capacities[name], Queued),
+            "queuesByItself": isinstance(capacities.get(name), Queued),
             "toldAt": health.told_at,
             "problem": health.problem,
             "failing": health.failing,

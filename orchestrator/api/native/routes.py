@@ -187,7 +187,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             "plan the job with fewer nodes"
         )
     name = engine_of(placements[0].host)
-    images = reconciler.engine.engines[name].images
+    images = reconciler.engine.engines[name].traits.images
     return {
         "engine": name,
         "computeEnvironment": compute_environment,

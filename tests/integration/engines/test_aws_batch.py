@@ -17,7 +17,7 @@ import boto3
 import pytest
 
 from orchestrator.domain.hosts import Limit, Placement
-from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.engines.api import EngineError, NotYet, Transient
 from orchestrator.engines.aws_batch import engine as aws_batch
 from orchestrator.engines.aws_batch.config import is_mounted_from
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
@@ -279,7 +279,9 @@ def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(
     assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
 
 
-def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench) -> None:
+def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(
+    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
 
     def reason() -> str:
@@ -295,7 +297,20 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
     away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
     [node] = away.engine.observe(handle)
-    assert node.running and "does not answer" in node.words
+    assert node.running and "does not answer" in node.words and node.stale == node.words
+    bench.engine._batch, there = nowhere, bench.engine._batch
+    monkeypatch.setattr(aws_batch, "_ENDING", 0.1)
+    with pytest.raises(
+        Transient, match=r"^the aws-batch engine has not ended gang .*; last answer: AWS Batch does not"
+    ):
+        bench.engine.stop(handle, 0)
+    [node] = bench.engine.observe(handle)
+    assert "500" in node.words and "does not answer" in node.stale, "the last status, told as an old one"
+    monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
+    with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):
+        bench.engine.capacity()
+    bench.engine._batch = there
+    assert bench.engine.capacity().limits == limit
     with pytest.raises(NotYet, match="does not answer"):
         away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
 
