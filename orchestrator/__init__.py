@@ -1,4 +1,4 @@
-"""The control plane: what runs, where, when. Imports no torch, no warp, no newton, and nothing of ``worker``."""
+"""The control plane, which decides when and where jobs run. Imports no torch, no warp, no newton, and nothing of ``worker``."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class Client:
         self.url = url
         self._found = False
         self.successor: Callable[[], Client] | None = None
-        """Where to find, or how to start, another controller when this one is gone; else it is waited for."""
+        """Finds or starts another controller when this one is gone; None: the client waits for this one."""
         self.told: Callable[[str], object] = lambda line: None
         """Is called with what a person would like to know while nothing happens."""
         headers = {"Authorization": f"Bearer {token}"} if token else {}

@@ -34,7 +34,7 @@ def muster_home() -> Path:
 
 
 def local_url() -> str | None:
-    """Where the controller of this home directory says that it listens; None where it does not run."""
+    """URL at which the controller of this home directory listens; None where it does not run."""
     try:
         told = json.loads((muster_home() / "controller.json").read_text())
         os.kill(int(told["pid"]), 0)
@@ -94,7 +94,7 @@ def _closed(directory: Path) -> bool:
 
 
 class ControllerRuns(ServerError):
-    """Another controller has this home directory; the message says which."""
+    """Another controller has this home directory; the message names it."""
 
 
 class HomeLock:

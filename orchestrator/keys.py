@@ -1,4 +1,4 @@
-"""Access keys: who may call the server. Kept in ``$MUSTER_HOME/keys.json``, written by ``muster keys``, read by the server.
+"""Access keys for callers of the server. Kept in ``$MUSTER_HOME/keys.json``, written by ``muster keys``, read by the server.
 
 The file holds the secrets themselves, because a signature can be checked only with the secret that made it. So it is for its
 owner alone (mode 0600), and a file that others can read is refused.
@@ -46,7 +46,7 @@ class _Document(BaseModel):
 
 
 class Key(_Document):
-    """A pair that signs requests, and what it may do."""
+    """A pair that signs requests, and its permissions."""
 
     name: str = Field(pattern=_NAME_PATTERN)
     access_key_id: str = Field(pattern=r"^[A-Z0-9]{16,128}$")
@@ -59,7 +59,7 @@ class Key(_Document):
 
     @property
     def rights(self) -> str:
-        """What it may do, in words."""
+        """Its permissions, in words."""
         queues = "all queues" if self.queues is None else f"queues {', '.join(self.queues)}"
         return f"{queues}, {'read only' if self.read_only else 'read and write'}"
 

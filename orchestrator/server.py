@@ -1,4 +1,4 @@
-"""A controller with its HTTP server in this process: what ``muster serve`` runs, and ``muster run`` where none is running."""
+"""A controller with its HTTP server in this process, for ``muster serve``, and for ``muster run`` where none is running."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _FEWEST_CHARACTERS = 6
 _CLIENT = re.compile(r"(MSTR[A-Z2-7]{16}):")
 _INVALID = Seldom("Invalid HTTP request received")
 _NO_DESCRIPTOR = Seldom("socket.accept() out of system resource")
-"""What any client can have uvicorn and asyncio log at any rate."""
+"""Log lines of uvicorn and asyncio that any client can cause at any rate."""
 
 
 class Server:
@@ -129,8 +129,7 @@ class Server:
             stack.callback(self.reconciler.close)
             self.evaluations = AutomaticEvaluations(self.reconciler)
             stack.callback(self.evaluations.close)
-            if "local" in nodes.names:
-                _name_lost_gangs(home, found)
+            _name_lost_gangs(home, found)
             bound = self._socket.getsockname()[1]
             self.url = (
                 f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
@@ -171,7 +170,7 @@ class Server:
         self._lock.publish(self.url)
 
     def close(self) -> None:
-        """Stop serving; running gangs go on, and the next controller of this home finds them."""
+        """Stop serving; running gangs continue, and the next controller of this home finds them."""
         self.app.state.closing.set()
         self._uvicorn.should_exit = True
         if self._thread.is_alive():
@@ -253,7 +252,7 @@ def _check_token(token: str | None) -> None:
 
 
 def _check_proxies(addresses: Sequence[str]) -> None:
-    """Raises UsageError for what is neither an address nor a network."""
+    """Raises UsageError for a text that is neither an address nor a network."""
     for address in addresses:
         try:
             ipaddress.ip_network(address)

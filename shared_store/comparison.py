@@ -41,7 +41,7 @@ class RunFacts:
 
     @property
     def train(self) -> Mapping[str, Any]:
-        """How it was trained."""
+        """The ``train`` section of its spec."""
         train = self.spec.get("train")
         return train if isinstance(train, Mapping) else {}
 
@@ -163,7 +163,7 @@ def facts_of(
     checkpoints: Sequence[Mapping[str, Any]],
     evaluations: Sequence[Mapping[str, Any]],
 ) -> RunFacts:
-    """What is compared of a run, from what the native API tells of it, its metrics, its checkpoints and its evaluations.
+    """The compared facts of a run, from the native API's answers about it, its metrics, its checkpoints and its evaluations.
 
     It is judged by its best checkpoint that has an evaluation, else by the last one that has.
     """
@@ -194,7 +194,7 @@ def same_episodes(new: RunFacts, old: RunFacts) -> tuple[Mapping[str, Any], Mapp
 
 
 def versus(group: Group, first: Group) -> dict[str, Any] | None:
-    """How a single run differs from the first one in the same episodes; None where there are no such, or they can't be read here.
+    """The difference of a single run from the first one in the same episodes; None where they have none, or these can't be read here.
 
     Returns:
         ``new`` and ``old`` (as ``RUN@ITERATION``), and what :func:`shared_store.pairs.paired` finds.
@@ -217,7 +217,7 @@ def versus(group: Group, first: Group) -> dict[str, Any] | None:
 
 
 def sentence(told: Mapping[str, Any]) -> str:
-    """What :func:`versus` found, in words."""
+    """The result of :func:`versus`, in words."""
     low, high = (f"{end:+.2f}" if end is not None else "-" for end in (told["low"], told["high"]))
     return (
         f"{told['new']} against {told['old']}: return {told['difference']:+.2f} ({low} to {high}, paired over "

@@ -21,7 +21,7 @@ TERMS_SHOWN = 6
 """Number of reward terms in a printed table: the largest ones."""
 
 BY_CLOCK = "the clock ended the episode"
-"""What a success is of a task that does not declare it: its length tells as much."""
+"""The criterion of success for a task that declares none: the episode's length tells as much."""
 
 _NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9-]{1,40})?")
 _NUMBERS = ("mean_return", "mean_length", "max_length", "episodes", "time")

@@ -185,7 +185,7 @@ def lines_after(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_WI
 
 @dataclass(frozen=True)
 class Found:
-    """What a search has found, and where it goes on."""
+    """The lines that a search has found, and the place where it continues."""
 
     lines: list[LogLine]
     place: Places

@@ -132,7 +132,7 @@ class Group(_Part):
 
 @dataclass(frozen=True)
 class Target(_Part):
-    """What a choice asks of one joint."""
+    """The effect of a choice on one joint."""
 
     joint: str
     """Name of the joint."""
@@ -172,9 +172,9 @@ class Action(_Part):
     range: Pair | None = None
     """Least and greatest position of the joint [m, rad]; null: not limited, or unknown."""
     rule: str = ""
-    """How the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
+    """The rule by which the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
     targets: tuple[Target, ...] = ()
-    """What a choice asks of the joints, the same joints for each choice; empty: it is no choice, or the task does not declare it."""
+    """The effect of a choice on the joints, the same joints for each choice; empty: it is no choice, or the task does not declare it."""
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,13 @@ def policy_arn(name: str) -> str:
 
 
 def ecs_arn(kind: str, environment: str, name: str = "") -> str:
-    """ARN of the ECS ``cluster`` that a compute environment would have, or with ``name`` of what is in it (``task`` …)."""
+    """ARN of the ECS ``cluster`` that a compute environment would have, or with ``name`` that of an object in it (``task`` …)."""
     below = f"/{name}" if name else ""
     return f"arn:aws:ecs:{REGION}:{ACCOUNT}:{kind}/AWSBatch-{environment}{below}"
 
 
 def plain_name(reference: str, kind: str) -> str:
-    """The name in an ARN of this controller's ``kind`` (``job``, ``job-queue`` …); what is no ARN, as it is. Raises ClientError."""
+    """The name in an ARN of this controller's ``kind`` (``job``, ``job-queue`` …); any other text is returned unchanged. Raises ClientError."""
     if not reference.startswith("arn:"):
         return reference
     found, name = split_arn(reference)

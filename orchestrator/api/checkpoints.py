@@ -13,7 +13,7 @@ CONFLICT = 409
 
 
 def choose(run: Run, wanted: int | Literal["best", "latest"] | None) -> Checkpoint | None:
-    """The checkpoint that is meant; None for the newest one of a run that has none. Raises ClientError where there is no such."""
+    """The requested checkpoint; None for the newest one of a run that has none. Raises ClientError where it does not exist."""
     checkpoints = list_checkpoints(run)
     there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
     if wanted in (None, "latest"):

@@ -55,7 +55,7 @@ class Refusal(ClientError):
 
 @dataclass(frozen=True)
 class Identity:
-    """Who sends a request. ``queues``: names of those that it may use; None means all."""
+    """The sender of a request. ``queues``: names of the queues that it may use; None means all."""
 
     name: str
     queues: frozenset[str] | None = None
@@ -200,7 +200,7 @@ def check_all_queues(operation: Operation) -> None:
 
 
 def is_visible(thing: Object) -> bool:
-    """Whether the caller may read all of it; what is not visible is left out of lists."""
+    """Whether the caller may read all of it; lists leave out the rest."""
     return _allowed(current_identity.get(), Operation.LIST_JOBS, thing)
 
 

@@ -26,7 +26,7 @@ def check_names(store: Store, named: Any, key: str) -> None:
     """Raise ClientError where a track does not exist or is damaged.
 
     Args:
-        store: Where tracks lie.
+        store: The store that holds the tracks.
         named: One name, or a list of them; anything else is the schema's matter.
         key: Of the spec, which names them.
     """

@@ -40,7 +40,7 @@ class Source:
 
 
 def sources_of(gang: GangSpec) -> list[Source]:
-    """What a job reads; each node reads the spec of its own environment. Raises ClientError."""
+    """The sources that a job reads; each node reads the spec of its own environment. Raises ClientError."""
     nodes = {id(node): node for node in gang.nodes}
     return sorted({source for node in nodes.values() for source in _sources(node)})
 
@@ -54,9 +54,9 @@ class TeacherNeeded(ClientError):
 
 
 def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> TeacherNeeded | None:
-    """The runs are there and have what is read of them, unless the job waits for another one that makes them.
+    """Check that the runs exist and have the files that the job reads, unless it waits for another one that makes them.
 
-    The caller may read them. A run that holds its teacher already needs the teacher's run no more. Raises ClientError.
+    The caller must be allowed to read them. A run that holds its teacher already needs the teacher's run no more. Raises ClientError.
 
     Returns:
         The teacher's weights, where the job's run has to hold a copy of them.

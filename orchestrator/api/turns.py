@@ -1,4 +1,4 @@
-"""Requests that take turns: their work is a process on the server's machine, and who waits for it holds a thread that others need."""
+"""Requests that take turns: their work is a process on the server's machine, and a waiting request holds a thread that others need."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Turns:
     """At most ``at_once`` work at a time, and at most ``waiting`` others wait, for ``patience`` seconds each. Any thread may call."""
 
     def __init__(self, what: str, at_once: int = 2, waiting: int = 6, patience: float = 20.0) -> None:
-        """``what``: what is done now, for those who are refused."""
+        """``what``: the work that goes on now, for the message of a refusal."""
         self._what, self._patience = what, patience
         self._there, self._working = threading.Semaphore(at_once + waiting), threading.Semaphore(at_once)
 

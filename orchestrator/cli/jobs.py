@@ -16,7 +16,7 @@ from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.hosts import engine_of
-from orchestrator.engines.installed import ENGINES
+from orchestrator.engines.installed import ENGINES, traits_of
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.json_schema import contract_schema, schema
@@ -173,7 +173,7 @@ def _counted(summary: dict[str, int]) -> str:
 
 
 def _used(attempt: dict[str, Any], saves: bool) -> str:
-    """GPU time of an attempt (CPU time without GPUs), and the lost part if known: only for what ``saves``."""
+    """GPU time of an attempt (CPU time without GPUs), and the lost part if known, which only a job that ``saves`` has."""
     kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
     used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
     if not used:
@@ -185,7 +185,7 @@ def _gpus(node: dict[str, Any]) -> str:
     """The GPUs of a node, or their number if only its engine knows them."""
     if not node["gpus"]:
         return ""
-    known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
+    known = node.get("devices") or (node["gpus"] if traits_of(engine_of(node["host"])).gpu_ids else None)
     if known:
         return f", GPUs {','.join(known)}"
     return f", {counted(len(node['gpus']), 'GPU')}"
@@ -331,11 +331,11 @@ def stop(
     if lost := lost_iterations(detail):
         echo(lost)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
-        echo(f"go on with: muster resume {detail['run']}")
+        echo(f"continue with: muster resume {detail['run']}")
 
 
 def slow_iteration(detail: Mapping[str, Any]) -> str:
-    """What may become of the present iteration of a training whose iterations last long; empty for others."""
+    """A warning about the present iteration of a training whose iterations last long; empty for others."""
     seconds = (detail["progress"] or {}).get("iteration_seconds") or 0.0
     if detail["kind"] != "train" or detail["status"] != "RUNNING" or seconds < _PATIENCE:
         return ""

@@ -1,4 +1,4 @@
-"""What ``--dry-run`` prints: which node a job would start where."""
+"""The output of ``--dry-run``: the host of each node that a job would start."""
 
 from __future__ import annotations
 

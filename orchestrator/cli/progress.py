@@ -91,7 +91,7 @@ def summary(client: Client, job_id: str) -> int:
         if value:
             console.print(f"  {name + ':':12} {value}", markup=False)
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
-        console.print(f"  go on with:  muster resume {detail['run']}", markup=False)
+        console.print(f"  continue with:  muster resume {detail['run']}", markup=False)
     return 0 if succeeded else 1
 
 

@@ -163,13 +163,13 @@ def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
 
 
 def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
-    """The iteration of the checkpoint that is meant. Raises UsageError where there is none."""
+    """The iteration of the requested checkpoint. Raises UsageError where there is none."""
     iteration: int = chosen(client, run["run"], split_reference(source)[1])["iteration"]
     return iteration
 
 
 def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
-    """What the job has of the one that trained: its queue, image and environment; a CPU is enough."""
+    """The parts of a job's spec that come from the training: queue, image and environment; a CPU is enough."""
     spec = run.get("spec") or {}
     kept = {key: spec[key] for key in ("queue", "share", "image", "environment") if spec.get(key)}
     memory = (spec.get("resources") or {}).get("memory", 2048)
@@ -179,7 +179,7 @@ def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
 
 
 def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> None:
-    """Run the job and bring what it made to ``output``. Raises typer.Exit, ServerError."""
+    """Run the job and bring its file to ``output``. Raises typer.Exit, ServerError."""
     job = submit_spec(client, spec, spec.name)["jobId"]
     with Activity() as told:
         told.wait(client, job)

@@ -111,7 +111,7 @@ def _train(connect: Connect, spec: Spec, source: str, **environment: str) -> dic
 
 
 def _restart(client: Client, detail: dict[str, Any], at: int) -> str:
-    """How the killed run died and where it resumed. Raises typer.Exit if it was not killed as requested."""
+    """The end of the killed run and the iteration from which it resumed, in words. Raises typer.Exit if it was not killed as requested."""
     ended = detail["attempts"][0]["nodes"][0].get("reason", "")
     if len(detail["attempts"]) < 2 or "SIGKILL" not in ended:
         echo(f"the main rank was not killed after iteration {at} ({ended or 'no reason'}): nothing is proven")

@@ -1,4 +1,4 @@
-"""The console: web pages on the orchestrator's own port, for people who would rather look than read.
+"""The console: web pages on the orchestrator's own port, for people who prefer pages to commands.
 
 Pages are rendered here with Jinja2; small modules of JavaScript keep them live over server-sent events. A page calls the functions that
 the API calls (:mod:`orchestrator.api.native`, :mod:`orchestrator.api.batch`), so that it can do nothing that the API can't, and these
@@ -12,10 +12,11 @@ How to add a page
 
        @router.get("/things")
        def things(request: Request, search: str = "") -> Response:
-           found = page_of_things(controller_of(request), search)        # a use case of the API; it raises ClientError
+           found = page_of_things(reconciler_of(request), search)        # a use case of the API; it raises ClientError
            return render(request, "things.html", things=found)
 
-   ``page_router`` (:mod:`orchestrator.console.routing`) turns a ClientError into a page (or JSON for a script), and refuses changes without the form's token.
+   ``page_router`` (:mod:`orchestrator.console.routing`) turns a ClientError into a page (or JSON for a script), and refuses changes without the form's token
+   and addresses with a parameter twice.
    Plain ``def`` functions run in a thread, where the database may be used.
 2. **A template** ``templates/things.html`` that extends ``base.html``: blocks ``title``, ``content``, ``scripts``. Its navigation entry
    is a line of :data:`orchestrator.console.pages.NAVIGATION`. Macros: ``from "parts.html" import badge, action, when, spark, empty``.

@@ -23,7 +23,7 @@ def _files() -> dict[str, bytes]:
 
 @cache
 def version() -> str:
-    """Of all files together: a module imports its neighbours by their plain names, and gets those of its own version."""
+    """One version for all files: a module imports its neighbours by their plain names, and gets those of its own version."""
     whole = sha256()
     for name, content in _files().items():
         whole.update(f"{name}\0{len(content)}\0".encode() + content)
@@ -31,14 +31,14 @@ def version() -> str:
 
 
 def url(name: str) -> str:
-    """The address of a file in ``static/``. Raises KeyError for one that is not there."""
+    """The address of a file in ``static/``. Raises KeyError for an unknown file."""
     _ = _files()[name]
     return f"/static/{version()}/{name}"
 
 
 @router.get("/static/{of}/{name}")
 def file(of: str, name: str) -> Response:
-    """A file; of another version than this server's, which an old page may ask for, the present one, which is not kept."""
+    """A file. An old page may ask for another version than this server's: it gets the present file, which browsers must not cache."""
     content = _files().get(name)
     if content is None:
         raise ClientError(f"there is no file {name[:100]!r}", 404)

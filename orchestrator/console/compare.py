@@ -21,15 +21,15 @@ from orchestrator.console.routing import page_router
 from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
 from shared_store.metrics import sampled
 
-router = page_router()
+router = page_router("run")
 
 MOST = 40
 """Runs that are compared at once."""
 _RECORDS = 600
-"""Of each run that are read, evenly spread over its history; the newest is among them."""
+"""Records that are read of each run, evenly spread over its history; the newest is among them."""
 _POINTS = 200
 _NO_METRICS = {"iteration", "env_steps", "time", "epoch"}
-"""Numbers of a record that no one wants as a curve over the steps."""
+"""Numbers of a record that make no useful curve over the steps."""
 _recent = Recent(2.0)
 
 
@@ -87,7 +87,7 @@ def _line(group: Group, metric: str, at: Sequence[float]) -> dict[str, Any]:
 
 
 def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
-    """The names that are meant, in the order of the patterns, separated by spaces or given one by one. Raises ClientError."""
+    """The names that the patterns match, in the order of the patterns, which may be separated by spaces. Raises ClientError."""
     chosen: dict[str, None] = {}
     known: list[str] | None = None
     reconciler = reconciler_of(request)
@@ -113,7 +113,7 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
 
 
 def _groups(request: Request, names: Sequence[str]) -> list[Group]:
-    """The runs in groups, shared by all who look at the same. Raises ClientError where one may not be seen, or does not exist."""
+    """The runs in groups; pages of the same runs share the result. Raises ClientError for a run that does not exist, or that the caller may not see."""
     key = (id(reconciler_of(request)), current_identity.get(), tuple(names))
     return _recent.get(key, lambda: grouped(map(partial(_facts, request), names)))
 
@@ -130,6 +130,6 @@ def _facts(request: Request, name: str) -> RunFacts:
 
 
 def _metrics(groups: Sequence[Group]) -> list[str]:
-    """The metrics of which some run has a number."""
+    """The metrics for which at least one run has a number."""
     newest = [run.records[-1] for group in groups for run in group.runs if run.records]
     return sorted({name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS)

@@ -33,10 +33,10 @@ from orchestrator.console.routing import page_router
 from shared_store.layout import Run
 from shared_store.metrics import finite, history_of, sampled
 
-router = page_router()
+router = page_router("name")
 
 POINTS = 300
-"""Of a curve, by default; a chart is seldom wider than that many points two pixels apart."""
+"""Points of a curve by default; a chart is seldom wider than that many points two pixels apart."""
 _MOST_POINTS = 1000
 _MOST_READ = 4000
 """Records that are read for an answer."""
@@ -64,7 +64,7 @@ def run_curves(
 def curves_of(
     run: Run, names: Sequence[str] = (), begin: int = 0, end: int | None = None, points: int = POINTS
 ) -> dict[str, Any]:
-    """What the route answers; reads at most 4000 records. Raises OSError.
+    """The answer of the route; reads at most 4000 records. Raises OSError.
 
     Args:
         run: The run.
@@ -87,7 +87,7 @@ def curves_of(
 
 
 def thinned(records: Sequence[Mapping[str, Any]], points: int) -> list[Mapping[str, Any]]:
-    """At most so many of the records, evenly spread, the first and the last among them."""
+    """At most ``points`` of the records, evenly spread, with the first and the last."""
     if len(records) <= points:
         return list(records)
     return [records[round(i * (len(records) - 1) / (points - 1))] for i in range(points)]
@@ -116,7 +116,7 @@ def _single(record: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def number(value: Any) -> float | None:
-    """The value in six digits, where it is a finite number, and no truth value."""
+    """The value in six digits; None unless it is a finite number; a truth value is not."""
     if finite(value) is None:
         return None
     return value if isinstance(value, int) or abs(value) > 1e6 else float(f"{value:.6g}")

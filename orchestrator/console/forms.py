@@ -1,4 +1,4 @@
-"""Forms: their token, questions before something is lost, and what follows a change.
+"""Forms: their token, questions before something is lost, and the answer to a change.
 
 A form works without scripts (a page asks, a page answers); with ``static/forms.js`` the same addresses answer in JSON, and the question
 is a dialog on the page.
@@ -22,17 +22,17 @@ TOKEN = "form_token"
 """The field of a form that other web pages can't know."""
 _MOST_FIELDS = 5000
 _OPEN = "/login"
-"""Whoever sends this form has no session yet; browsers say where it comes from."""
+"""Path of the login form, which is sent without a session; browsers tell its origin."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """What a person is asked before something is lost."""
+    """A question to a person before something is lost."""
 
     title: str
     text: str
     label: str
-    """Of the button that goes on."""
+    """Label of the button that confirms."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,13 @@ class Form:
         return list(self.fields.get(name, []))
 
     def confirm(self, question: Question) -> None:
-        """Go on only where the person has been asked and said yes."""
+        """Continue only where the person was asked and said yes. Raises Unconfirmed."""
         if self.one("confirmed") != "yes":
             raise Unconfirmed(question, self)
 
 
 class Unconfirmed(Exception):
-    """The person must be asked first."""
+    """A change that needs the person's confirmation first."""
 
     def __init__(self, question: Question, form: Form) -> None:
         super().__init__(question.title)
@@ -89,7 +89,7 @@ async def check_form(request: Request) -> None:
 
 
 def done(request: Request, path: str, message: str = "") -> Response:
-    """What follows a change: the page at ``path``, and a message there."""
+    """The answer to a change: the page at ``path``, and a message there."""
     if not wants_page(request):
         return JSONResponse({"location": path, "message": message})
     return RedirectResponse(path, 303)

@@ -1,4 +1,4 @@
-"""The page of a job: why it waits, how it learns, its attempts, its log, its checkpoints, its configuration and its files; live."""
+"""The live page of a job: its reason to wait, its curves, attempts, log, checkpoints, configuration and files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _CHILDREN = 100
 
 @router.get("/jobs/{reference}")
 def job(request: Request, reference: str) -> Response:
-    """The page; by a name or the start of an id, the way to it."""
+    """The page; a name or the start of an id is redirected to it."""
     reconciler = reconciler_of(request)
     detail = job_detail(request, reference)
     if detail["id"] != reference:
@@ -86,7 +86,7 @@ def job(request: Request, reference: str) -> Response:
 
 @router.get("/jobs/{reference}/stream")
 def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
-    """What changes of the page, and what its log has anew. The id of an event is what the page has then, of both."""
+    """The changes of the page and the new lines of its log, as events. The id of an event is the page's position in both."""
     reconciler = reconciler_of(request)
     key = (id(reconciler), current_identity.get(), chosen.job)
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
@@ -96,7 +96,7 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:
-    """The parts of the page that change; shared by all who look at it."""
+    """The parts of the page that change; open pages of the same job share them."""
     detail = job_detail(request, job_id)
     facts = {**facts_of(detail), "view": views.state(job_id, is_seen=True).text}
     return {"facts": facts, **_rows(reconciler_of(request), detail)}
@@ -109,7 +109,7 @@ def _rows(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass
 class _Feed:
-    """What one page has been sent."""
+    """The events that one page has been sent."""
 
     look: Any
     log: LiveLog
@@ -122,7 +122,7 @@ class _Feed:
     is_over: bool = False
 
     def changes(self) -> Sequence[Event] | None:
-        """The events since the last look; None once the job is over and everything of it has been sent."""
+        """The events since the last look; None once the job is over and all its events have been sent."""
         if self.is_over:
             return None
         seen = self.look()  # before the log: nothing is written after the end
@@ -141,7 +141,7 @@ class _Feed:
         return [Event(each.name, each.data, given) for each in events]
 
     def _curves(self) -> list[Event]:
-        """New iterations; ``again`` where an attempt went back behind what the page has, or it has missed too much."""
+        """New iterations; ``again`` where an attempt went back behind the page's last iteration, or the page has missed too many."""
         newest = max((each["iteration"] for each in sampled(self.run, 2)), default=0)
         had, self.iteration = self.iteration, newest
         if had is None or newest == had:
@@ -153,7 +153,7 @@ class _Feed:
 
 
 def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
-    """What the page has, as the id of its last event says; nothing where it says nothing that can be read."""
+    """The page's position by the id of its last event: iteration and log; None for each that can't be read."""
     try:
         told = json.loads(given)
         iteration, places = told["i"], told["l"]
@@ -173,7 +173,7 @@ def _files(reconciler: Reconciler, name: str) -> list[File]:
 
 
 def _container(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What code the job runs."""
+    """The code that the job runs."""
     training = spec.get("train") or {}
     command = spec.get("command")
     return [

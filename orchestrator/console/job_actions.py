@@ -1,4 +1,4 @@
-"""What a person does with a job and with a checkpoint of its run: what the commands do, through the same functions of the API."""
+"""Actions on a job and on a checkpoint of its run: those of the commands, through the same functions of the API."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _Wanted = int | Literal["best", "latest"] | None
 def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Stop the job."""
     job, name, _, _ = _job(request, reference, Operation.TERMINATE_JOB)
-    text = "A training saves a checkpoint before it leaves, and can be resumed. What waits is cancelled."
+    text = "A training saves a checkpoint before it leaves, and can be resumed. A waiting job is cancelled."
     form.confirm(Question(f"Stop {name}?", text, "Stop"))
     reason = f"stopped in the console by {permissions.current_identity.get().name}"
     batch.call(reconciler_of(request), "TerminateJob", {"jobId": job, "reason": reason})
@@ -61,10 +61,10 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
     newest = list_checkpoints(run)[-1:]
     if chosen and newest and chosen.name != newest[0].name:
         text = (
-            f"The newest checkpoint is of iteration {newest[0].iteration}. What the run has learnt after iteration "
-            f"{chosen.iteration} counts no longer, also in its curves."
+            f"The newest checkpoint is of iteration {newest[0].iteration}. Training after iteration "
+            f"{chosen.iteration} counts no longer, and its curves end there."
         )
-        form.confirm(Question(f"Go on from iteration {chosen.iteration}?", text, "Resume"))
+        form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
     told = runs.resume(reconciler_of(request), run, Changes(iteration, _changes(form), directory))
     return done(request, f"/jobs/{told['jobId']}", f"resumed {run.name} from iteration {told['iteration']}")
@@ -96,7 +96,7 @@ def export(request: Request, reference: str, form: Form = Depends(sent_form)) ->
 
 @router.post("/jobs/{reference}/record")
 def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
-    """Submit a job that records what a checkpoint's policy does."""
+    """Submit a job that records a checkpoint's policy at work."""
     return _beside(request, reference, form, "record")
 
 
@@ -157,7 +157,7 @@ def _trained(request: Request, run: Run) -> Mapping[str, Any]:
 
 
 def _checkpoint(form: Form) -> _Wanted:
-    """The checkpoint that was marked; None: the newest. Raises ClientError."""
+    """The marked checkpoint: an iteration, ``best``, or None for the newest. Raises ClientError."""
     given = form.one("checkpoint")
     if given in ("", "latest"):
         return None

@@ -1,4 +1,4 @@
-"""The configuration of a job as YAML, and what is different from the one before it."""
+"""The configuration of a job as YAML, and its differences from the job before it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _shown(value: Any) -> str:
 
 
 def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, str, Mapping[str, Any]] | None:
-    """What the job's configuration is compared with: a title, an address and a spec; None where there is nothing.
+    """The other side of the configuration's comparison: a title, an address and a spec; None where there is none.
 
     That is the job before it in its run, else the run whose weights a clone began with.
     """

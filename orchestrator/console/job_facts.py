@@ -1,4 +1,4 @@
-"""What the page of a job shows of it, as texts: its state and why, how far it is, its attempts on a line of time, its checkpoints."""
+"""The facts on the page of a job, as texts: its state and the reason, its progress, the time line of its attempts, its checkpoints."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from shared_store.metrics import finite
 from shared_store.wording import counted
 
 CHECKPOINTS = 30
-"""Checkpoints of a run that are listed, the newest; and the best one."""
+"""Number of a run's newest checkpoints that are listed, beside the best one."""
 _NODES = 16
-"""Nodes of an attempt that are named."""
+"""Number of an attempt's nodes that are named."""
 
 
 def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of the page that change, from what ``GET /api/jobs/{reference}`` answers."""
+    """The fields of the page that change, from the answer of ``GET /api/jobs/{reference}``."""
     status = detail["status"]
     is_over = Status(status).is_terminal
     training = (detail["spec"] or {}).get("train") or {}
@@ -100,7 +100,7 @@ def _attempt(attempt: Mapping[str, Any], begin: int, end: int, saves: bool) -> d
 
 
 def _where(nodes: Sequence[Mapping[str, Any]]) -> str:
-    """Where each node is, and what became of it."""
+    """The host of each node, and its end."""
     told = []
     for node in nodes[:_NODES]:
         gpus = f", {counted(len(node['gpus']), 'GPU')}" if node["gpus"] else ""
@@ -201,5 +201,5 @@ def _checkpoint(
 
 @lru_cache(maxsize=4096)
 def _described(checkpoint: Checkpoint, born: int) -> dict[str, Any]:
-    """What a checkpoint says of itself, which never changes in a run that was created at ``born`` [Unix ms]."""
+    """The facts that a checkpoint holds; they never change in a run that was created at ``born`` [Unix ms]."""
     return runs.describe_checkpoint(checkpoint, verify=False)

@@ -1,4 +1,4 @@
-"""The log of a job in a page: windows of it, what is searched, and what is new, never the whole."""
+"""The log of a job in a page: windows of it, results of a search, and new lines; never the whole."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shared_store.logs import LogFollower, LogLine
 router = page_router()
 
 _MOST_LAG = 1 << 20
-"""Bytes that a page gets of what it has missed; of more, the last lines."""
+"""Bytes that a page gets of the lines that it has missed; where it has missed more, it gets the last lines alone."""
 _LONGEST = 4000
 """Characters of a line that a page shows."""
 _AROUND = 30
@@ -53,7 +53,7 @@ def window(
     after: str = Query(default="", max_length=50_000),
     around: str = Query(default="", max_length=50_000),
 ) -> dict[str, Any]:
-    """A window of the log: the last lines; those before or after a place; those around the line that ends at a place."""
+    """A window of the log: its last lines, the lines before or after a place, or those around the line that ends at a place."""
     try:
         if after:
             return _told(lines_after(chosen, positions_of(after)))
@@ -71,7 +71,7 @@ def find(
     text: str = Query(default="", max_length=200),
     place: str = Query(default="{}", max_length=50_000),
 ) -> dict[str, Any]:
-    """Lines with a text, or the first errors where there is none; ``over`` is false where the search goes on at ``place``."""
+    """Lines with a text, or the first errors where there is none; ``over`` is false where the search continues at ``place``."""
     try:
         start = positions_of(place)
         found = search(chosen, text, start) if text else first_error(chosen, start)
@@ -96,11 +96,11 @@ def written(lines: Sequence[LogLine]) -> list[list[Any]]:
 
 @dataclass
 class LiveLog:
-    """What is new of a log for one page."""
+    """The lines of a log that are new to one page."""
 
     chosen: Chosen
     places: dict[str, int]
-    """What the page has."""
+    """The positions up to which the page has the lines."""
 
     def __post_init__(self) -> None:
         self._follower = self._follow(self.places)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 from urllib.parse import urlencode
@@ -43,21 +44,32 @@ GROUPS: Mapping[str, tuple[Status, ...]] = {
 _recent = Recent()
 
 
-@router.get("/")
-def jobs(
-    request: Request,
+@dataclass(frozen=True)
+class _Choice:
+    """The filter and the page of the table, as an address gives them."""
+
+    filter: Mapping[str, str]
+    """``state``, ``queue`` and ``search``; empty for all."""
+    wanted: Wanted
+    page: int
+
+
+def _choice(
     state: str = Query(default="", max_length=20),
     queue: str = Query(default="", max_length=128),
     search: str = Query(default="", max_length=_LONGEST),
     page: int = Query(default=1, ge=1, le=10**6),
-) -> Response:
+) -> _Choice:
+    return _Choice({"state": state, "queue": queue, "search": search}, _wanted(state, queue, search), page)
+
+
+@router.get("/")
+def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The table."""
-    reconciler = reconciler_of(request)
-    wanted = _wanted(state, queue, search)
-    rows, totals = _window(reconciler, wanted, page)
+    reconciler, chosen, page = reconciler_of(request), choice.filter, choice.page
+    rows, totals = _window(reconciler, choice.wanted, page)
     with reconciler.database.session() as session:
         queues = queue_names(session)
-    chosen = {"state": state, "queue": queue, "search": search}
     return render(
         request,
         "jobs.html",
@@ -74,16 +86,9 @@ def jobs(
 
 
 @router.get("/jobs/stream")
-def jobs_stream(
-    request: Request,
-    state: str = Query(default="", max_length=20),
-    queue: str = Query(default="", max_length=128),
-    search: str = Query(default="", max_length=_LONGEST),
-    page: int = Query(default=1, ge=1, le=10**6),
-) -> Response:
-    """What changes in a window of the table."""
-    wanted, table = _wanted(state, queue, search), Rows()
-    look = partial(_window, reconciler_of(request), wanted, page)
+def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Response:
+    """The changes in a window of the table, as events."""
+    table, look = Rows(), partial(_window, reconciler_of(request), choice.wanted, choice.page)
 
     def changes() -> Sequence[Event]:
         return table.changes(*look())
@@ -104,7 +109,7 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     if not ids:
         raise ClientError("no job that could be stopped is chosen; mark some in the table first")
     several = counted(len(ids), "job")
-    text = "Trainings save a checkpoint before they leave, and can be resumed. What waits is cancelled."
+    text = "Trainings save a checkpoint before they leave, and can be resumed. Waiting jobs are cancelled."
     form.confirm(Question(f"Stop {several}?", text, f"Stop {several}"))
     errors = []
     reason = f"stopped in the console by {current_identity.get().name}"
@@ -127,7 +132,7 @@ def _wanted(state: str, queue: str, search: str) -> Wanted:
 
 
 def _window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Rows of a page of the table, by id, and the totals; shared by all who look at the same."""
+    """Rows of a page of the table, by id, and the totals; open pages with the same choice share them."""
     key = (id(reconciler), current_identity.get(), wanted, page)
     return _recent.get(key, partial(_read_window, reconciler, wanted, page))
 

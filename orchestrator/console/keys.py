@@ -1,4 +1,4 @@
-"""The page of access keys: what each may do; make one, whose secret is shown once, and delete one."""
+"""The page of access keys and their permissions: create a key, whose secret is shown once, and delete one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def keys(request: Request) -> Response:
 
 @router.get("/keys/stream")
 def keys_stream(request: Request) -> Response:
-    """What changes in the list."""
+    """The changes in the list, as events."""
     table = Rows()
 
     def changes() -> Sequence[Event]:

@@ -33,7 +33,7 @@ from shared_store.wording import counted
 router = page_router()
 
 _RACES = 20
-"""Races under way, or over and not entered, that a league's page shows."""
+"""Number of races under way, or over and not entered, on a league's page."""
 _INTERVAL = 2.0
 """Seconds between two looks at them; each reads all entries."""
 _recent = Recent(_INTERVAL * 0.9)
@@ -89,7 +89,7 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
 
 @router.get("/leagues/{name}/stream")
 def race_stream(request: Request, name: str) -> Response:
-    """What changes in the list of races."""
+    """The changes in the list of races, as events."""
     rows = Rows()
     look = partial(_races, request, name)
     api.read_league(request, name)
@@ -114,7 +114,7 @@ def enter(request: Request, name: str, form: Form = Depends(sent_form)) -> Respo
 
 @router.get("/leagues/{name}/entries/{number}")
 def entry(request: Request, name: str, number: int) -> Response:
-    """An entry with its laps; whether it and its model are as they were entered."""
+    """An entry with its laps, and whether it and its model are unchanged since."""
     found = api.read_entry(request, name, number)
     trials = [
         {**each, "time": clock(each.get("time")), "penalty": f"{each.get('penalty') or 0:g} s"}
@@ -162,7 +162,7 @@ def _racer(form: Form) -> dict[str, Any]:
 
 
 def _body(kind: type[_Body], given: Mapping[str, Any]) -> _Body:
-    """A request's body of a form's texts. Raises ClientError with the first field that is wrong."""
+    """A request's body made of a form's texts. Raises ClientError that names the first wrong field."""
     try:
         return kind.model_validate(given)
     except ValidationError as error:
@@ -180,7 +180,7 @@ def _moment(key: str, text: str) -> float:
 
 
 def _shown(league: Mapping[str, Any]) -> dict[str, Any]:
-    """A league in a row of the list; nothing of one that was altered."""
+    """A league as a row of the list; without its facts where it was altered."""
     if "rules" not in league:
         return {"track": "", "laps": "", "ranking": "", "entries": "", "owner": "", "state": ""}
     closes = f"open until {moment(league['closes'])}" if league["closes"] else "open"

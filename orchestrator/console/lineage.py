@@ -1,4 +1,4 @@
-"""Where a model comes from, as a graph that the server draws: runs and the clones of their checkpoints, then versions of the model."""
+"""The lineage of a model, as a graph that the server draws: runs and the clones of their checkpoints, then versions of the model."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def drawing(
     Args:
         versions: ``model.json`` of each version that the caller may see.
         chosen: The version that the page shows.
-        parent_of: Looks up what a run is a clone of.
+        parent_of: Looks up the parent of a run.
         link: Address of a run's page; empty where there is none.
     """
     nodes: dict[str, _Node] = {}
@@ -93,7 +93,7 @@ def drawing(
 
 
 def _add_run(nodes: dict[str, _Node], run: str, parent: Any, parent_of: Parent, link: Callable[[str], str]) -> None:
-    """A run and all that it comes from; what its own model says of its parent outlives the run."""
+    """Add a run and all its ancestors; a model keeps its run's parent even where the run is gone."""
     while f"run {run}" not in nodes and len(nodes) < _MOST:
         node = nodes[f"run {run}"] = _Node(run, "run", link(run))
         parent = parent if isinstance(parent, Mapping) else parent_of(run)
@@ -105,7 +105,7 @@ def _add_run(nodes: dict[str, _Node], run: str, parent: Any, parent_of: Parent, 
 
 
 def _level(nodes: Mapping[str, _Node], key: str, above: tuple[str, ...]) -> int:
-    """The longest way from a beginning; a run that is its own ancestor, in a damaged store, counts once."""
+    """The longest way from a run without a parent; a run that is its own ancestor, in a damaged store, counts once."""
     node = nodes[key]
     before = [
         _level(nodes, each, (*above, key)) for each in node.parents if each in nodes and each not in (*above, key)

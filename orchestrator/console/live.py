@@ -1,4 +1,4 @@
-"""Live parts of pages: events from the server (server-sent events), which go on where a browser lost them."""
+"""Live parts of pages: events from the server (server-sent events), which continue where a browser lost them."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from shared_store.files import DamagedFile
 INTERVAL = 0.5
 """Seconds between two looks."""
 _HEARTBEAT = 10.0
-"""Seconds after which an idle stream says something, which is how a browser that left is noticed."""
+"""Seconds after which an idle stream sends a comment: that reveals a browser that has left."""
 _LONGEST = 300.0
-"""Seconds after which a stream ends; the browser comes back at once, and is admitted again, or not."""
+"""Seconds after which a stream ends; the browser reconnects at once, and is admitted again or refused."""
 _MOST_OPEN = 100
 """Streams of one key or user at once: each takes a share of the server's time."""
 _MOST_KEPT = 64
@@ -38,7 +38,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True)
 class Event:
-    """One event: its name, its data (JSON), and the id with which a browser that comes back says what it has."""
+    """One event: its name, its data (JSON), and its id, which a browser sends when it reconnects."""
 
     name: str
     data: Any
@@ -46,7 +46,7 @@ class Event:
 
 
 Look = Callable[[], Sequence[Event] | None]
-"""What is new since the last call; None at the end of the stream. Runs in a thread, where the database may be used."""
+"""The events since the last call; None at the end of the stream. Runs in a thread, where the database may be used."""
 
 
 def last_id(request: Request) -> str:
@@ -73,7 +73,7 @@ def stream(request: Request, look: Look, interval: float = INTERVAL) -> Streamin
 
 
 _open: Counter[str] = Counter()
-"""Streams that are open, by who reads them; used by the event loop alone."""
+"""Number of open streams by the name of their reader; used by the event loop alone."""
 
 
 async def _admitted(name: str, events: AsyncGenerator[bytes, None]) -> AsyncIterator[bytes]:
@@ -123,7 +123,7 @@ def _written(event: Event) -> bytes:
 
 
 class Rows:
-    """The rows of a live table: what has changed of them since the last look, by key and field."""
+    """The rows of a live table, and their changes since the last look, by key and field."""
 
     def __init__(self, name: str = "rows") -> None:
         """``name``: of its events; a page with several tables has one of each."""
@@ -157,7 +157,7 @@ def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> M
 
 
 class Recent:
-    """Values that many open pages want at once: each is computed at most once in ``seconds``. Any thread may call."""
+    """Values that many open pages need at once: each is computed at most once in ``seconds``. Any thread may call."""
 
     def __init__(self, seconds: float = INTERVAL * 0.9) -> None:
         self._seconds, self._lock = seconds, threading.Lock()

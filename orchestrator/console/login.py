@@ -20,7 +20,7 @@ router = page_router()
 
 @router.get(LOGIN)
 def ask(request: Request, next: str = "/") -> Response:
-    """Where a key is given; whoever needs none, or is logged in, is sent on."""
+    """The page for the key; a visitor who needs none, or is logged in, is redirected."""
     access: Access = request.app.state.access
     if not access.demanded() or session(request):
         return RedirectResponse(_own(next), 303)
@@ -29,7 +29,7 @@ def ask(request: Request, next: str = "/") -> Response:
 
 @router.post(LOGIN)
 def log_in(request: Request, form: Form = Depends(sent_form)) -> Response:
-    """A session for a key; the key itself stays in no cookie and in no page."""
+    """Open a session for a key; no cookie and no page keeps the key itself."""
     access: Access = request.app.state.access
     limit: RateLimit = request.app.state.limit
     there = _own(form.one("next", "/"))
@@ -59,7 +59,7 @@ def log_out(request: Request) -> Response:
 
 
 def _own(address: str) -> str:
-    """The address where it is a path of this server, else ``/``: a login must not lead elsewhere."""
+    """The address if it is a path of this server, else ``/``: a login must not lead to another server."""
     is_own = (
         re.fullmatch(r"/(?![/\\])[!-\[\]-~]*", address) is not None
     )  # no other host, no backslash, no control character

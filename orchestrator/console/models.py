@@ -1,4 +1,4 @@
-"""The model registry: where each policy comes from, how it was evaluated, and whether it is as it was registered."""
+"""The model registry: the lineage and evaluations of each policy, and whether it is unchanged since its registration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shared_store.files import DamagedFile
 router = page_router()
 
 _MOST_VERSIONS = 30
-"""Versions of a model that its graph shows: the newest, and the one that is looked at."""
+"""Number of a model's newest versions in its graph, beside the one on the page."""
 
 
 @router.get("/models")
@@ -71,7 +71,7 @@ def _link(run: str) -> str:
 
 
 def _version(request: Request, name: str, version: int) -> Mapping[str, Any] | None:
-    """Another version of the model; None of one that the caller may not see or that is damaged."""
+    """Another version of the model; None where the caller may not see it, or it is damaged."""
     try:
         found: Mapping[str, Any] = read_model(request, name, version, False)
         return found if found.get("run") else None
@@ -80,7 +80,7 @@ def _version(request: Request, name: str, version: int) -> Mapping[str, Any] | N
 
 
 def _parent(request: Request, run: str) -> Mapping[str, Any] | None:
-    """What a run is a clone of, where the caller may know it."""
+    """The run and checkpoint of which a run is a clone; None where there is none, or the caller may not know it."""
     try:
         parent = run_detail(request, run).get("parent")
     except (ClientError, DamagedFile, OSError):
@@ -117,7 +117,7 @@ def _evaluation(each: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _contract(contract: Any) -> list[tuple[str, str]]:
-    """What goes in and out of the policy, in a few words."""
+    """The policy's inputs and outputs, in a few words."""
     if not isinstance(contract, Mapping):
         return []
     seen = {

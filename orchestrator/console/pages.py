@@ -1,4 +1,4 @@
-"""Pages: templates, headers, what all pages show, and errors that a person can read."""
+"""Pages: templates, headers, the parts of all pages, and errors that a person can read."""
 
 from __future__ import annotations
 
@@ -98,13 +98,13 @@ def may_change() -> bool:
 
 
 def form_token(request: Request) -> str:
-    """What forms send back; see :mod:`orchestrator.console.forms`."""
+    """The token that forms send back; see :mod:`orchestrator.console.forms`."""
     access: Access = request.app.state.access
     return access.form_token(session(request))
 
 
 def session(request: Request) -> str:
-    """The session that the request came with, where it is one."""
+    """The session of the request; empty where it has none."""
     access: Access = request.app.state.access
     given = session_of(request.headers, request.scope["server"][1])
     return given if access.session(given) is not None else ""
@@ -116,7 +116,7 @@ def _navigation(request: Request) -> list[Entry]:
 
 
 def wants_page(request: Request) -> bool:
-    """Whether a person's browser asks, and not one of the console's scripts."""
+    """Whether the request is for a page, and not from one of the console's scripts."""
     return "text/html" in request.headers.get("accept", "")
 
 

@@ -1,4 +1,4 @@
-"""The page of queues and compute: who waits for what, shares, hosts and how full they are, engines and how they answer; all of it live."""
+"""The live page of queues and compute: waiting jobs and their reasons, shares, hosts and their load, engines and their health."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _recent = Recent()
 
 @router.get("/queues")
 def queues(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
-    """All tables, or of one queue with more of its jobs."""
+    """All tables, or those of one queue with more of its jobs."""
     tables = _tables(reconciler_of(request), queue)
     return render(
         request,
@@ -46,7 +46,7 @@ def queues(request: Request, queue: str = Query(default="", max_length=128)) -> 
 
 @router.get("/queues/stream")
 def queues_stream(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
-    """What changes in the tables."""
+    """The changes in the tables, as events."""
     look = partial(_tables, reconciler_of(request), queue)
     known = {name: Rows(name) for name in _ROWS}
 
@@ -57,7 +57,7 @@ def queues_stream(request: Request, queue: str = Query(default="", max_length=12
 
 
 def _tables(reconciler: Reconciler, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """The rows of every table, by key; shared by all who look at the same."""
+    """The rows of every table, by key; open pages of the same queue share them."""
     key = (id(reconciler), current_identity.get(), queue)
     return _recent.get(key, partial(_read_tables, reconciler, queue))
 
@@ -194,4 +194,4 @@ _ROWS = {
     "engines": _engine,
     "computeEnvironments": _compute_environment,
 }
-"""Of each table: the texts of a row; all empty for the row that scripts copy."""
+"""For each table a function of the texts of a row; all empty for the row that scripts copy."""

@@ -1,7 +1,8 @@
-"""Routers of pages: their errors are pages too, and no change passes without the form's token."""
+"""Routers of pages: their errors are pages too, and every change needs the form's token."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -43,13 +44,21 @@ class PageRoute(APIRoute):
         return answer
 
 
-def page_router() -> APIRouter:
-    """A router for pages of the console."""
-    return APIRouter(route_class=PageRoute, include_in_schema=False, dependencies=[Depends(check_form)])
+def page_router(*repeatable: str) -> APIRouter:
+    """A router for pages of the console. ``repeatable``: query parameters that an address may have several times."""
+
+    def check_query(request: Request) -> None:
+        given = Counter(name for name, _ in request.query_params.multi_items() if name not in repeatable)
+        for name, times in given.items():
+            if times > 1:
+                raise ClientError(f"the address has {name[:50]} {times} times; give it once")
+
+    checks = [Depends(check_form), Depends(check_query)]
+    return APIRouter(route_class=PageRoute, include_in_schema=False, dependencies=checks)
 
 
 def finish(app: FastAPI) -> None:
-    """After the last page: the navigation learns which pages there are, and an address that leads nowhere is a page for browsers."""
+    """Call after the last page was added: note the pages for the navigation, and answer browsers with a page at unknown addresses."""
     app.state.console_paths = {
         each.path for each in NAVIGATION if any(_leads(route, each.path) for route in app.routes)
     }

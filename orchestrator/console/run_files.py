@@ -26,7 +26,7 @@ PLACES = ("metrics", "recordings", "evaluations", "exports")
 """Directories of a run whose files are shown."""
 _MOST = 200
 _MOST_READ = 2000
-"""Entries of a directory that are looked at: a job may make any number of them."""
+"""Greatest number of entries that are read of a directory: a job may make any number of them."""
 _DEEPEST = 4
 _PICTURES = (".png", ".gif")
 _BLOCK = 256 << 10
@@ -83,7 +83,7 @@ def _walk(directory: Path, depth: int) -> Iterator[Path]:
 
 @router.get("/runs/{name}/files/{path:path}")
 def file(request: Request, name: str, path: str) -> Response:
-    """A file of a run: a picture as one, all others as a download."""
+    """A file of a run: pictures are shown, other files are downloaded."""
     run = permitted_run(reconciler_of(request), name, Operation.READ_RUN)
     parts = path.split("/")
     if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):

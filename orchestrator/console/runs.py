@@ -1,4 +1,4 @@
-"""The pages of runs: the list of those in the store, and one run with its checkpoints, evaluations, lineage and curves."""
+"""The pages of runs: the list of the store's runs, and one run with its checkpoints, evaluations, lineage and curves."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ METRICS = (
     "learning_rate",
     "action_std",
 )
-"""Those that the page of a run draws, where it has them; the page of its job has all."""
+"""Metrics that the page of a run draws, where the run has them; the page of its job has all."""
 _listed = Recent(_INTERVAL * 0.9)
 _recent = Recent()
 
@@ -66,7 +66,7 @@ def runs(
 def runs_stream(
     request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
 ) -> Response:
-    """What changes in a page of the list."""
+    """The changes in a page of the list, as events."""
     table, reconciler = Rows(), reconciler_of(request)
     return stream(request, lambda: table.changes(_window(reconciler, search, after), {}), _INTERVAL)
 
@@ -93,7 +93,7 @@ def run(request: Request, name: str) -> Response:
 
 @router.get("/runs/{name}/stream")
 def run_stream(request: Request, name: str) -> Response:
-    """What changes in the tables of a run; ``changed`` when its metrics go on."""
+    """The changes in the tables of a run, as events; ``changed`` when it has new metrics."""
     _ = run_routes.run_detail(request, name)  # refused at once, if at all
     known = {key: Rows(key) for key in _TABLES}
     reconciler, before = reconciler_of(request), [-1]
@@ -111,7 +111,7 @@ def run_stream(request: Request, name: str) -> Response:
 
 
 def _window(reconciler: Reconciler, search: str, after: str) -> dict[str, dict[str, Any]]:
-    """Rows of a page of the list, by the run's name; shared by all who look at the same."""
+    """Rows of a page of the list, by the run's name; open pages with the same choice share them."""
 
     def look() -> dict[str, dict[str, Any]]:
         with reconciler.database.session() as session:
@@ -122,7 +122,7 @@ def _window(reconciler: Reconciler, search: str, after: str) -> dict[str, dict[s
 
 
 def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, dict[str, dict[str, Any]]]]:
-    """A run as the API describes it, and the rows of the page's tables; shared by all who look at it. Raises ClientError."""
+    """A run as the API describes it, and the rows of the page's tables; open pages of the same run share them. Raises ClientError."""
 
     def look() -> tuple[dict[str, Any], dict[str, dict[str, dict[str, Any]]]]:
         described = run_routes.run_detail(request, name)
@@ -161,13 +161,13 @@ def _row(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _train(run: Mapping[str, Any]) -> Mapping[str, Any]:
-    """How a run is trained; a store may hold anything."""
+    """The ``train`` section of a run's spec; empty where there is none, since a store may hold anything."""
     train = (run.get("spec") or {}).get("train")
     return train if isinstance(train, Mapping) else {}
 
 
 def _judged(run: Mapping[str, Any]) -> str:
-    """The return of the best checkpoint, where several are evaluated, else of the one that is."""
+    """The return of the best checkpoint where several are evaluated, else of the only evaluated one."""
     best, only = run.get("best"), run.get("evaluation")
     if best:
         return f"{words.count(best['mean'])} at {best['iteration']}"
@@ -233,7 +233,7 @@ def _interval(told: Mapping[str, Any]) -> str:
 
 
 _TABLES = {"jobs": _job, "checkpoints": _checkpoint, "evaluations": _evaluation}
-"""Of each table of a run: the texts of a row; all empty for the row that scripts copy."""
+"""For each table of a run a function of the texts of a row; all empty for the row that scripts copy."""
 
 
 def _comparison(run: Mapping[str, Any]) -> str:

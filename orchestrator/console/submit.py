@@ -1,4 +1,4 @@
-"""Submitting a job: a wizard for a task or the racer, plain YAML, and a look at both before anything is submitted."""
+"""Submitting a job: a wizard for a task or the racer, plain YAML, and a review of both before anything is submitted."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _turns = Turns("other reward functions are being tried")
 
 @router.get("/submit")
 def choose(request: Request) -> Response:
-    """What is to be trained."""
+    """The page on which the task is chosen."""
     permissions.check(Operation.SUBMIT_JOB)
     racers = {name: about for name, about in tasks().items() if races(name)}
     others = {name: about for name, about in tasks().items() if name not in racers}
@@ -66,7 +66,7 @@ def wizard(request: Request, task: str) -> Response:
 
 @router.post("/submit/task/{task}")
 def wizard_again(request: Request, task: str, form: Form = Depends(sent_form)) -> Response:
-    """The wizard with what was filled in before."""
+    """The wizard with the fields as they were filled in before."""
     return _wizard(request, task, filled(form, _groups(request, task)), None)
 
 
@@ -84,13 +84,13 @@ def plain(request: Request, job: str = Query(default="", max_length=200)) -> Res
 
 @router.post("/submit/yaml")
 def plain_again(request: Request, form: Form = Depends(sent_form)) -> Response:
-    """The YAML editor with a text: the wizard's, or what was written before."""
+    """The YAML editor with a text: the wizard's, or the one written before."""
     return _editor(request, _text(request, form)[0], None)
 
 
 @router.post("/submit/check")
 def check(request: Request, form: Form = Depends(sent_form)) -> Response:
-    """The YAML of what is filled in, what is wrong with it, and help for a line; ``whole`` also tries a reward function."""
+    """The YAML of the filled fields, its problem, and help for a line; ``whole`` also tries a reward function."""
     permissions.check(Operation.SUBMIT_JOB)
     text, _ = _text(request, form)
     spec, problem = _checked(text, form.one("whole") == "yes")
@@ -107,7 +107,7 @@ def check(request: Request, form: Form = Depends(sent_form)) -> Response:
 
 @router.post("/submit/review")
 def review(request: Request, form: Form = Depends(sent_form)) -> Response:
-    """The YAML and what would start where; or the form again, with what is wrong."""
+    """The YAML with the hosts on which its nodes would start; or the form again, with its problem."""
     permissions.check(Operation.SUBMIT_JOB)
     text, task = _text(request, form)
     spec, problem = _checked(text, whole=True)
@@ -206,9 +206,9 @@ def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
 
 
 def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
-    """The spec of a text, or what is wrong with it.
+    """The spec of a text, or its problem.
 
-    A learner's code runs here for keys with all queues alone, since what guards it is no sandbox: of others, the text of a reward
+    A learner's code runs here only for keys with all queues, since its guard is no sandbox: for other keys the text of a reward
     function is checked here, and the job's ranks try it.
     """
     tries = whole and permissions.current_identity.get().queues is None
@@ -227,7 +227,7 @@ def _text(request: Request, form: Form) -> tuple[str, str]:
 
 
 def _lines(text: str) -> str:
-    """As it was written: a form sends lines that end with CR and LF."""
+    """The text with its own line ends: a form sends lines that end with CR and LF."""
     return text.replace("\r\n", "\n")
 
 
@@ -262,7 +262,7 @@ def _wizard(
 
 
 def _nearest_field(key: str, names: Sequence[str]) -> str:
-    """The field in which a key of the YAML stands; empty where none is."""
+    """The field that holds a key of the YAML; empty where none does."""
     return max((name for name in names if f"{key}.".startswith(f"{name}.")), key=len, default="")
 
 

@@ -1,4 +1,4 @@
-"""The wizard's fields, made of the published schema; and the YAML that the filled fields are."""
+"""The wizard's fields, made of the published schema; and the YAML made of the filled fields."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from orchestrator.spec.values import known_tasks
 from shared_store.file_fields import kept_files
 
 CODE = "reward_function.py"
-"""What messages call the code of the wizard's editor."""
+"""Name of the code in the wizard's editor, as messages give it."""
 EXAMPLE = '''def reward_function(params):
     """Keep to the middle of the road, and drive fast."""
     if not params["all_wheels_on_track"]:
@@ -42,7 +42,7 @@ _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
 @dataclass(frozen=True)
 class Field:
-    """A field of the wizard; what is left empty is not in the YAML."""
+    """A field of the wizard; the YAML leaves empty ones out."""
 
     name: str
     """The key path in the YAML."""
@@ -80,7 +80,7 @@ def job_schema() -> dict[str, Any]:
 
 
 def plain(about: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A part of the schema without references, and without the null of what may be absent."""
+    """A part of the schema without references, and without null as a value of optional fields."""
     while True:
         kinds = [each for each in about.get("anyOf", ()) if each.get("type") != "null"]
         if "$ref" in about:
@@ -93,7 +93,7 @@ def plain(about: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def config_schema(task: str) -> Mapping[str, Any] | None:
-    """What ``train.config`` may hold of a task; None of one that does not say it."""
+    """JSON schema of a task's ``train.config``; None for a task that declares none."""
     for each in job_schema()["$defs"]["Train"]["allOf"]:
         if each["if"]["properties"]["task"]["const"] == task:
             found: Mapping[str, Any] = each["then"]["properties"]["config"]
@@ -140,20 +140,20 @@ def groups(task: str, queues: Sequence[str]) -> list[Group]:
     found += _racer(task) if races(task) else []
     config = config_schema(task)
     if config is None:
-        hint = "What this task accepts is not published here; its ranks check it."
+        hint = "This task publishes no schema; its ranks check the settings."
         found.append(Group("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
     else:
         left_out = {*kept_files(task_config(task)), *(("track",) if races(task) else ())}
         found += _groups("Task", config["properties"], "train.config", left_out)
     for name in ALGORITHMS:
         section = job_schema()["$defs"][f"Settings_{name}"]
-        hint = "What is left empty stays as the task has it."
+        hint = "Empty fields keep the task's own values."
         found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", (), name, hint)
     return [*found, Group("More", job(*_MORE))]
 
 
 def _racer(task: str) -> list[Group]:
-    """What is asked of a racer's task besides: track, action space, reward function, hyperparameters."""
+    """The further fields of a racer's task: track, action space, reward function, hyperparameters."""
     kind = task_config(task)
     assert kind is not None
     space = json.dumps(kind().action_space, indent=1, default=dict)
@@ -245,7 +245,7 @@ def _given(form: Form, field: Field) -> str:
 
 
 def document(task: str, found: Sequence[Group]) -> dict[str, Any]:
-    """The job that filled groups are."""
+    """The job described by filled groups."""
     result: dict[str, Any] = {}
     algorithm = next((each.value for group in found for each in group.fields if each.name == "train.algorithm"), "")
     for group in found:

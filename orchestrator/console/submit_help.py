@@ -1,4 +1,4 @@
-"""What the published schema says of a place in a job's YAML, for the editor; and where an error stands in it."""
+"""Help for the editor of a job's YAML: the published schema's text for a place, and the place of an error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from orchestrator.console.submit_fields import bounds, config_schema, job_schema
 from orchestrator.spec import strict_yaml
 
 SOURCE = "job.yaml"
-"""What errors call the text."""
+"""Name of the text in errors."""
 _PLACE = re.compile(rf"{re.escape(SOURCE)}(?::(\d+))?: (?:([\w.-]+): )?(.*)", re.DOTALL)
 
 

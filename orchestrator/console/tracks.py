@@ -25,9 +25,9 @@ router = page_router()
 _SIZE = (240.0, 160.0)
 """Width and height of an outline."""
 _GREY, _RED = "#808791", "#d55e00"
-"""Of road and start line: seen on light and on dark, since a picture does not know the page's theme."""
+"""Colours of road and start line, visible on light and on dark: a picture does not know the page's theme."""
 _recent = Recent(60.0)
-"""Tracks never change; one that was added is another list."""
+"""Tracks never change; an added track makes another list."""
 
 
 @router.get("/tracks")
@@ -80,7 +80,7 @@ def known(request: Request) -> Sequence[Mapping[str, Any]]:
 
 
 def track_names(request: Request) -> tuple[list[str], str]:
-    """The tracks that can be driven on, and why there are none."""
+    """The names of the usable tracks, and the reason where there is none."""
     try:
         return [str(each["name"]) for each in known(request) if "problem" not in each], ""
     except ClientError as error:
@@ -110,7 +110,7 @@ def _picture(content: bytes, kind: str) -> Response:
 
 
 def facts(track: Mapping[str, Any]) -> dict[str, Any]:
-    """What a page shows of a track."""
+    """The facts about a track on its page."""
     name = str(track["name"])
     shown = {"name": name, "path": f"/tracks/{quote(name, safe='')}", "problem": track.get("problem", "")}
     if "problem" in track:

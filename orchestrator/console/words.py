@@ -1,4 +1,4 @@
-"""Numbers, times and attributes as the pages show them. What a job wrote may be anything: what is no number is shown as nothing."""
+"""Numbers, times and attributes as the pages show them. A job may write anything: a value other than a number is shown as an empty text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SPARK = (100.0, 24.0)
 
 
 def duration(seconds: Any) -> str:
-    """``4 s``, ``12 min``, ``3 h 5 min``, ``2 d 4 h``; empty for what is no number."""
+    """``4 s``, ``12 min``, ``3 h 5 min``, ``2 d 4 h``; empty for a value other than a number."""
     known = finite(seconds)
     if known is None:
         return ""
@@ -33,7 +33,7 @@ def duration(seconds: Any) -> str:
 
 
 def ago(moment: int | None) -> str:
-    """For how long something is past, from Unix time [ms]; empty for None."""
+    """The time since a moment, a Unix time [ms]; empty for None."""
     return "" if moment is None else duration(time.time() - moment / 1000)
 
 
@@ -46,12 +46,12 @@ def moment(when: int | float | None) -> str:
 
 
 def since(iso: str) -> str:
-    """:func:`ago` for what :func:`moment` wrote."""
+    """:func:`ago` for a text of :func:`moment`."""
     return ago(int(datetime.fromisoformat(iso).timestamp() * 1000)) if iso else ""
 
 
 def count(given: Any) -> str:
-    """A number in at most four digits: ``12``, ``3.46``, ``18.2 k``, ``1.07 M``; empty for what is no number."""
+    """A number in at most four digits: ``12``, ``3.46``, ``18.2 k``, ``1.07 M``; empty for a value other than a number."""
     value = finite(given)
     if value is None:
         return ""

@@ -1,1 +1,1 @@
-"""The reconcile loop and what stands beside it."""
+"""The reconcile loop and its threads."""

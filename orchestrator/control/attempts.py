@@ -1,7 +1,7 @@
-"""Attempts: the facts that :mod:`orchestrator.domain.attempt` decides on are gathered here, and its instructions carried out.
+"""Attempts: gathers the facts on which :mod:`orchestrator.domain.attempt` decides, and carries out its instructions.
 
 Everything that must survive a crash is in the database before it is done: an attempt is recorded before its gang is launched,
-its ending before the gang is stopped. A controller that starts on the database of a dead one goes on from there.
+its ending before the gang is stopped. A controller that starts on the database of a dead one continues from there.
 """
 
 from __future__ import annotations
@@ -71,16 +71,16 @@ log = logging.getLogger("muster.controller")
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
 _STOP_AGAIN, _STOP_RARELY = 2.0, 30.0
-"""Seconds after which a gang that could not be stopped is asked again: at first, and at most."""
+"""Seconds until another try to stop a gang that could not be stopped: at first, and at most."""
 
 
 class StoreUnavailable(Exception):
-    """The store can't be used now; the message says why. What was to be done is tried again."""
+    """The store can't be used now; the message says why. The action is tried again."""
 
 
 @dataclass
 class _Memory:
-    """What is known of an attempt beside its row, until it is closed."""
+    """Facts about an attempt that its row does not hold, until it is closed."""
 
     cause_since: int | None = None
     done_since: int | None = None
@@ -109,7 +109,7 @@ class Attempts:
         """Why the engine could not stop an attempt's gang when it was last asked."""
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
-        """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle.
+        """Record a new attempt, then launch it: after a crash in between, the next pass finds no handle and launches it.
 
         Raises StoreUnavailable where the run can't be prepared now; nothing is recorded then.
         """
@@ -158,7 +158,7 @@ class Attempts:
         self._happened(session, job, attempt, Preempted(reason))
 
     def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> None:
-        """Carry out what follows from an event, and from the events that this leads to."""
+        """Carry out the instructions that follow from an event, and from the events that these cause."""
         for instruction in step(self._state(job, attempt), event):
             if (then := self._carry_out(session, job, attempt, instruction)) is not None:
                 self._happened(session, job, attempt, then)
@@ -240,7 +240,7 @@ class Attempts:
             return LaunchRefused(str(error))
 
     def gang(self, session: Session, job: Job, attempt: Attempt, spec: GangSpec) -> Gang:
-        """What the engine is given to start an attempt."""
+        """The gang that the engine starts for an attempt."""
         nodes, options = spec.nodes[: len(attempt.nodes)], spec.options
         compute_environment = attempt.compute_environment or "local"
         return Gang(
@@ -296,7 +296,7 @@ class Attempts:
         return self.bus.silence(attempt.job_id, attempt.number, node.index, node.met)
 
     def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
-        """How each node ended; noted in the attempt's record, with what else is known of its nodes."""
+        """The end of each node; noted in the attempt's record with the other facts about its nodes."""
         run = self.store.run(job.run)
         ends: list[NodeEnd | None] = []
         for record, node in zip(attempt.nodes, status, strict=True):
@@ -328,7 +328,7 @@ class Attempts:
         job.move(Status.RUNNING, reason)
 
     def _stop(self, job: Job, attempt: Attempt, grace: float) -> Gone | StopDelayed | None:
-        """Stop the gang in the background. Where the engine can't stop it, it is asked again, later and later."""
+        """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
         key, memory = (job.id, attempt.number), self._memory(attempt)
         if memory.stop is None and not self._denied.waits(key):
             assert attempt.handle is not None
@@ -345,7 +345,7 @@ class Attempts:
         return StopDelayed(said_last.removeprefix(f"job {job.id}: ")) if said_last else None
 
     def _stop_in_thread(self, handle: str, grace: float) -> Future[GangStatus]:
-        """How the nodes ended: from a daemon's thread, since a controller that leaves must not wait for a grace time."""
+        """Stop the gang in a daemon thread, since a controller that leaves must not wait for a grace time. The result: its last status."""
         done: Future[GangStatus] = Future()
 
         def stop() -> None:
@@ -360,7 +360,7 @@ class Attempts:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        """Around reads of the store. Raises StoreUnavailable."""
+        """A context for reads of the store. Raises StoreUnavailable."""
         try:
             yield
         except OSError as error:

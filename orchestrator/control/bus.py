@@ -1,7 +1,7 @@
 """The bus's router, inside the controller: which nodes are present, their progress, and commands to them.
 
 Every node may connect; access rules in the router let a node publish below node keys and answer commands, and nothing else: it
-can neither send a command nor read a message. What a node says counts only with the proof of its attempt's credential, and
+can neither send a command nor read a message. A node's message counts only with the proof of its attempt's credential, and
 commands carry that proof to the node (:mod:`shared_store.bus`).
 
 The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval;
@@ -68,7 +68,7 @@ _ACCESS = {
         }
     ],
 }
-"""What may pass between the router and a node. Zenoh reads rules and users once, when the router starts, so that they can't name
+"""Access rules for messages between the router and a node. Zenoh reads rules and users once, when the router starts, so that they can't name
 attempts; the proofs do that. The controller's own session is inside the router: no rule applies to it."""
 
 
@@ -85,7 +85,7 @@ class Bus:
     """
 
     def __init__(self, home: Path, addresses: Sequence[str] = ()) -> None:
-        """``addresses``: of this machine, to listen on beside loopback."""
+        """``addresses``: addresses of this machine on which the router listens beside loopback."""
         self.changed: Callable[[], None] = lambda: None
         """Called (on the network's thread) when a node came or went."""
         self._home, self._addresses = home, addresses
@@ -103,7 +103,7 @@ class Bus:
         self.endpoint: str | None = None
 
     def open(self) -> None:
-        """Start the router. Where that fails the bus is off, which is logged, and nothing else is different."""
+        """Start the router. Where that fails, the bus is off: a log line says so, and everything else works as usual."""
         if os.environ.get("MUSTER_BUS_OFF"):
             return
         try:
@@ -180,14 +180,14 @@ class Bus:
         return str(self._credential(job, attempt)) if self.endpoint else None
 
     def met(self, job: str, attempt: int, node: int) -> bool:
-        """Whether the node is here, or was."""
+        """Whether the node is or was connected."""
         with self._lock:
             return (job, attempt, node) in self._gone
 
     def silence(self, job: str, attempt: int, node: int, met_before: bool = False) -> float | None:
-        """For how many seconds a node that was here is gone; None where it is here, or never was.
+        """Seconds since a node that was connected has gone; None where it is connected, or never was.
 
-        ``met_before``: an earlier router met it. One that does not come back to this one is gone since this one is there.
+        ``met_before``: an earlier router met it. Where it does not connect to this router, it counts as gone since this router's start.
         """
         with self._lock:
             since = self._gone.get((job, attempt, node), self._opened if met_before else None)
@@ -264,7 +264,7 @@ class Bus:
                 self._progress[node] = progress
 
     def _sender(self, key: str) -> Node | None:
-        """The node whose key this is, if its attempt is open and has such a node."""
+        """The node of this key, if its attempt is open and has such a node."""
         node = node_of(key)
         with self._lock:
             return node if node is not None and 0 <= node[2] < self._expected.get(node[:2], 0) else None

@@ -3,7 +3,7 @@
 A wall clock steps: a person sets it, NTP corrects it, a machine that was suspended wakes up hours later. The kernel's monotonic clock
 does not, and it is the same for every process until the machine boots again. Steady time is Unix time as the wall clock had it when a
 database was first used, and from there on what the monotonic clock counts: time for which the machine is suspended is not part of it.
-What people and clients read (``createdAt``, logs) stays wall-clock time.
+Times for people and clients (``createdAt``, logs) stay wall-clock times.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _STEP = 1000
 
 
 def boot_id() -> str:
-    """What identifies this boot of the machine, as long as its monotonic clock counts on."""
+    """An identifier of this boot of the machine: it stays while the monotonic clock runs."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
@@ -47,16 +47,16 @@ class Clock:
         self._offset = 0
         """Steady time less monotonic time [ms]; the same until the next boot."""
         self.drift = 0
-        """Wall-clock time less steady time [ms]: what a steady time lacks to be shown."""
+        """Wall-clock time less steady time [ms]: added to a steady time where it is shown."""
 
     def now(self) -> int:
         """Steady time [ms]."""
         return round(self._monotonic() * 1000) + self._offset
 
     def restore(self, session: Session) -> None:
-        """Go on from the controller before.
+        """Continue the steady time of the controller before.
 
-        After another boot (or on another machine) nothing tells how much time has passed but the wall clock, which is believed.
+        After another boot (or on another machine) only the wall clock tells how much time has passed, and is believed.
         """
         state, boot = session.get(ClockState, 1), self._boot()
         if state is not None and state.boot == boot:
@@ -76,13 +76,13 @@ class Clock:
         before, self.drift = self.drift, self._difference()
         log.warning(
             "the wall clock moved by %+.0f s against the monotonic one (it was set, or the machine was suspended); time-outs, "
-            "limits and shares go on without that time",
+            "limits and shares continue without that time",
             (self.drift - before) / 1000,
         )
         self._save(session)
 
     def rewrite(self, session: Session) -> None:
-        """Write what is written already, to see that the database can be written to."""
+        """Write the present values again, as a test that the database can be written to."""
         session.execute(update(ClockState).values(boot=self._boot()))
 
     def _difference(self) -> int:

@@ -13,7 +13,7 @@ from orchestrator.engines.installed import ENGINES
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue
 
 ENGINE_TAG = "muster:engine"
-"""Tag of a compute environment: which engine's hosts it has; without it, those of the controller's first."""
+"""Tag that names the engine of a compute environment; without it, the controller's first engine."""
 
 
 def ensure_compute_environments(session: Session, engines: Sequence[str]) -> None:
@@ -38,7 +38,7 @@ def is_built_in(compute_environment: ComputeEnvironment) -> bool:
 
 
 def own_queues(engines: Sequence[str]) -> dict[str, str]:
-    """The queue that is there for each engine: ``default`` for the first."""
+    """The built-in queue of each engine: ``default`` for the first."""
     return {name: name if number else "default" for number, name in enumerate(engines)}
 
 

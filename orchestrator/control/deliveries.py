@@ -36,7 +36,7 @@ from shared_store.wording import nearest
 TIMEOUT = 10.0
 """Seconds that one try may take in all: connecting, sending, and the answer's status."""
 _IDLE = 5.0
-"""Seconds between two looks for what is due, where nothing wakes the thread."""
+"""Seconds between two looks for due messages, where nothing wakes the thread."""
 _SHOWN = ("mean_return", "mean_length", "max_length", "episodes")
 
 log = logging.getLogger("muster.webhooks")
@@ -64,7 +64,7 @@ class Deliveries:
             self._database.ended = self.note
 
     def start(self) -> None:
-        """Go on with what an earlier controller has left, but for webhooks that are not in the file any more."""
+        """Deliver the messages that an earlier controller has left, except to webhooks that are not in the file any more."""
         if self.webhooks:  # a controller without any, such as that of `muster run`, leaves what waits to the next one
             with suppress(DatabaseError), self._reconciler.writing, self._database.session() as session:
                 gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
@@ -75,7 +75,7 @@ class Deliveries:
             thread.start()
 
     def _name_unknown_queues(self, known: Sequence[str]) -> None:
-        """Warn of queues that no job can be in; no more than that, since a queue may be created later."""
+        """Warn of unknown queues in the file; a warning only, since a queue may be created later."""
         for webhook in self.webhooks.values():
             for queue in sorted({*(webhook.queues or ())} - {*known}):
                 log.warning(
@@ -83,7 +83,7 @@ class Deliveries:
                 )
 
     def close(self) -> None:
-        """Deliver no more; what is due waits in the database for the next controller."""
+        """Deliver no more; due messages wait in the database for the next controller."""
         self._ending.set()
         for wake in self._wake.values():
             wake.set()
@@ -92,7 +92,7 @@ class Deliveries:
                 thread.join(timeout=1)
 
     def note(self, session: Session, job: Job) -> None:
-        """A job ends with this transaction: add the messages that tell so to it."""
+        """Add the messages about the end of a job to the transaction that ends it."""
         for webhook in self.webhooks.values():
             if webhook.wants(job):
                 made = now()
@@ -187,9 +187,9 @@ class Deliveries:
             )
 
     def _send(self, webhook: Webhook, identity: str, body: bytes) -> str | None:
-        """One try; what was wrong with it, None where the receiver accepted it. Of the answer only the status counts.
+        """Try once; returns the problem, None where the receiver accepted the message. Only the status of the answer counts.
 
-        It has an event loop of its own: from there a try can be left at any point, as while a receiver sends a byte a second. Nothing
+        It has an event loop of its own: that way a try can be cancelled at any point, such as while a receiver sends a byte a second. Nothing
         of the answer is read behind its header.
         """
         headers = {"user-agent": f"muster/{__version__}", **webhook.headers(identity, int(time.time()), body)}
@@ -244,7 +244,7 @@ class Deliveries:
 
 
 def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None]:
-    """The checkpoint that a message names and its evaluation: of a job that evaluates its own, of others the newest one's."""
+    """The checkpoint that a message names, and its evaluation: the evaluated one for a job that evaluates, else the newest."""
     if kind_of(job) == "train" and is_of_earlier_run(job, run):
         return None, None
     with suppress(OSError, ValueError):  # a volume that is away: the message does without

@@ -20,7 +20,7 @@ _PATIENCE = 5.0
 
 @dataclass(frozen=True)
 class MinFree:
-    """How much of a volume must be free; the lesser of the two where both are given."""
+    """The part of a volume that must be free; the lesser of the two where both are given."""
 
     size: int | None = None
     """Bytes."""
@@ -55,14 +55,14 @@ class _Volume:
     path: Path
     short: str | None = None
     asked: tuple[float, float] | None = None
-    """While it is looked at: since when, by the monotonic clock [s] and in Unix time [s]."""
+    """Start of the look under way, by the monotonic clock [s] and in Unix time [s]."""
 
 
 class Disk:
-    """Watches volumes by what lies on them. Any thread may ask, and none ever waits for a volume."""
+    """Watches volumes by directories on them. Any thread may ask, and none ever waits for a volume."""
 
     def __init__(self, volumes: Mapping[str, Path], minimum: MinFree = DEFAULT) -> None:
-        """Look once at each volume. ``volumes``: a directory on each, by what the volume is for, such as ``store``."""
+        """Look once at each volume. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``."""
         self._volumes, self._minimum = [_Volume(*each) for each in volumes.items()], minimum
         self._ended = threading.Event()
         for volume in self._volumes:
@@ -70,7 +70,7 @@ class Disk:
 
     @property
     def names(self) -> list[str]:
-        """What the volumes are for."""
+        """Names of the volumes, such as ``store``."""
         return [volume.name for volume in self._volumes]
 
     def start(self) -> None:
@@ -79,11 +79,11 @@ class Disk:
             threading.Thread(target=self._watch, args=(volume,), name=f"volume {volume.name}", daemon=True).start()
 
     def close(self) -> None:
-        """Look no more; a look that hangs is left behind."""
+        """Stop looking; a look that hangs is abandoned."""
         self._ended.set()
 
     def shortage(self, purpose: str | None = None) -> str | None:
-        """Which volume does not answer or has less than the minimum, and what to do; None where there is no such volume.
+        """A line about a volume that does not answer or has less than the minimum; None where there is no such volume.
 
         ``purpose``: of the volume for this alone.
         """

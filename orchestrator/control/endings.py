@@ -1,4 +1,4 @@
-"""How a node ended: by its outcome in the store, else as its engine saw it."""
+"""The end of a node: by its outcome in the store, else as its engine saw it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _KILLED = 137
 
 
 def node_end(run: Run, record: Node, node: NodeStatus, is_native: bool, moment: int) -> tuple[NodeEnd, int]:
-    """How and when (Unix time [ms]) a node ended. Raises OSError.
+    """The end of a node, and its time (Unix time [ms]). Raises OSError.
 
     Args:
         run: Of its job.
         record: Its row.
-        node: What its engine says; it has ended.
+        node: Its status by its engine; it has ended.
         is_native: Its job came from YAML.
         moment: When that was seen (Unix time [ms]).
     """
@@ -43,7 +43,7 @@ def seen_end(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
     """The end of a node that left no outcome.
 
     Args:
-        node: What its engine says; it has ended.
+        node: Its status by its engine; it has ended.
         is_native: Its job came from YAML. A job of the Batch API that is preempted has lost its host: AWS has no other word for it.
         moment: When it was seen (Unix time [s]).
     """

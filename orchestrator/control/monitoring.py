@@ -1,4 +1,4 @@
-"""What a Prometheus server reads of a controller: counters since it began, and what there is at the moment of a scrape.
+"""A controller's metrics for Prometheus: counters since it began, and values at the moment of a scrape.
 
 Names and units are Prometheus's: base units, ``_total`` for what only grows. Counters begin at 0 with each controller, as Prometheus
 expects. Nothing here looks into the store or waits for an engine: a volume that hangs keeps no scrape waiting.
@@ -100,7 +100,7 @@ class Monitoring:
         event.listen(session, "after_commit", note, once=True)
 
     def ended(self, session: Session, job: Job, attempt: Attempt) -> None:
-        """An attempt, whose use was charged, ends once the session is committed."""
+        """An attempt, whose usage was charged, ends once the session is committed."""
 
         def note(_: Session) -> None:
             self._attempts.labels(*labels, ending).inc()
@@ -122,7 +122,7 @@ def exposition(reconciler: Reconciler) -> bytes:
 
 
 class _Moment(Collector):
-    """What there is while Prometheus looks."""
+    """The values at the moment of a scrape."""
 
     def __init__(self, reconciler: Reconciler) -> None:
         self._reconciler = reconciler

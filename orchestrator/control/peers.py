@@ -27,7 +27,7 @@ BEAT = 5.0
 GONE = 30.0
 """Seconds without a new heartbeat after which a controller counts as gone."""
 _OUTDATED = 3600.0
-"""Age of a heartbeat [s] that is not taken for a sign of life at first sight, however the clocks of the machines differ."""
+"""Age [s] from which a heartbeat is no sign of life at first sight, whatever the difference between the machines' clocks."""
 _LONGEST_NAME = 256
 
 
@@ -75,7 +75,7 @@ class Peers:
             self._path.unlink(missing_ok=True)
 
     def writer(self, run: Run) -> str | None:
-        """Which attempt of another controller writes the run now, in words; None where none does.
+        """The attempt of another controller that writes the run now, in words; None where there is none.
 
         Raises:
             OSError, ValueError: The store can't be read, or the run's ``EPOCH`` is damaged.
@@ -103,7 +103,7 @@ class Peers:
             self._look()
 
     def _look(self) -> None:
-        """Leave a heartbeat and read the others'; where the store is away, the next one comes in time."""
+        """Leave a heartbeat and read the others'; where the store is unavailable, the next heartbeat makes up for it."""
         self._beat += 1
         own = Peer(str(self._home), socket.gethostname(), os.getpid(), self._beat, time.time())
         try:

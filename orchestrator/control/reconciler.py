@@ -1,6 +1,6 @@
 """The reconcile loop: database × scheduler × engine.
 
-A controller that starts on the database of a dead one goes on from there: what it decides is recorded before it is done.
+A controller that starts on the database of a dead one continues from there: what it decides is recorded before it is done.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from shared_store.layout import Store
 _SETTLED_AT_ONCE = 200
 """Jobs a commit, of those that only change their state."""
 _SETTLED_A_TICK = 1000
-"""The same in one pass: a large array that ends must not keep running gangs from being looked at."""
+"""The same in one pass: a large array that ends must not delay the looks at running gangs."""
 _GATHERING = 0.02
 """Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
 _PASS_INTERVAL = 1.0
@@ -50,7 +50,7 @@ _PASS_INTERVAL = 1.0
 _PASS_SHARE = 0.2
 """Share of one CPU that passes may take."""
 _WITHOUT_DATABASE = 1.0
-"""Seconds between two looks for a database that can't be used."""
+"""Seconds between two tries of a database that can't be used."""
 _SWEEP_INTERVAL = 2.0
 """Seconds between two looks for queues that are gone and history that may be forgotten."""
 
@@ -73,7 +73,7 @@ class Reconciler:
         min_free: MinFree = DEFAULT,
     ) -> None:
         """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
-        ``min_free``: what must be free on the volumes of the store and the database for something new to start.
+        ``min_free``: free space that the volumes of the store and the database need for something new to start.
         """
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval, self.retention = interval, retention
@@ -85,7 +85,7 @@ class Reconciler:
         self.monitoring = Monitoring()
         self.attempts = Attempts(engine, store, bus, peers, self.clock, self.monitoring, self.wake)
         self.writing = threading.Lock()
-        """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
+        """Held while something is registered, submitted or changed: checks must still hold at the commit."""
         self.submissions = GroupCommit(database, self.writing)
         bus.changed = engine.changed = self.wake
         database.committed = self._committed
@@ -98,9 +98,9 @@ class Reconciler:
         self.trouble: str | None = None
         """Why the database can't be used at present: nothing is launched, and no request is accepted."""
         self._is_full = False
-        """Whether that is because its volume is full: what ends jobs is tried all the same."""
+        """Whether its volume is full; jobs are ended all the same."""
         self._backoff = Backoff(log)
-        """What goes wrong, by a part of the pass, or by what was tried of a job and the job's id."""
+        """Failures, by the part of the pass, or by the action on a job and the job's id."""
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
         with database.session() as session:
             self.clock.restore(session)
@@ -113,11 +113,11 @@ class Reconciler:
         self._thread.start()
 
     def wake(self) -> None:
-        """Something changed: look now instead of at the next interval."""
+        """Look now instead of at the next interval, since something changed."""
         self._wake.set()
 
     def close(self) -> None:
-        """Leave the loop; running gangs go on, and the next controller on this database finds them."""
+        """Leave the loop; running gangs continue, and the next controller on this database finds them."""
         self._ending.set()
         self.disk.close()
         self._wake.set()
@@ -155,7 +155,7 @@ class Reconciler:
         self._isolated("clearing away", self._sweep)
 
     def _keep_database(self) -> None:
-        """Raises DatabaseError where it is away, or another controller's; where it is back, what is known of jobs is read anew."""
+        """Check the database, and read the jobs anew where it is back. Raises DatabaseError where it is unavailable or another controller's."""
         self.database.check()
         if self.trouble is not None or time.monotonic() - self._kept > _SWEEP_INTERVAL:
             self.database.keep_lock()
@@ -168,7 +168,7 @@ class Reconciler:
             log.warning("the database can be used again")
 
     def _isolated(self, what: str, body: Callable[[], None]) -> None:
-        """Carry out a part of a pass, whose failure must not stop the other parts."""
+        """Carry out one part of a pass: its failure must not stop the other parts."""
         try:
             body()
             self._backoff.worked(what)
@@ -180,7 +180,7 @@ class Reconciler:
             self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
     def _guarded(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
-        """Do something to these jobs in one commit; where that fails, to each by itself. Returns those that it failed for.
+        """Do something to these jobs in one commit; where that fails, to each by itself. Returns the jobs for which it failed.
 
         Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
@@ -207,7 +207,7 @@ class Reconciler:
                     body(session, jobs[job_id])
 
     def _failed(self, what: str, job_id: str, error: Exception) -> None:
-        """Note what went wrong with a job: logged once, shown as its reason, and tried again later and later."""
+        """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
         expected = isinstance(error, StoreUnavailable)
         reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
         reason = excerpt(storable(reason), LONGEST_REASON)
@@ -221,14 +221,14 @@ class Reconciler:
             self.attempts.advance(session, job, attempt)
 
     def _committed(self, jobs: Sequence[Job]) -> None:
-        """Only what this thread has written is known to be the newest; what a request has changed is read again."""
+        """Note the jobs of a commit as they are, where this thread has made it; read them again after a commit of a request."""
         if threading.current_thread() is self._thread:
             self.work_queue.note(jobs)
         else:
             self._look_again([job.id for job in jobs])
 
     def _look_again(self, ids: Collection[str]) -> None:
-        """Requests have changed these jobs: what failed of them is tried at once."""
+        """Try failed actions on these jobs at once, since requests have changed the jobs."""
         for job_id in ids:
             for what in ("settle", "advance", "cancel", "preempt", "start"):
                 self._backoff.hurry((what, job_id))
@@ -241,7 +241,7 @@ class Reconciler:
     # -- admission ----------------------------------------------------------------------------------------------------
 
     def _admit(self) -> None:
-        """A scheduling pass, where something changed or time has passed, and enough space is free."""
+        """Make a scheduling pass, where something changed or time has passed, and enough space is free."""
         shortage = self.disk.shortage()
         if self._short != (shortage is not None):
             log.warning("%s", shortage or "the volumes have enough free space again")
@@ -260,6 +260,7 @@ class Reconciler:
         if not waiting:
             self._report, self._passed = None, (version, started, 0.0)
             return
+        unknown = self.engine.unknown()  # before the capacity: an engine may tell it in between
         with self.database.session() as session:
             snapshot = take_snapshot(
                 session,
@@ -269,6 +270,7 @@ class Reconciler:
                 self.work_queue.active(),
                 self._leading,
                 self.engine.names[0],
+                unknown,
             )
         decisions = decide(snapshot)
         self._report, self._leading = decisions.report, decisions.leading
@@ -278,7 +280,7 @@ class Reconciler:
         self._carry_out(decisions)
 
     def _carry_out(self, decisions: Decisions) -> None:
-        """Each decision by itself: one that fails does not stop the others."""
+        """Carry out each decision by itself: one that fails does not stop the others."""
         bodies: list[tuple[str, str, Callable[[Session, Job], None]]] = [
             *(("cancel", each.job, partial(self._cancel, each)) for each in decisions.cancels),
             *(("preempt", each.job, partial(self._preempt, each)) for each in decisions.preempts),
@@ -310,7 +312,7 @@ class Reconciler:
         """Whether a request may change the database, to which it ``adds`` something or not.
 
         Raises DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
-        little room for what is new.
+        little room for an addition.
         """
         if (trouble := self.trouble) is not None and (adds or not self._is_full):
             raise DatabaseError(trouble)
@@ -318,7 +320,7 @@ class Reconciler:
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
 
     def reason(self, job: Job) -> str | None:
-        """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
+        """Why a job waits now, or a note for its user while it runs; None where its own reason says all."""
         shortage, report = self.disk.shortage(), self._report
         if job.status in (Status.STARTING, Status.RUNNING):
             failed = self._backoff.said(("preempt", job.id)) if report and report.preempts(job.id) else None
@@ -350,7 +352,7 @@ class Reconciler:
     def utilization(
         self, session: Session, queue: str
     ) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
-        """What the gangs of a queue hold just now, by unit (``VCPU``, ``GPU``): in all, and by share."""
+        """Amounts that the gangs of a queue hold now, by unit (``VCPU``, ``GPU``): in all, and by share."""
         total: dict[str, float] = defaultdict(float)
         shares: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         for job, attempt in open_attempts(session, self.work_queue.active()):
@@ -366,7 +368,7 @@ class Reconciler:
         ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
     def _sweep(self) -> None:
-        """Remove deleted queues that are empty, and history that is older than it is kept."""
+        """Remove deleted queues that are empty, and history beyond the retention time."""
         if time.monotonic() - self._swept < _SWEEP_INTERVAL:
             return
         if not self.writing.acquire(blocking=False):

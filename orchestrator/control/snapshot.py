@@ -1,4 +1,4 @@
-"""From the database to a scheduling pass's snapshot, and what is known of the queues after the pass."""
+"""The snapshot of a scheduling pass, read from the database, and the facts about queues after the pass."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ def take_snapshot(
     active: Sequence[str],
     leading: Mapping[str, Leading] | None = None,
     first: str = "local",
+    unknown: Mapping[str, str] | None = None,
 ) -> Snapshot:
-    """Everything that the pass depends on, as it is now.
+    """Read everything that the pass depends on.
 
     Args:
         session: The session.
@@ -53,13 +54,16 @@ def take_snapshot(
         capacities: All that the engines have, by their names.
         waiting: The jobs that wait for room.
         active: Ids of the jobs that may hold some.
-        leading: What the last pass found at the head of each queue.
+        leading: The job that the last pass found at the head of each queue.
         first: The controller's first engine.
+        unknown: Why an engine has not told what it has, by name; asked for before ``capacities``, which count.
     """
+    unknown = {name: why for name, why in (unknown or {}).items() if name not in capacities}
     policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
     queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
     ces = {
-        each.name: read_compute_environment(each, first) for each in session.scalars(select(models.ComputeEnvironment))
+        each.name: read_compute_environment(each, first, unknown)
+        for each in session.scalars(select(models.ComputeEnvironment))
     }
     holding = open_attempts(session, active)
     # what runs on an engine that queues by itself takes nothing away from what is handed to it
@@ -95,15 +99,18 @@ def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Atte
 
 
 def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:
-    """What the queue would have for a gang if nothing ran; ``patience``: seconds to wait for the engines' newest hosts."""
+    """The hosts for a gang in the queue if nothing else ran, or why it could never start; ``patience``: seconds to wait for the engines' newest hosts."""
     first = engine.names[0]
     rows = [
         row for name in queue.compute_environments if (row := session.get(models.ComputeEnvironment, name)) is not None
     ]
-    ces = {row.name: read_compute_environment(row, first) for row in rows}
-    engines = dict.fromkeys(ce.engine for ce in ces.values() if ce.engine is not None)
+    engines = dict.fromkeys(engine_named_by(row.tags, first) for row in rows)
+    before = engine.unknown()
+    capacities = engine.capacity(engines, patience)
+    unknown = {name: why for name, why in before.items() if name not in capacities}
+    ces = {row.name: read_compute_environment(row, first, unknown) for row in rows}
     elastic = [name for name, ce in ces.items() if ce.engine is not None and engine.is_elastic([ce.engine])]
-    return fit(shape, read_queue(queue, {}), ces, _places(engine.capacity(engines, patience)), elastic)
+    return fit(shape, read_queue(queue, {}), ces, _places(capacities), elastic)
 
 
 def _places(capacities: Mapping[str, Capacity]) -> Sequence[Host]:
@@ -130,13 +137,16 @@ def _fair_share(document: Mapping[str, Any]) -> FairShare:
     return FairShare(decay, document.get("computeReservation", 0), weights)
 
 
-def read_compute_environment(row: models.ComputeEnvironment, first: str) -> ComputeEnvironment:
-    """``first``: the engine of one that names none."""
+def read_compute_environment(
+    row: models.ComputeEnvironment, first: str, unknown: Mapping[str, str] | None = None
+) -> ComputeEnvironment:
+    """``first``: the engine of one that names none. ``unknown``: why an engine has not told what it has, by the names of those."""
     named = row.tags.get(HOSTS_TAG)
     hosts = tuple(name.strip() for name in named.split(",")) if named else None
     most = (row.document.get("computeResources") or {}).get("maxvCpus")
     cpus = float(most) if most is not None else None
-    return ComputeEnvironment(row.name, row.state == "ENABLED", hosts, cpus, engine_named_by(row.tags, first))
+    engine = engine_named_by(row.tags, first)
+    return ComputeEnvironment(row.name, row.state == "ENABLED", hosts, cpus, engine, (unknown or {}).get(engine, ""))
 
 
 def new_nodes(placements: Sequence[Placement]) -> list[Node]:

@@ -1,4 +1,4 @@
-"""What attempts have used: GPU-seconds and CPU-seconds, those whose work was lost, and each share's part."""
+"""Usage of attempts: GPU-seconds and CPU-seconds, those whose work was lost, and each share's part."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shared_store.layout import Run
 
 
 def held_by(attempt: Attempt) -> Resources:
-    """What the nodes of an attempt were given in all."""
+    """Total resources of the nodes of an attempt."""
     return sum((each.resources for each in placements_of(attempt)), Resources())
 
 
@@ -35,7 +35,7 @@ def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
 
 
 def charge(attempt: Attempt, run: Run, moment: int) -> None:
-    """Fill in what a closed attempt has used until ``moment`` (steady time [ms]), and what of it was lost: all since its last checkpoint."""
+    """Record the usage of a closed attempt until ``moment`` (steady time [ms]), and the lost part: all since its last checkpoint."""
     assert attempt.stopped_at is not None
     seconds = _held(attempt, moment)
     held = held_by(attempt)
@@ -58,12 +58,12 @@ def _since_checkpoint(attempt: Attempt, run: Run, otherwise: float) -> float:
 
 
 def _held(attempt: Attempt, moment: int) -> float:
-    """Seconds for which an attempt has held what it was given, at ``moment`` (steady time [ms])."""
+    """Seconds for which an attempt has held its resources, at ``moment`` (steady time [ms])."""
     return max(0, moment - (attempt.created_at if attempt.held_since is None else attempt.held_since)) / 1000
 
 
 def resource_seconds(attempt: Attempt, moment: int) -> float:
-    """What an attempt has used until ``moment`` (steady time [ms]): GPU-seconds, or CPU-seconds where it has no GPUs."""
+    """Usage of an attempt until ``moment`` (steady time [ms]): GPU-seconds, or CPU-seconds where it has no GPUs."""
     seconds = _held(attempt, moment)
     held = held_by(attempt)
     return seconds * (held.gpus or held.cpus)
@@ -82,7 +82,7 @@ def add_usage(session: Session, queue: str, share: str, seconds: float, decay: i
 def usage_at(
     session: Session, moment: int, decays: Mapping[str, int], running: Sequence[tuple[Job, Attempt]]
 ) -> dict[tuple[str, str], float]:
-    """(queue, share) → resource-seconds decayed to a moment, with what running gangs have used until then.
+    """(queue, share) → resource-seconds decayed to a moment, with the usage of running gangs until then.
 
     Args:
         session: The session.
@@ -107,7 +107,7 @@ def usage_at(
 def forget_before(session: Session, moment: int, most: int = 500) -> int:
     """Delete the history of jobs that were over before ``moment`` [ms], at most so many; returns how many were.
 
-    What a job that is not over waits for is kept, and an array with its children until the last of them is over.
+    A job is kept while another one waits for it, and an array with its children until the last of them is over.
     """
     open_jobs = select(Job.id).where(Job.status.not_in(TERMINAL))
     needed = select(Dependency.on_id).where(Dependency.job_id.in_(open_jobs))

@@ -75,7 +75,7 @@ class Webhook(BaseModel):
     kinds: list[Literal["train", "evaluate", "race", "export", "record", "render", "command"]] | None = None
     """Of :data:`orchestrator.spec.model.KINDS`; None: all."""
     link: Annotated[str, AfterValidator(_url)] | None = None
-    """Where the receiver's people reach this controller; None: where it listens."""
+    """URL at which the receiver's people reach this controller; None: the address at which it listens."""
 
     @property
     def receiver(self) -> str:
@@ -104,7 +104,7 @@ class Webhook(BaseModel):
 
 
 def kind_of(job: Job) -> str:
-    """What a job does, of :data:`orchestrator.spec.model.KINDS`; ``command`` where its spec does not say, or its row is damaged."""
+    """The kind of a job, of :data:`orchestrator.spec.model.KINDS`; ``command`` where its spec has none, or its row is damaged."""
     spec = _spec(job)
     return next((kind for kind in KINDS if spec.get(kind)), "command")
 
@@ -154,7 +154,7 @@ _KEYS = [name for name in Webhook.model_fields if name != "name"]
 
 
 def _told(problem: Any) -> str:
-    """What is wrong with a value; of a secret or a URL, which may have one, without the value."""
+    """The problem of a value, without the value where that is a secret, or a URL that may hold one."""
     if problem["type"] == "value_error":
         return str(problem["ctx"]["error"])
     return "expected a text" if problem["type"] == "string_type" else explain(problem)

@@ -1,4 +1,4 @@
-"""The controller's memory of the jobs that are not over: those that wait for resources, those with a gang, those that are due for a look.
+"""The controller's memory of the jobs that are not over: those that wait for resources, those with a gang, and those due for a look.
 
 It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a look.
 """
@@ -21,7 +21,7 @@ _LOADED_AT_ONCE = 1000
 
 
 class WorkQueue:
-    """Jobs by what the controller has to do with them. Any thread may call."""
+    """Jobs by the controller's next action on them. Any thread may call."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -34,7 +34,7 @@ class WorkQueue:
         """Grows whenever something changes that a scheduling pass depends on."""
 
     def load(self, session: Session) -> None:
-        """Read all jobs that are not over, in place of what was known. Those that depend on a job that has ended are looked at too."""
+        """Read all jobs that are not over, and forget the earlier state. PENDING jobs become due: one on which they depend may have ended."""
         with self._lock:
             self._waiting, self._active = {}, {}
             self.version += 1
@@ -81,12 +81,12 @@ class WorkQueue:
         return due
 
     def look_again(self, jobs: Iterable[str]) -> None:
-        """Hand these out at the next :meth:`take_due`."""
+        """Return these at the next :meth:`take_due`."""
         with self._lock:
             self._due.update(dict.fromkeys(jobs))
 
     def take_dependents(self, session: Session) -> None:
-        """Have those looked at that wait for jobs which ended since the last call."""
+        """Make the jobs due that depend on jobs that ended since the last call."""
         with self._lock:
             ended, self._ended = list(self._ended), {}
         try:
@@ -109,7 +109,7 @@ class WorkQueue:
             return list(self._waiting.values())
 
     def since(self, job: str) -> int | None:
-        """Since when a job waits for room [ms]; None where it does not."""
+        """Time from which a job waits for room [ms]; None where it does not wait."""
         entry = self._waiting.get(job)
         return entry.since if entry else None
 

@@ -67,6 +67,8 @@ class NodeSpec:
     resources: Resources
     container: Mapping[str, Any]
     """``containerProperties`` unchanged, from which engines read volumes, limits and the like."""
+    ecs: str | None = None
+    """Name of the container where the definition gave ``ecsProperties``; None where it gave ``container``."""
 
     @cached_property
     def spec(self) -> Mapping[str, Any] | None:
@@ -122,7 +124,7 @@ def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
     for entry in sorted(
         node_properties["nodeRangeProperties"], key=lambda e: -len(target_nodes(e["targetNodes"], count))
     ):
-        node = _node_spec(entry.get("container") or {})
+        node = _node_spec(entry)
         for index in target_nodes(entry["targetNodes"], count):
             if index < count:
                 nodes[index] = node
@@ -139,7 +141,8 @@ def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
     return GangSpec(main, whole, least, NativeOptions.read(variables))
 
 
-def _node_spec(container: Mapping[str, Any]) -> NodeSpec:
+def _node_spec(entry: Mapping[str, Any]) -> NodeSpec:
+    container = entry.get("container") or {}
     resources = {entry["type"]: entry["value"] for entry in container.get("resourceRequirements") or []}
     environment = {entry["name"]: entry.get("value", "") for entry in container.get("environment") or []}
     ranks = environment.get("MUSTER_RANKS_PER_NODE", "1")
@@ -155,4 +158,5 @@ def _node_spec(container: Mapping[str, Any]) -> NodeSpec:
             memory=int(resources.get("MEMORY", container.get("memory", 4))),
         ),
         container=container,
+        ecs=entry.get("ecs"),
     )

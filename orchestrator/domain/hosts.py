@@ -1,4 +1,4 @@
-"""Machines, what engines have of them, and the placement of a gang's nodes."""
+"""Machines, the capacity of engines, and the placement of a gang's nodes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Hosts:
 
     @property
     def places(self) -> Sequence[Host]:
-        """What gangs are placed on."""
+        """The hosts on which gangs are placed."""
         return self.machines
 
 
@@ -79,7 +79,7 @@ class Queued:
 
     @property
     def places(self) -> Sequence[Host]:
-        """What gangs are placed on to see whether they fit."""
+        """The hosts on which gangs are placed to find out whether they fit."""
         if not isinstance(self.limits, Limit):
             return self.limits
         most = self.limits.resources

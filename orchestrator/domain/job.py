@@ -69,7 +69,7 @@ class Ending(StrEnum):
 
 @dataclass(frozen=True)
 class NodeEnd:
-    """How one node ended; ``ended`` is the Unix time [s] of its first error, or of its end."""
+    """The end of one node; ``ended`` is the Unix time [s] of its first error, or of its end."""
 
     exit_code: int
     reason: str
@@ -119,9 +119,9 @@ def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdic
 
 
 def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | None:
-    """Whether the attempt is over, from how its nodes ended; None while it goes on.
+    """Whether the attempt is over, from how its nodes ended; None while it continues.
 
-    The main node's end ends the job and decides (AWS Batch). What a child's failure means is ``policy``: ``ignore`` nothing
+    The main node's end ends the job and decides (AWS Batch). The meaning of a child's failure is ``policy``: ``ignore`` nothing
     (what AWS does), ``restart`` a new attempt, ``fail`` the end of the job.
 
     Args:

@@ -27,7 +27,7 @@ class NativeOptions:
     directory: str = ""
     """Directory from which it was submitted; empty if unknown."""
     worlds: int | None = None
-    """Of each rank, of a training that goes on with what its run has; None where that is not said."""
+    """Worlds of the whole gang, for a training that continues a run; None where not given."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck."""
     log_limit: int = LIMIT
@@ -35,7 +35,7 @@ class NativeOptions:
 
     @classmethod
     def read(cls, environment: Mapping[str, str]) -> NativeOptions:
-        """The options that a node's variables say. Raises MalformedOptions."""
+        """Read the options in a node's variables. Raises MalformedOptions."""
         given = {name[7:]: value for name, value in environment.items() if name.startswith("MUSTER_")}
         worlds = given.get("WORLDS", "")
         try:

@@ -77,7 +77,7 @@ class Gang:
     """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
     bus: str | None = None
     bus_token: str | None = None
-    """Where the controller's bus router listens, and the attempt's credential for it."""
+    """Address of the controller's bus router, and the attempt's credential for it."""
     title: str = ""
     """The job's name."""
     timeout: int | None = None
@@ -169,7 +169,7 @@ class Handle:
     gang: str
     """Its name, ``<job>/<attempt>/<epoch>``."""
     nodes: int
-    """How many nodes it has."""
+    """Number of its nodes."""
     facts: Mapping[str, Any] = field(hash=False)
     """Further facts by which the engine finds it: JSON, never changed."""
 
@@ -196,7 +196,7 @@ def read_handle(text: str) -> Handle:
 
 
 class NodePhase(StrEnum):
-    """How far a node is. Until it has ended it counts as running: what it holds is held."""
+    """The progress of a node. Until it has ended it counts as running: what it holds is held."""
 
     QUEUED = "queued"
     """The engine has the gang and waits for room."""
@@ -296,14 +296,42 @@ class Setting:
     """Ids of its GPUs to hand out; all by default."""
 
 
+class SecretValues(StrEnum):
+    """The way of the values of a job's secrets to its nodes."""
+
+    NONE = "none"
+    """None is safe: a job with secrets is refused."""
+    ENVIRONMENT = "environment"
+    """The controller puts them into the nodes' environments when it launches the gang."""
+    REFERENCES = "references"
+    """The engine is sent the references, and its own service has the values."""
+
+
+@dataclass(frozen=True)
+class Traits:
+    """The properties in which engines differ, for decisions outside of them: nothing is decided by an engine's name."""
+
+    elastic: bool = False
+    """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
+    images: bool = False
+    """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
+    users: bool = False
+    """A node can run as the user that the job names. True of every engine with images."""
+    secrets: SecretValues = SecretValues.NONE
+    gpu_ids: bool = False
+    """The ids of its hosts' GPUs are those of the devices; else they are numbers until a node's status has its ``gpus``."""
+
+
 @dataclass(frozen=True)
 class EngineType:
-    """The object behind an entry point of the group ``muster.engines``: a factory of the engine, and its options."""
+    """The object behind an entry point of the group ``muster.engines``: a factory of the engine, and what is known without one."""
 
     make: Callable[[Setting], Engine]
     """Imports what the engine needs only when it is called. Raises EngineError, in one line with what to do: it is not installed, or it
     does not answer."""
     options: Sequence[Option] = ()
+    traits: Traits = Traits()
+    """Those of its engine."""
 
 
 class Engine(Protocol):
@@ -320,17 +348,15 @@ class Engine(Protocol):
     """
 
     name: str
-    elastic: bool
-    """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
-    images: bool
-    """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
+    traits: Traits
     address: str | None
     """Address of this machine as its nodes see it, where the bus has to listen; None for loopback."""
 
     def capacity(self) -> Capacity:
         """``Hosts`` to place gangs on, or ``Queued`` of an engine that queues and places them by itself: always the same of the two.
 
-        Names of hosts begin with the engine's and a slash.
+        Names of hosts begin with the engine's and a slash. Until the first answer the engine's jobs wait, and its controller goes
+        on without it. Raises EngineError where it can't be told now: the last answer counts, and the engine's health says why.
         """
         ...
 
@@ -355,7 +381,11 @@ class Engine(Protocol):
         ...
 
     def stop(self, handle: Handle, grace: float) -> None:
-        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left. Raises EngineError."""
+        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left.
+
+        Raises EngineError, which is the job's reason until the next try. It never waits for an answer without end: see
+        :func:`orchestrator.engines.toolkit.stopping.stop_within`.
+        """
         ...
 
     def close(self) -> None:

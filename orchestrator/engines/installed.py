@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
-from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting
+from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting, Traits
 from shared_store.wording import nearest
 
 GROUP = "muster.engines"
@@ -47,6 +47,14 @@ def engine_type(name: str) -> EngineType:
     if not isinstance(found, EngineType):
         raise EngineError(f"engine {name}: {_POINTS[name].value} is no EngineType (orchestrator.engines.api)")
     return found
+
+
+def traits_of(name: str) -> Traits:
+    """Those of the engine called ``name``; the most careful ones where it is not installed here."""
+    try:
+        return engine_type(name).traits
+    except EngineError:
+        return Traits()
 
 
 def make_engine(name: str, setting: Setting) -> Engine:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import wait
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
@@ -18,18 +19,18 @@ from orchestrator.engines.api import (
     NodeStatus,
     NotYet,
     Plan,
+    SecretValues,
+    Traits,
     read_handle,
 )
+from orchestrator.engines.installed import traits_of
 from orchestrator.engines.runner import Health, Runner
 from orchestrator.engines.secrets import Secrets, SecretsError
 
 FRESH = 2.0
 """Seconds that a request waits for the engines' newest hosts."""
-
-_GIVEN = ("local", "docker")
-"""Engines that hand the controller's secrets to their nodes."""
-_PASSED_ON = ("aws-batch",)
-"""Engines that are sent the job's ``secrets`` as they are: AWS has its own."""
+START = 5.0
+"""Seconds that a controller's start waits for the first answers of its engines; it goes on without those that are later."""
 
 
 class NotServed(NotYet):
@@ -43,13 +44,14 @@ class EngineSet:
     """Engines by their names, each on its own thread; the first is the one that jobs of the queue ``default`` go to."""
 
     def __init__(self, engines: Sequence[Engine]) -> None:
-        """Takes the engines over: :meth:`close` closes them."""
+        """Takes the engines over: :meth:`close` closes them. Waits a little for their first answers."""
         self.secrets = Secrets()
         """The source of the jobs' secrets; none at first."""
         self.changed: Callable[[], None] = lambda: None
         """Called (on an engine's thread) when an engine has something new to tell."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
         self._runners = {engine.name: Runner(engine, lambda: self.changed()) for engine in engines}
+        wait([runner.first for runner in self._runners.values()], START)
 
     def close(self) -> None:
         """Close every engine; gangs go on."""
@@ -63,7 +65,7 @@ class EngineSet:
 
     def is_elastic(self, names: Iterable[str]) -> bool:
         """Whether one of these engines may have more hosts later."""
-        return any(self.engines[name].elastic for name in names if name in self.engines)
+        return any(self.engines[name].traits.elastic for name in names if name in self.engines)
 
     @property
     def addresses(self) -> Sequence[str]:
@@ -71,36 +73,39 @@ class EngineSet:
         return sorted({engine.address for engine in self.engines.values() if engine.address})
 
     def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Mapping[str, Capacity]:
-        """The capacity of all engines, or of these, by their names, as each told it last.
+        """The capacity of all engines, or of these, by their names, as each told it last; without those that have not told it yet.
 
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
         deadline = time.monotonic() + patience
-        return {
-            name: self._runners[name].capacity(max(0.0, deadline - time.monotonic()))
-            for name in (self.engines if names is None else names)
-            if name in self._runners
-        }
+        asked = [name for name in (self.engines if names is None else names) if name in self._runners]
+        told = {name: self._runners[name].capacity(max(0.0, deadline - time.monotonic())) for name in asked}
+        return {name: capacity for name, capacity in told.items() if capacity is not None}
+
+    def unknown(self) -> Mapping[str, str]:
+        """Why it is not known what an engine has, by the names of those that have not told it yet."""
+        return {name: why for name, runner in self._runners.items() if (why := runner.unknown) is not None}
 
     def health(self) -> Mapping[str, Health]:
-        """How each engine answers, by its name."""
+        """The answers of each engine, by its name."""
         return {name: runner.health for name, runner in self._runners.items()}
 
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""
         runner = self._runner(engine_of(gang.placements[0].host))
         engine = runner.engine
+        traits = engine.traits
         named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
-        if named and not engine.images and gang.options.get("images") == "refuse":
+        if named and not traits.images and gang.options.get("images") == "refuse":
             raise EngineError(
                 f"image {min(named)}: the {engine.name} engine runs commands in its nodes' own environment, and compute environment "
                 f"{gang.compute_environment} refuses other images (tag muster:images)"
             )
-        if any(container.get("secrets") for container in gang.containers) and engine.name not in (*_GIVEN, *_PASSED_ON):
+        if any(container.get("secrets") for container in gang.containers) and traits.secrets is SecretValues.NONE:
             raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
-        if engine.images:  # its containers are what others have to imitate
+        if traits.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
-        elif engine.name != "local" and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
+        elif not traits.users and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
             raise EngineError(
                 f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out"
             )
@@ -115,7 +120,7 @@ class EngineSet:
         """
         if not any(container.get("secrets") for container in gang.containers):
             return gang
-        if engine_of(gang.placements[0].host) not in _GIVEN:
+        if self._traits(engine_of(gang.placements[0].host)).secrets is not SecretValues.ENVIRONMENT:
             return gang
         try:
             given = [self.secrets.of(container, gang.queue) for container in gang.containers]
@@ -126,7 +131,7 @@ class EngineSet:
 
     def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
         """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
-        if any(name not in _PASSED_ON for name in names):
+        if any(self._traits(name).secrets is not SecretValues.REFERENCES for name in names):
             self.secrets.check(containers, queue)
 
     def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]]) -> str:
@@ -159,6 +164,10 @@ class EngineSet:
         """The gang, one of whose nodes was placed on ``host``, is over; ``handle``: None where it was never launched."""
         if runner := self._runners.get(engine_of(host)):
             runner.forget(gang, read_handle(handle) if handle else None)
+
+    def _traits(self, name: str) -> Traits:
+        """Those of an engine, also of one that is not served."""
+        return self.engines[name].traits if name in self.engines else traits_of(name)
 
     def _runner(self, name: str) -> Runner:
         try:

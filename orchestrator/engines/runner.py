@@ -11,14 +11,13 @@ import threading
 import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, wait
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from orchestrator.domain.hosts import Capacity, Hosts
+from orchestrator.domain.hosts import Capacity
 from orchestrator.engines.api import (
     Engine,
     EngineError,
@@ -47,7 +46,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Health:
-    """How an engine answers."""
+    """The answers of an engine, as a person is told of them."""
 
     told_at: int | None
     """When it last reported its capacity, Unix time [ms]; None before the first time."""
@@ -83,16 +82,16 @@ class Runner:
         self._seen: dict[Handle, GangStatus] = {}
         """By handle: the newest picture."""
         self._telling: Future[Capacity] | None = None
-        self._capacity: Capacity = Hosts(())
+        self._capacity: Capacity | None = None
         self._told_at: int | None = None
         self._backoff = Backoff(log)
         self._since: float | None = None
         """Since when the present call is being carried out (monotonic [s])."""
-        with suppress(EngineError):
-            self._capacity = self._tell_capacity()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"engine {engine.name}", daemon=True)
         self._thread.start()
+        self.first = self.ask_capacity()
+        """Done once the engine has told its capacity for the first time, or has failed to."""
 
     def close(self) -> None:
         """Give the present call a few seconds, drop those that wait, and close the engine; its gangs go on."""
@@ -114,23 +113,37 @@ class Runner:
         return said
 
     @property
+    def unknown(self) -> str | None:
+        """Why it is not known what the engine has; None once it has told that."""
+        if self._capacity is not None:
+            return None
+        return self.silence or self._backoff.said("hosts") or f"the {self.engine.name} engine has not answered yet"
+
+    @property
     def health(self) -> Health:
-        """How the engine answers just now."""
-        problem = self.silence or self._backoff.said("hosts")
+        """The engine's answers just now."""
+        problem = self.silence or self._backoff.said("hosts") or self.unknown
         gangs = {subject[1]: pause for subject, pause in self._backoff.pauses().items() if isinstance(subject, tuple)}
         return Health(self._told_at, problem, len(gangs), min(gangs.values(), default=None))
 
     # -- what the controller asks -------------------------------------------------------------------------------------
 
-    def capacity(self, patience: float = 0.0) -> Capacity:
-        """The hosts or limits that the engine reported last. Requests a newer report and waits for it at most ``patience`` seconds."""
-        with self._lock:
-            if self._telling is None or self._telling.done():
-                self._telling = self._submit(self._tell_capacity)
-            telling = self._telling
+    def capacity(self, patience: float = 0.0) -> Capacity | None:
+        """The hosts or limits that the engine reported last; None before the first report.
+
+        Requests a newer report and waits for it at most ``patience`` seconds.
+        """
+        telling = self.ask_capacity()
         if patience and not self.silence:
             wait([telling], patience)
         return self._capacity
+
+    def ask_capacity(self) -> Future[Capacity]:
+        """Request a newer report of the capacity, unless one is under way; does not wait."""
+        with self._lock:
+            if self._telling is None or self._telling.done():
+                self._telling = self._submit(self._tell_capacity)
+            return self._telling
 
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it, on the caller's thread. Raises EngineError."""

@@ -24,7 +24,7 @@ class SecretsError(Exception):
 
 
 class Secrets:
-    """Where this controller takes secrets from."""
+    """The source of the secrets that this controller gives to jobs."""
 
     def __init__(self, source: str | None = None, environment: MutableMapping[str, str] = os.environ) -> None:
         """Args:

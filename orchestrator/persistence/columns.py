@@ -23,5 +23,5 @@ class Names(TypeDecorator[tuple[str, ...]]):
 
 
 def storable(text: str) -> str:
-    """The text without what a column can't hold, a zero byte and half of a character, which are written out instead."""
+    """The text with zero bytes and halves of characters, which a column can't hold, written out."""
     return text.replace("\0", "\\x00").encode(errors="backslashreplace").decode()

@@ -43,7 +43,7 @@ class GroupCommit:
         self._waiting: deque[_Call] = deque()
 
     def call(self, body: Body) -> dict[str, Any]:
-        """The answer of ``body``, once it is committed. Raises RequestError, or what the database says of it.
+        """The answer of ``body``, once it is committed. Raises RequestError, or the database's error.
 
         Args:
             body: First looks, and raises RequestError where it refuses; then adds to the session.

@@ -62,8 +62,8 @@ class JobQueue(Base):
     """``ENABLED``; ``DISABLED`` takes no new job and finishes those that it has."""
     priority: Mapped[int] = mapped_column(default=1)
     """The highest is served first."""
-    compute_environments: Mapped[list[str]] = mapped_column("environments")
-    """Their names, in the order in which they are tried; ``environments`` in SQL."""
+    compute_environments: Mapped[list[str]]
+    """Their names, in the order in which they are tried."""
     policy: Mapped[str | None] = mapped_column(default=None)
     """Name of its scheduling policy; None: first in, first out."""
     limits: Mapped[list[dict[str, Any]]] = mapped_column(default=list)
@@ -87,7 +87,7 @@ class ComputeEnvironment(Base):
 
 
 class SchedulingPolicy(Base):
-    """How a queue's capacity is shared."""
+    """A rule by which a queue's capacity is shared."""
 
     __tablename__ = "scheduling_policies"
     name: Mapped[str] = mapped_column(primary_key=True)
@@ -129,7 +129,7 @@ class Job(Base):
     name: Mapped[str] = mapped_column(index=True)
     queue: Mapped[str]
     owner: Mapped[str | None] = mapped_column(default=None)
-    """Who submitted it: the name of a key, of a user, or MUSTER_TOKEN."""
+    """The submitter: the name of a key, of a user, or MUSTER_TOKEN."""
     definition: Mapped[str]
     """ARN with revision."""
     kind: Mapped[str] = mapped_column(default="multinode")
@@ -222,7 +222,7 @@ class RunRecord(Base):
     __tablename__ = "runs"
     name: Mapped[str] = mapped_column(primary_key=True)
     owner: Mapped[str | None] = mapped_column(default=None)
-    """Who submitted the job that created it; None where that is not known."""
+    """The submitter of the job that created it; None where unknown."""
     queue: Mapped[str]
     """Of that job: keys of this queue may read and continue the run."""
     created_at: Mapped[int] = mapped_column(default=now)

@@ -71,7 +71,7 @@ def jobs_of(run: Run) -> list[ColumnElement[bool]]:
 
 
 def forget_gone_run(session: Session, run: Run) -> None:
-    """Whose an earlier run of this name was, which is gone from the store, has no say in a new one. Commits."""
+    """Forget the owner of an earlier run of this name that is gone from the store: it has no rights to a new one. Commits."""
     if (record := session.get(RunRecord, run.name)) is not None:
         session.delete(record)
         session.commit()

@@ -36,7 +36,7 @@ def bring_up_to_date(connection: Connection) -> None:
         _VERSION.create(connection, checkfirst=True)
         connection.execute(insert(_VERSION).values(version_num=NEWEST))
         connection.execute(insert(ComputeEnvironment).values(name="local", document={"type": "UNMANAGED"}))
-        connection.execute(insert(JobQueue).values(name="default", environments=["local"]))
+        connection.execute(insert(JobQueue).values(name="default", compute_environments=["local"]))
         return
     from alembic import command
     from alembic.config import Config

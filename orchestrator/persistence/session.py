@@ -41,7 +41,7 @@ class DatabaseError(Exception):
 
 
 class DatabaseFull(DatabaseError):
-    """The volume of the database has no room for what is new; what ends jobs is still written."""
+    """The volume of the database has no room for additions; the ends of jobs are still written."""
 
 
 class Database:
@@ -61,7 +61,7 @@ class Database:
         self._lock: Connection | None = None
         self._file_lock: IO[bytes] | None = None
         self._damage: str | None = None
-        """What was said when a damaged page was first met."""
+        """Message about the first damaged page that was met; None before."""
         self._file: Path | None = None
         self._identity: tuple[int, int] | None = None
         """Device and inode of the file, once it is open."""
@@ -211,7 +211,7 @@ class Database:
         return connection
 
     def _take_file_lock(self, path: Path) -> IO[bytes] | None:
-        """The same for an SQLite file, beside it: its own locks are SQLite's. None where SQLite itself says what is wrong."""
+        """The same for an SQLite file, beside it: its own locks are SQLite's. None where SQLite itself reports the problem."""
         try:
             file = open(f"{path.resolve()}.lock", "ab", opener=_private)  # noqa: SIM115 - held until close()
         except OSError:
@@ -279,7 +279,7 @@ def _is_damaged(error: Exception) -> bool:
 
 
 def _explain(shown: str, error: Exception) -> str:
-    """One line: which database, what is wrong, and what to do about it."""
+    """One line that names the database, the problem and the remedy."""
     if not _is_damaged(error):
         return f"database {shown}: {_first_line(error)}"
     path, found = shown.partition(":///")[2], getattr(error, "orig", error)
@@ -300,7 +300,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _connect_args(url: URL) -> dict[str, Any]:
-    """So that a PostgreSQL server that vanished is noticed within seconds; what the URL itself says counts more."""
+    """Options that reveal a vanished PostgreSQL server within seconds; options in the URL take precedence."""
     if url.get_backend_name() != "postgresql":
         return {}
     told = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}

@@ -21,7 +21,7 @@ class Fit:
     """The answer of an idle queue to a gang."""
 
     allocation: Allocation | None
-    """Where it would start; None if the hosts known now don't suffice."""
+    """Hosts on which it would start; None if the hosts known now don't suffice."""
     problem: str | None
     """Why it could never start; None if it could, perhaps on hosts that are added later."""
 
@@ -68,7 +68,7 @@ def examine(
         if not affordable(shape, most):
             too_many += 1
             causes.append(f"compute environment {ce.name} has at most {count_of(most, 'CPU')}")
-        elif cause := never_fits(shape, free.totals(ce.name), ce.name in elastic):
+        elif cause := never_fits(shape, free.totals(ce.name), bool(ce.unknown) or ce.name in elastic):
             causes.append(f"{where}{cause}")
         else:
             possible.append(ce.name)

@@ -66,10 +66,10 @@ class FreeResources:
         machines: dict[str, tuple[str, ...]],
     ) -> None:
         """Args:
-        total: What each host has.
+        total: All resources of each host.
         members: Hosts of each compute environment, in the engine's order.
-        hosts: What is free of each.
-        cpus: What each compute environment may still use, infinite for one without ``max_cpus``.
+        hosts: The free resources of each.
+        cpus: CPUs that each compute environment may still use, infinite for one without ``max_cpus``.
         machines: The hosts of each machine that has several.
         """
         self.total, self.members, self.hosts, self.cpus, self._machines = total, members, hosts, cpus, machines
@@ -140,7 +140,7 @@ class FreeResources:
     def allocation(
         self, shape: Shape, ce: str, bounds: Sequence[BackfillWindow] = (), most: int | None = None
     ) -> Allocation | None:
-        """A place for the gang in the compute environment, within what each of the ``bounds`` leaves; of ``most`` nodes, where given."""
+        """A place for the gang in the compute environment, within the remainder of each of the ``bounds``; of ``most`` nodes, where given."""
         hosts = [self.hosts[name] for name in self.members[ce]]
         cpus = self.cpus[ce]
         for bound in bounds:

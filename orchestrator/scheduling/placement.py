@@ -84,7 +84,7 @@ def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:
 
 
 def affordable(shape: Shape, cpus: float = inf, gpus: float = inf) -> int:
-    """How many of the gang's first nodes stay within these amounts in all; 0 where that is less than its minimum."""
+    """Number of the gang's first nodes that stay within these amounts in all; 0 where that is less than its minimum."""
     count = 0
     for node in shape.nodes:
         cpus, gpus = cpus - node.cpus, gpus - node.gpus
@@ -129,7 +129,7 @@ def count_of(number: float, what: str) -> str:
 
 
 def _room(node: Resources, host: Host) -> int:
-    """How many such nodes fit on the free part of the host."""
+    """Number of such nodes that fit on the free part of the host."""
     free = host.resources
     if not node <= free:
         return 0
@@ -141,7 +141,7 @@ def _room(node: Resources, host: Host) -> int:
 
 
 def _seats(node: Resources, free: Sequence[Host], enough: int) -> int:
-    """How many such nodes fit on all hosts; counting stops at ``enough``."""
+    """Number of such nodes that fit on all hosts; counting stops at ``enough``."""
     seats = 0
     for host in free:
         seats += _room(node, host)

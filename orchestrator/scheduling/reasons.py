@@ -19,7 +19,7 @@ from orchestrator.scheduling.snapshot import Waiting
 
 NO_COMPUTE_ENVIRONMENT = "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
 _NAMED = 3
-"""How many jobs a reason names."""
+"""Greatest number of jobs that a reason names."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class WaitReport:
         now: Time of the pass [ms].
         lines: By queue.
         reservations: In the order in which they came.
-        free: What is free after the pass.
-        preempts: Who is preempted, by whom.
+        free: The free resources after the pass.
+        preempts: The preempted jobs, and the jobs for which they leave.
         drift: Difference of Unix time to the pass's clock [ms].
         """
         self._drift = drift
@@ -102,6 +102,9 @@ class WaitReport:
         """The reason shared by all jobs of a shape in a queue, and whether it is another job."""
         if reason := cache.impossible(shape) or cache.barred(shape):
             return False, reason
+        unknown = [cache.compute_environments[ce].unknown for ce in cache.possible(shape)]
+        if all(unknown):
+            return False, f"{NO_ROOM} - {needs(shape)}; {unknown[0]}"
         before = self._before(queue, cache, shape)
         if before is None:
             return False, f"{NO_ROOM} - {self._free(shape, cache.possible(shape)[0])}"

@@ -45,7 +45,7 @@ class Reservation:
     hosts: frozenset[str]
     """Those hosts, and all on the same machines."""
     allocation: Allocation
-    """Where it could start at ``window.at``, with its smallest number of nodes."""
+    """Hosts on which it could start at ``window.at``, with its smallest number of nodes."""
     window: BackfillWindow
     awaits: tuple[Holder, ...]
     """The gangs that occupy it, in the order of their ends."""
@@ -70,8 +70,8 @@ def reserve(job: Waiting, ces: tuple[str, ...], free: FreeResources, holders: It
 
     Args:
         job: It does not fit now.
-        ces: Where it would fit if nothing ran.
-        free: What is free now; not changed.
+        ces: The compute environments in which it would fit if nothing ran.
+        free: The free resources now; not changed.
         holders: Every gang that holds resources.
     """
     hosts = free.reach(ces)
@@ -117,9 +117,9 @@ def victims(
 
     Args:
         job: A job with a reservation, or about to get one.
-        share_score: What its share has used when its turn comes (:func:`orchestrator.scheduling.order.share_score`).
-        ces: Where it would fit if nothing ran.
-        free: What is free now; not changed.
+        share_score: The usage of its share when its turn comes (:func:`orchestrator.scheduling.order.share_score`).
+        ces: The compute environments in which it would fit if nothing ran.
+        free: The free resources now; not changed.
         snapshot: The pass.
         ending: Jobs that are being stopped: what they hold counts as coming free.
     """
@@ -178,7 +178,7 @@ def _fits_after(gangs: Sequence[Running], shape: Shape, ces: tuple[str, ...], fr
 def _fewest(
     shape: Shape, ces: tuple[str, ...], free: FreeResources, ends: Sequence[tuple[str, tuple[Placement, ...]]]
 ) -> int:
-    """How many of the gangs (compute environment and placements, in the order in which they end) have to end until the shape fits.
+    """Number of gangs (compute environment and placements, in the order in which they end) that have to end until the shape fits.
 
     By bisection; all of them where the shape fits at no time before.
     """

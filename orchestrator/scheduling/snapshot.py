@@ -61,6 +61,8 @@ class ComputeEnvironment:
     max_cpus: float | None
     engine: str | None = None
     """Only hosts of this one; None: of any."""
+    unknown: str = ""
+    """Why the engine has not told its hosts yet; empty once it has."""
 
 
 @dataclass(frozen=True)

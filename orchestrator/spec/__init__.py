@@ -1,1 +1,1 @@
-"""The job YAML: its model, its file with lines of errors, and what it compiles to."""
+"""The job YAML: its model, its file with lines of errors, and the job definition made of it."""

@@ -95,7 +95,7 @@ class Counted:
 
 
 def first_count(checkpoints: Sequence[Checkpoint], first_epoch: int) -> Counted:
-    """For a job whose first attempt has this epoch: what earlier jobs of the run have saved does not count."""
+    """For a job whose first attempt has this epoch: checkpoints of the run's earlier jobs do not count."""
     earlier = [checkpoint.name for checkpoint in checkpoints if checkpoint.epoch < first_epoch]
     return Counted(earlier[-1] if earlier else "")
 
@@ -103,17 +103,17 @@ def first_count(checkpoints: Sequence[Checkpoint], first_epoch: int) -> Counted:
 def due(
     checkpoints: Sequence[Checkpoint], counted: Counted, every: int, iterations: int, busy: bool
 ) -> tuple[Counted, Checkpoint | None]:
-    """Which checkpoint is to be evaluated now, and what is known of them then.
+    """The progress through the checkpoints, and the one to evaluate now.
 
     Args:
-        checkpoints: Those that are there, the newest last.
-        counted: What was known after the last look.
-        every: How many checkpoints come from one evaluation to the next.
+        checkpoints: All of the run, the newest last.
+        counted: The progress after the last look.
+        every: Number of checkpoints from one evaluation to the next.
         iterations: Of the whole training, which evaluates its last checkpoint by itself.
         busy: Whether the evaluation before waits or runs: one is open at a time.
 
     Returns:
-        What is known now; and the newest checkpoint, where enough have come since the last one that was evaluated.
+        The progress now; and the newest checkpoint, where enough have come since the last one that was evaluated.
     """
     order = {checkpoint.name: (checkpoint.epoch, checkpoint.iteration) for checkpoint in checkpoints}
     last = _order(counted.seen)

@@ -37,7 +37,7 @@ def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
 
     Args:
         text: The YAML.
-        source: What to call it in an error.
+        source: Its name in errors.
         whole: Also have a process try the texts that stand in the place of files, which takes a second or more.
 
     Raises:

@@ -41,7 +41,7 @@ def contract_schema() -> dict[str, Any]:
 
 
 def _add_tasks(definitions: dict[str, Any]) -> None:
-    """What ``train.config`` may hold of each installed task that says so."""
+    """Describe ``train.config`` for each installed task that declares its configuration."""
     definitions["Train"]["allOf"] = []
     for task in known_tasks():
         if (kind := task_config(task)) is None:

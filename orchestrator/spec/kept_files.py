@@ -36,8 +36,8 @@ def with_files(
     Paths are relative to the working directory. Of a task that is not installed here nothing is known: its nodes read the path.
 
     Args:
-        document: What the YAML holds.
-        source: What to call it in an error.
+        document: The content of the YAML.
+        source: Its name in errors.
         lines: Line of each key path in the file, for errors.
         task: Name of the task, where the document does not say it.
 
@@ -164,7 +164,7 @@ def _check_size(name: str, value: Any) -> None:
 
 
 def _check(path: str, how: KeptFile, name: str = "") -> None:
-    """Have another process check the file: what tasks are made of is the worker's. Raises SpecError, in which ``name`` stands for the path."""
+    """Have another process check the file, since the parts of tasks belong to the worker. Raises SpecError, in which ``name`` stands for the path."""
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]

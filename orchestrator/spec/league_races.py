@@ -16,7 +16,7 @@ def race_job(league: League, model: str, facts: Mapping[str, Any], queue: str, s
     Args:
         league: Its rules, tracks, seed and car.
         model: ``NAME@VERSION``.
-        facts: What the registry says of it.
+        facts: Its facts in the registry.
         queue: In which the job waits.
         suffix: Ends the job's name.
     """

@@ -77,7 +77,7 @@ class _Train(Section):
 
     @property
     def section(self) -> str:
-        """Where the algorithm's settings belong."""
+        """Name of the section that holds the algorithm's settings."""
         return self.algorithm if self.algorithm in ALGORITHMS else "settings"
 
     @model_serializer(mode="wrap")
@@ -237,7 +237,7 @@ class Spec(Section):
     @model_validator(mode="before")
     @classmethod
     def _no_second_kind(cls, document: Any) -> Any:
-        """First of all: what else is wrong with a section that should not be there helps nobody."""
+        """Checked first: other errors in a section that should not exist help nobody."""
         given = [kind for kind in KINDS if document.get(kind) is not None] if isinstance(document, Mapping) else []
         if len(given) > 1:
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found {' and '.join(given)}")
@@ -298,8 +298,8 @@ def validate(
     """A spec from a plain mapping.
 
     Args:
-        value: What the YAML or a request holds.
-        source: What to call it in an error (a file name).
+        value: The content of the YAML or of a request.
+        source: Its name in errors (a file name).
         lines: Line of each key path in the file, for errors; 0 of one that ``--set`` gave.
         merged: Whether what is given is also checked together with the defaults of task and algorithm, as far as they are known here.
 
@@ -332,7 +332,7 @@ def validate(
 
 
 def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The document with plain settings in the place of ``train.hyperparameters``, and what is to be said of them. Raises Refused."""
+    """The document with plain settings in the place of ``train.hyperparameters``, and notes about them. Raises Refused."""
     train = document.get("train")
     if not isinstance(train, dict) or train.get("hyperparameters") is None:
         return document, []
@@ -377,9 +377,9 @@ def _of_another_algorithm(train: _Train) -> _Problem | None:
 
 
 def _problem_of(train: _Train) -> _Problem | None:
-    """What the rank would refuse of the task's configuration or of the algorithm's settings.
+    """A value of the task's configuration or of the algorithm's settings that the rank would refuse, and why; None where there is none.
 
-    A task that is not installed says it on its rank: what it sets of the algorithm is not known here.
+    The settings of a task that is not installed here are checked by its rank.
     """
     kind = task_config(train.task)
     if kind is None:

@@ -52,7 +52,7 @@ class CheckpointPolicy(Section):
 
 
 class Logs(Section):
-    """How much of each node's output is kept."""
+    """Limit of the kept output of each node."""
 
     limit: Annotated[Size, Field(ge=LEAST_LIMIT)] = Field(
         default=LIMIT,

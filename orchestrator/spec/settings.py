@@ -1,4 +1,4 @@
-"""What the installed algorithms and tasks accept: classes that the installation names and that are imported without torch.
+"""Settings of the installed algorithms and tasks: classes that the installation names and that are imported without torch.
 
 Algorithms (entry-point group ``muster.settings``): pydantic dataclasses. A job's YAML gives some of the fields; the others are the
 task's own. Each field is checked by itself; where the class of the task's configuration is installed, all of them together, too.
@@ -53,7 +53,7 @@ def task_config(task: str) -> Any | None:
 def effective_problem(
     settings: Any, name: str, config: Any, given: Mapping[str, Any]
 ) -> tuple[tuple[str | int, ...], str] | None:
-    """What is wrong with an algorithm's settings as its rank puts them together; None where nothing is.
+    """The first problem of an algorithm's settings as its rank puts them together; None where there is none.
 
     Args:
         settings: Class of the settings.

@@ -108,7 +108,7 @@ for _tag in ("binary", "set", "omap", "pairs"):  # values that JSON, which carri
 
 
 def _measure(node: yaml.Node, known: dict[int, tuple[int, int]], above: tuple[int, ...]) -> tuple[int, int]:
-    """How many values, and how many levels, a node has with its aliases written out. Raises YamlError beyond the limits."""
+    """Numbers of values and of levels of a node with its aliases written out. Raises YamlError beyond the limits."""
     identity = id(node)
     if identity in known:
         return known[identity]

@@ -38,7 +38,7 @@ def _has_credential(uri: str) -> bool:
 
 
 class WandB(Section):
-    """Weights & Biases. What is absent follows from ``WANDB_*`` variables."""
+    """Weights & Biases. Missing keys follow from ``WANDB_*`` variables."""
 
     project: str | None = Field(default=None, min_length=1, max_length=128, description="by default the task's name")
     entity: str | None = Field(default=None, min_length=1, description="user or team")
@@ -50,7 +50,7 @@ class WandB(Section):
 
 
 class MLflow(Section):
-    """MLflow. What is absent follows from ``MLFLOW_*`` variables."""
+    """MLflow. Missing keys follow from ``MLFLOW_*`` variables."""
 
     uri: Annotated[str, AfterValidator(_uri)] | None = Field(
         default=None, min_length=1, description="of the tracking server, or sqlite:///PATH"

@@ -1,4 +1,4 @@
-"""Tracks of the racer, by a process of the worker's: this package never imports what they are made of."""
+"""Tracks of the racer, by a process of the worker's: this package never imports their code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orchestrator.domain.errors import ServerError, UsageError
 
 
 def ask(order: Mapping[str, Any]) -> Any:
-    """What :mod:`worker.racer` answers to an order.
+    """Give an order to :mod:`worker.racer`, and return its answer.
 
     Args:
         order: ``action``, ``store`` (its path), ``output`` (a path, or None), and what the action takes.

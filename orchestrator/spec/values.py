@@ -125,7 +125,7 @@ Argument = Annotated[str, AfterValidator(_argument)]
 
 
 def place_of(path: tuple[str | int, ...], source: str, lines: Mapping[tuple[str | int, ...], int] | None) -> str:
-    """File, line and key of an error, with what stands between them and its words."""
+    """File, line and key of an error, as the beginning of its message."""
     line = _line_of(path, lines or {})
     where = "--set" if line == 0 else f"{source}:{line}" if line else source
     key = ".".join(str(part) for part in path)

@@ -61,7 +61,7 @@ def creates_a_league(person: Person) -> None:
     page.get_by_label("Name").fill("evening")
     page.get_by_label("Laps", exact=True).fill("1")
     page.get_by_label("Longest lap, simulated").fill("60")
-    page.get_by_label("A car that leaves the road").select_option("is put back and goes on")
+    page.get_by_label("A car that leaves the road").select_option("is put back and continues")
     person.click("Create")
     expect(page.get_by_role("heading", name="League evening")).to_be_visible()
 

@@ -221,7 +221,7 @@ def _check_shares(shares: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _matches(pattern: str, name: str) -> bool:
-    """Whether an entry (a name, or a prefix and ``*``) speaks of what another one does."""
+    """Whether an entry (a name, or a prefix and ``*``) covers a name."""
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 

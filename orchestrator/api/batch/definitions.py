@@ -14,6 +14,7 @@ from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
+from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import JobDefinition
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
@@ -21,6 +22,11 @@ _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 
 def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """RegisterJobDefinition; each registration of a name is a new revision."""
+    return register(context, request)[0]
+
+
+def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any], GangSpec]:
+    """RegisterJobDefinition: its answer, and the gang of the definition. Raises ClientError."""
     name, kind = request["jobDefinitionName"], request["type"]
     rules.check_name("jobDefinitionName", name)
     rules.check_tries(request)
@@ -34,7 +40,7 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
     given = [key for key in (*_PROPERTIES, "eksProperties") if request.get(key)]
     if len(given) != 1 or given[0] not in wanted:
         raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
-    rules.check_nodes(rules.node_properties(request), kind)
+    gang = rules.check_nodes(rules.node_properties(request), kind)
     _check_owner(context, name, Operation.REGISTER_JOB_DEFINITION)
     query = select(JobDefinition.revision, JobDefinition.owner).where(JobDefinition.name == name)
     newest = context.session.execute(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
@@ -45,7 +51,8 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
     context.session.add(
         JobDefinition(name=name, revision=revision, document=document, owner=owner, tags=request.get("tags") or {})
     )
-    return {"jobDefinitionName": name, "jobDefinitionArn": definition_arn(name, revision), "revision": revision}
+    answer = {"jobDefinitionName": name, "jobDefinitionArn": definition_arn(name, revision), "revision": revision}
+    return answer, gang
 
 
 def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -72,7 +79,7 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
 
 
 def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """DeregisterJobDefinition: INACTIVE; jobs that were submitted with it go on."""
+    """DeregisterJobDefinition: INACTIVE; jobs that were submitted with it continue."""
     name, _, revision = plain_name(request["jobDefinition"], "job-definition").partition(":")
     if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
         raise ClientError(

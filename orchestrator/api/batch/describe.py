@@ -9,7 +9,6 @@ from typing import Any
 from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.api.batch.ecs import to_ecs
 from orchestrator.api.damaged import DAMAGED
-from orchestrator.domain.gang import target_nodes
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Attempt, Job, JobDefinition
 
@@ -34,6 +33,7 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
         "parameters": job.parameters,
         "dependsOn": [_dependency(each.on_id, each.kind) for each in job.dependencies],
         "tags": job.tags,
+        # echoes of the submission and of the definition, which nothing else reads
         "propagateTags": bool(job.request.get("propagateTags", document.get("propagateTags", False))),
         "platformCapabilities": document.get("platformCapabilities", ["EC2"]),
         "eksAttempts": [],
@@ -42,20 +42,21 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
         "isCancelled": job.cancelled,
         "isTerminated": job.stop_reason is not None and not job.cancelled,
     }
-    index = int(job.node_properties["mainNode"]) if node is None else node
+    gang = job.gang
+    index = gang.main if node is None else node
     detail["attempts"] = [_attempt(job, attempt, index) for attempt in job.attempts if attempt.stopped_at]
     last = job.attempts[-1] if job.attempts else None
     if node is not None:
         detail |= _node_identity(job, node)
         detail |= _end_of_node(job, node)
-        detail["nodeDetails"] = {"nodeIndex": node, "isMainNode": node == job.node_properties["mainNode"]}
+        detail["nodeDetails"] = {"nodeIndex": node, "isMainNode": node == gang.main}
     if job.kind == "multinode" and node is None:
-        detail["nodeProperties"] = node_ranges(job.node_properties)
+        detail["nodeProperties"] = node_ranges(job.node_properties)  # an echo: range by range, as it was submitted
     else:
-        entry = _range_of(job, node or 0)
-        shown = {**with_defaults(entry["container"]), **(_container(job, last, node or 0) if last else {})}
-        if "ecs" in entry:
-            detail["container"], detail["ecsProperties"] = {}, _in_ecs(shown, entry["ecs"])
+        spec = gang.nodes[node or 0]
+        shown = {**with_defaults(spec.container), **(_container(job, last, node or 0) if last else {})}
+        if spec.ecs is not None:
+            detail["container"], detail["ecsProperties"] = {}, _in_ecs(shown, spec.ecs)
         else:
             detail["container"] = shown
     return {key: value for key, value in detail.items() if value is not None}
@@ -93,7 +94,7 @@ def retry_strategy(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_defaults(container: Mapping[str, Any]) -> dict[str, Any]:
-    """``containerProperties`` with the empty lists that AWS shows for what was left out."""
+    """``containerProperties`` with the empty lists that AWS shows for missing members."""
     return {**{name: [] for name in _LISTS}, **container}
 
 
@@ -103,7 +104,7 @@ def node_ranges(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def ecs_with_defaults(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """``ecsProperties`` with the empty lists of what was left out."""
+    """``ecsProperties`` with empty lists for missing members."""
     in_task = [name for name in _LISTS if name != "volumes"]
     tasks = [
         {
@@ -139,19 +140,18 @@ def array_properties(job: Job, counts: Mapping[str, int]) -> dict[str, Any] | No
 
 def summarize(job: Job, reason: str | None = None, node: int | None = None) -> dict[str, Any]:
     """JobSummary of a job, or of one of its nodes."""
-    summary = _common(job, reason)
+    summary, gang = _common(job, reason), job.gang
     if job.kind == "multinode":
-        main = job.node_properties["mainNode"]
-        summary["nodeProperties"] = {"numNodes": job.node_properties["numNodes"]}
+        summary["nodeProperties"] = {"numNodes": len(gang.nodes)}
         if node is not None:
             summary |= _node_identity(job, node)
-            summary["nodeProperties"] |= {"nodeIndex": node, "isMainNode": node == main}
+            summary["nodeProperties"] |= {"nodeIndex": node, "isMainNode": node == gang.main}
         summary |= _own_end(job, node) if node is not None else {}
     elif job.array_size is not None:
         summary["arrayProperties"] = {"size": job.array_size}
         if job.array_index is not None:
             summary["arrayProperties"]["index"] = job.array_index
-    index = int(job.node_properties["mainNode"]) if node is None else node
+    index = gang.main if node is None else node
     record = job.attempts[-1].node(index) if job.attempts else None
     if record is not None and record.exit_code is not None:
         summary["container"] = {"exitCode": record.exit_code, "reason": (record.reason or "")[:255]}
@@ -163,7 +163,7 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
 
 
 def describe_damaged(job: Job, reason: str | None) -> dict[str, Any]:
-    """JobSummary of a job whose row is damaged: what can be read, and in its reason that the rest can't be."""
+    """JobSummary of a job whose row is damaged: the readable facts, and a reason that tells of the damage."""
     summary = _common(job, reason)
     said = summary["statusReason"] or ""
     summary["statusReason"] = said if DAMAGED in said else f"{said}; {DAMAGED}" if said else DAMAGED
@@ -208,11 +208,11 @@ def _dependency(on: str, kind: str | None) -> dict[str, str]:
 
 
 def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
-    record, container, entry = attempt.node(node), _container(job, attempt, node), _range_of(job, node)
+    record, container, ecs = attempt.node(node), _container(job, attempt, node), job.gang.nodes[node].ecs
     stopped = (record and record.stopped_at) or attempt.stopped_at
     detail = {
-        "container": {} if "ecs" in entry else container,
-        "taskProperties": _in_ecs(container, entry["ecs"])["taskProperties"] if "ecs" in entry else None,
+        "container": container if ecs is None else {},
+        "taskProperties": None if ecs is None else _in_ecs(container, ecs)["taskProperties"],
         "startedAt": attempt.started_at,
         "stoppedAt": stopped and max(stopped, attempt.started_at or stopped),  # clocks of hosts differ
         "statusReason": (record and record.status_reason) or attempt.status_reason,
@@ -233,11 +233,3 @@ def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
         "networkInterfaces": [{"privateIpv4Address": record.address}] if record and record.address else [],
     }
     return {key: value for key, value in detail.items() if value is not None}
-
-
-def _range_of(job: Job, node: int) -> Mapping[str, Any]:
-    """The node range, innermost, that says what a node is."""
-    count = job.node_properties["numNodes"]
-    ranges = [e for e in job.node_properties["nodeRangeProperties"] if node in target_nodes(e["targetNodes"], count)]
-    innermost: Mapping[str, Any] = min(ranges, key=lambda entry: len(target_nodes(entry["targetNodes"], count)))
-    return innermost

@@ -1,4 +1,4 @@
-"""``ecsProperties`` of one container: the newer way to say what ``containerProperties`` says."""
+"""``ecsProperties`` of one container: the newer form of ``containerProperties``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _UNSUPPORTED_OF_CONTAINER = ("dependsOn", "firelensConfiguration", "startTimeout
 
 
 def from_ecs(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The ``containerProperties`` that mean the same. Raises ClientError for what they can't say."""
+    """The equivalent ``containerProperties``. Raises ClientError for members without an equivalent."""
     task = _only(properties["taskProperties"], "task", where)
     container = _only(task["containers"], "container", where)
     for given, keys in ((task, _UNSUPPORTED_OF_TASK), (container, _UNSUPPORTED_OF_CONTAINER)):
@@ -49,7 +49,7 @@ def container_name(properties: Mapping[str, Any]) -> str:
 
 
 def to_ecs(container: Mapping[str, Any], name: str, task: Mapping[str, Any]) -> dict[str, Any]:
-    """``ecsProperties`` of a container detail; ``task``: what belongs to the whole task, such as ``taskArn``."""
+    """``ecsProperties`` of a container detail; ``task``: members of the whole task, such as ``taskArn``."""
     own = {key: value for key, value in container.items() if key not in (*_OF_TASK.values(), *task)}
     of_task = {theirs: container[ours] for theirs, ours in _OF_TASK.items() if ours in container}
     return {"taskProperties": [{"containers": [{**own, "name": name, "essential": True}], **of_task, **task}]}

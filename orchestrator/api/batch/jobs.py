@@ -22,7 +22,7 @@ from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
 
 _BEFORE_NAME = len(definition_arn("", 1)) - 1
-"""Where the name begins in a definition's ARN, from 1."""
+"""Position of the name in a definition's ARN, from 1."""
 _EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
 
 
@@ -37,7 +37,7 @@ def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         reason = context.reason(job)
         try:
             with reading(job):
-                if node is not None and not (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"]):
+                if node is not None and not (job.kind == "multinode" and 0 <= node < len(job.gang.nodes)):
                     continue
                 detail = describe_job(job, context.definition_of(job), node, reason)
         except DamagedRow:
@@ -97,7 +97,7 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     permissions.check(Operation.LIST_JOBS, job)
     wanted, reason = request.get("jobStatus", Status.RUNNING), context.reason(job)
     with reading(job):
-        nodes = [node for node in range(int(job.node_properties["numNodes"])) if node_status(job, node) == wanted]
+        nodes = [node for node in range(len(job.gang.nodes)) if node_status(job, node) == wanted]
     token = request.get("nextToken")
     start = decode(token, [int])[0] if token else 0
     if start < 0:
@@ -207,7 +207,7 @@ def _cancel(context: Context, target: ColumnElement[bool], reason: str) -> None:
 
 
 class UnknownJob(ClientError):
-    """There is no job of this id."""
+    """No job has this id."""
 
 
 def _check_reason(request: Mapping[str, Any], operation: Operation) -> None:

@@ -41,7 +41,7 @@ def check_consumables(request: Mapping[str, Any], where: str) -> None:
 
 
 def check_members(container: Mapping[str, Any], where: str) -> None:
-    """``containerProperties``: refuse what would have no effect. Raises ClientError."""
+    """``containerProperties``: refuse members that would have no effect. Raises ClientError."""
     for key, advice in _REFUSED.items():
         if container.get(key):
             raise ClientError(f"{where}: {key} {advice}")

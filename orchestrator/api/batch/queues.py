@@ -1,4 +1,4 @@
-"""Job queues: create, describe, update, delete, and what GetJobQueueSnapshot shows of them."""
+"""Job queues: create, describe, update, delete, and GetJobQueueSnapshot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, Shared
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
 
-_MOST_ENVIRONMENTS, _MOST_QUEUES = 3, 50
+_MOST_COMPUTE_ENVIRONMENTS, _MOST_QUEUES = 3, 50
 _REASONS = (
     "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY",
     "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE",
@@ -85,7 +85,7 @@ def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 
 
 def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and what is in use."""
+    """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and the resources in use."""
     queue = context.queue(request["jobQueue"], deleting=True)
     permissions.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
     order, times = context.reconciler.front(queue.name, 100)
@@ -125,7 +125,7 @@ def _apply(context: Context, queue: JobQueue, request: Mapping[str, Any]) -> Non
             raise ClientError(f"priority is {priority}; it must be 0 to 1000000")
         queue.priority = priority
     if order := request.get("computeEnvironmentOrder"):
-        queue.compute_environments = _environments(context, order)
+        queue.compute_environments = _compute_environments(context, order)
     if (limits := request.get("jobStateTimeLimitActions")) is not None:
         queue.limits = _limits(limits)
 
@@ -136,15 +136,17 @@ def _check_kind(request: Mapping[str, Any]) -> None:
             raise ClientError(f"{key} is not supported; use computeEnvironmentOrder")
 
 
-def _environments(context: Context, order: Sequence[Mapping[str, Any]]) -> list[str]:
-    if len(order) > _MOST_ENVIRONMENTS:
-        raise ClientError(f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_ENVIRONMENTS}")
+def _compute_environments(context: Context, order: Sequence[Mapping[str, Any]]) -> list[str]:
+    if len(order) > _MOST_COMPUTE_ENVIRONMENTS:
+        raise ClientError(
+            f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_COMPUTE_ENVIRONMENTS}"
+        )
     names = [
         plain_name(each["computeEnvironment"], "compute-environment")
         for each in sorted(order, key=lambda each: each["order"])
     ]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
-        raise ClientError("computeEnvironmentOrder: every environment and every order once")
+        raise ClientError("computeEnvironmentOrder: every compute environment and every order once")
     for name in names:
         if context.session.get(ComputeEnvironment, name) is None:
             raise ClientError(f"Compute environment {name[:200]} does not exist")

@@ -84,9 +84,9 @@ def _check_condition(condition: Mapping[str, str]) -> None:
 
 
 def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = False) -> GangSpec:
-    """What a definition of type ``kind`` or, ``complete``, a job asks for, whose overrides are applied. Raises ClientError.
+    """Check the nodes of a definition of type ``kind``, or of a job (``complete``: its overrides are applied). Raises ClientError.
 
-    ``properties``: as :func:`node_properties` gives them.
+    ``properties``: as :func:`node_properties` gives them. Returns the gang that they ask for.
     """
     count, main, ranges = properties["numNodes"], properties["mainNode"], properties["nodeRangeProperties"]
     if not 1 <= count <= _MOST_NODES:
@@ -126,7 +126,7 @@ def _check_options(gang: GangSpec) -> None:
 
 
 def _depth(value: object) -> int:
-    """How deep lists and mappings are nested. Raises RecursionError."""
+    """Number of levels of nested lists and mappings. Raises RecursionError."""
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return 1 + max(map(_depth, inner), default=0)
 

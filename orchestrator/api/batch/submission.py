@@ -37,7 +37,7 @@ _KEY = re.compile(r"[\x21-\x7e]{1,128}")
 
 
 def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """SubmitJob. With an idempotency key a second call answers what the first one did."""
+    """SubmitJob. With an idempotency key a second call gets the answer of the first one."""
     request = {key: value for key, value in request.items() if value not in ({}, [])}  # Luigi sends what it has not set
     if (job := answered(context)) is not None:
         if job.request != request:
@@ -216,7 +216,7 @@ def _release(job: Job) -> None:
 
 
 def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> None:
-    """The array and its children, jobs of their own by index; what the children share is stored with the array alone."""
+    """The array and its children, jobs of their own by index; their common facts are stored with the array alone."""
     size = request["arrayProperties"].get("size", 0)
     if size not in _ARRAY_SIZES:
         raise ClientError(f"arrayProperties size is {size}; it must be 2 to 10000")

@@ -32,7 +32,7 @@ def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def untag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """Remove tags; those that are not there are passed over."""
+    """Remove tags; missing ones are passed over."""
     resource = _resource(context, request["resourceArn"], Operation.UNTAG_RESOURCE)
     resource.tags = {key: value for key, value in resource.tags.items() if key not in request["tagKeys"]}
     return {}

@@ -21,7 +21,7 @@ _TOKEN = "token"
 
 @dataclass
 class Access:
-    """What lets a request in: the keys of the home directory, one token that may do everything, or the controller's own user."""
+    """The ways to be admitted: the keys of the home directory, one token that may do everything, or the controller's own user."""
 
     keys: KeyStore | None = None
     token: str | None = None
@@ -34,7 +34,7 @@ class Access:
     own_token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
     """Admits this process to its own server (`muster run`), whatever others need."""
     console_secret: bytes = field(default_factory=lambda: secrets.token_bytes(32), repr=False)
-    """Signs the console's sessions and forms; the same after a restart, so that open pages go on."""
+    """Signs the console's sessions and forms; the same after a restart, so that open pages continue to work."""
     _ended: dict[str, float] = field(default_factory=dict, repr=False)
     """Sessions that were closed by their users, and when they would have expired."""
 
@@ -50,7 +50,7 @@ class Access:
         return self.exposed
 
     def admitted(self) -> str:
-        """Who may send requests now, in one line."""
+        """The callers that are admitted now, in one line."""
         if not self.demanded():
             name = "anybody" if self.user is None else f"user {user_name(self.user)} of this machine"
             return f"open to {name}, without a key; `muster keys create NAME` lets others in, and then everybody needs a key"
@@ -64,7 +64,7 @@ class Access:
         return self._proven(given)[1]
 
     def sign_in(self, given: str) -> str:
-        """A session for whoever presents the server's token or a key; what identifies it says nothing of the secret. Raises Refusal."""
+        """Open a session for the server's token or a key; its text reveals nothing of the secret. Raises Refusal."""
         name, _ = self._proven(given)
         claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
         return f"{claim}.{self._seal(name, claim)}"
@@ -99,7 +99,7 @@ class Access:
             self._ended[given] = now + SESSION
 
     def form_token(self, session: str) -> str:
-        """What a form of the console must send back: other web pages can't know it. ``session``: empty where none is needed."""
+        """The token that a form of the console must send back: other web pages can't know it. ``session``: empty where none is needed."""
         return hmac.new(self.console_secret, f"form\0{session}".encode(), sha256).hexdigest()
 
     def _seal(self, name: str, claim: str) -> str | None:
@@ -111,7 +111,7 @@ class Access:
         return hmac.new(self.console_secret, f"session\0{secret}\0{claim}".encode(), sha256).hexdigest()
 
     def _proven(self, given: str) -> tuple[str, Identity]:
-        """The credential's name in sessions, and who has it. Raises Refusal."""
+        """The credential's name in sessions, and its owner. Raises Refusal."""
         if self.token and hmac.compare_digest(given.encode(), self.token.encode()):
             return _TOKEN, Identity("MUSTER_TOKEN")
         access_key_id, _, secret = given.partition(":")

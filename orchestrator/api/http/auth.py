@@ -47,7 +47,7 @@ _UNKNOWN = ("MissingAuthenticationToken", "UnrecognizedClientException")
 
 
 class Guard:
-    """The middleware that authenticates, limits and identifies; the application sees only what has passed."""
+    """The middleware that authenticates, limits and identifies; only admitted requests reach the application."""
 
     def __init__(self, app: ASGIApp, access: Access, limit: RateLimit) -> None:
         self.app, self.access, self.limit = app, access, limit
@@ -147,7 +147,7 @@ class Guard:
         )
 
     def _of_session(self, request: _Request) -> Identity | None:
-        """Who is logged in to the console, where that counts and nothing else is presented."""
+        """The identity of the console's session, where a session counts and nothing else is presented."""
         if "authorization" in request.headers or not (request.method in ("GET", "HEAD") or request.is_of_console):
             return None
         return self.access.session(session_of(request.first_of_each(), request.port))
@@ -231,7 +231,7 @@ class _Request:
         return self.first(name)
 
     def check_browser(self, loopback_only: bool) -> None:
-        """Refuse what a web page from elsewhere could have made a browser send: another Host, a foreign Origin."""
+        """Refuse requests that a web page of another site could have made a browser send: another Host, a foreign Origin."""
         host = self.single("host") or ""
         if loopback_only and not is_loopback(_split(f"//{host}").hostname or ""):
             raise Refusal(

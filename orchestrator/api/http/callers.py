@@ -62,7 +62,7 @@ class Caller:
 
 
 def _forms(address: Address) -> list[str]:
-    """How the table may show an address and port: as IPv4 and as IPv6, in words of the machine's byte order."""
+    """The forms in which the table may show an address and port: IPv4 and IPv6, in words of the machine's byte order."""
     ip = ipaddress.ip_address(address[0].partition("%")[0])
     if isinstance(ip, ipaddress.IPv6Address) and ip.ipv4_mapped:
         ip = ip.ipv4_mapped

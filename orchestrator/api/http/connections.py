@@ -113,7 +113,7 @@ class Connections:
 
 
 class Connection(H11Protocol):
-    """One connection: uvicorn's, with deadlines for what the client sends."""
+    """One connection of uvicorn's, with deadlines for the client's input."""
 
     def __init__(self, connections: Connections, **uvicorns: Any) -> None:
         super().__init__(**uvicorns)

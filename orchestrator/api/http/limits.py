@@ -127,7 +127,7 @@ class Body:
         return self._whole
 
     async def receive(self) -> Message:
-        """For the application: the body in one message, then what else the client sends (that it left)."""
+        """For the application: the body in one message, then the client's further messages (its disconnect)."""
         if self._whole is None or self._given:
             return await self._receive()
         self._given = True

@@ -77,9 +77,9 @@ class LogFile:
         self._forget()
 
     def look(self) -> View:
-        """What is in the log now: whole lines only. A log that is not there yet is empty. Raises OSError.
+        """A view of the log as it is now: whole lines only. A log that does not exist yet is empty. Raises OSError.
 
-        Of what holds no events 64 MiB are passed over; the next look goes on there.
+        A look skips at most 64 MiB that hold no events; the next look continues there.
         """
         with self._lock:
             self._barren = 0
@@ -100,7 +100,7 @@ class LogFile:
         """Of every block: where it begins, and the greatest time before it. A block is in one file, or it is the gap."""
         self._gap: Gap | None = None
         self._tail: tuple[int, int] | None = None
-        """Where the head ended, and the greatest time up to there; None while there is no tail."""
+        """End of the head, and the greatest time up to there; None while there is no tail."""
         self._end = 0
         self._top = 0
         self._identity, self._inside = b"", False
@@ -168,7 +168,7 @@ class View:
     """The newest time [ms]; 0 where there is no event."""
     gap: Gap | None
     begun: int
-    """How often the log began: another number than at the look before says that it was truncated or replaced."""
+    """Number of times that the log began: it differs from the look before where the log was truncated or replaced."""
 
     def replaced(self) -> Event:
         """The event that a follower gets when a log was truncated or replaced."""
@@ -226,7 +226,7 @@ class View:
 
 @lru_cache(maxsize=4096)
 def log_file(path: Path, stream: str) -> LogFile:
-    """The log at ``path``, with what is known of it from earlier looks."""
+    """The log at ``path``, with the facts known from earlier looks."""
     return LogFile(path, stream)
 
 

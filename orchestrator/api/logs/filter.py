@@ -63,7 +63,7 @@ def _contains(text: str) -> Matcher:
 
 
 def _found_by(regex: str) -> Matcher:
-    """Whether the regex matches somewhere in a line. Raises ValueError for what AWS's subset does not have."""
+    """Whether the regex matches somewhere in a line. Raises ValueError for syntax outside AWS's subset."""
     understood = _REGEX.match(regex)
     if rest := regex[understood.end() if understood else 0 :]:
         raise ValueError(f"regular expression %{regex}% can't be read from {rest[:40]!r} on")

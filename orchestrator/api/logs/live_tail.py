@@ -54,7 +54,7 @@ class LiveTail:
         self._read: dict[str, int] = {}
         """Bytes of each stream that were looked through."""
         self._begun: dict[str, int] = {}
-        """How often each stream had begun when it was looked at last."""
+        """Each stream's number of beginnings when it was looked at last."""
         self._open: dict[str, LogFile] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
@@ -105,7 +105,7 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
 
     Args:
         tail: The session, which has begun already: the client may write as soon as it sees the first message.
-        start: What was asked for, to be told back in ``sessionStart``.
+        start: The request, which ``sessionStart`` repeats.
         group: Log group of the events, with the account.
         closing: Set when the server ends.
     """

@@ -1,7 +1,7 @@
 """CloudWatch Logs over the logs in the store: JSON 1.1 on ``POST /``, the operation in ``X-Amz-Target``.
 
 There is one group, ``/aws/batch/job``, and in it a stream for every node of every attempt. Nothing is stored for this API:
-positions are bytes in the log files, and tokens carry all that is needed to go on, also after a restart.
+positions are bytes in the log files, and tokens carry all that is needed to continue, also after a restart.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ GROUP_ARN = f"arn:aws:logs:{REGION}:{ACCOUNT}:log-group:{LOG_GROUP}"
 SETTLE = 500
 """Milliseconds for which FilterLogEvents keeps back the newest lines of running gangs.
 
-A follower goes on from the newest time that it has seen. A node's line must not turn up after a later one of another node was
+A follower continues from the newest time that it has seen. A node's line must not turn up after a later one of another node was
 given out, so a line has this long to get from its node's clock into the file that is read here: hosts' clocks must agree to less
 than this, and a shared volume must show what was written within it.
 """
@@ -47,7 +47,7 @@ _MOST_EVENTS = 10_000
 _MOST_BYTES = 1 << 20
 """Of a page, with 26 for each event, as AWS counts."""
 _LONGEST_SEARCH = 2.0
-"""Seconds after which FilterLogEvents answers with what it has, and a token to go on."""
+"""Seconds after which FilterLogEvents answers with what it has, and a token to continue."""
 _LATE = 3_600_000
 """Milliseconds by which a node's clock may be ahead of the controller's: a stream is searched for lines up to this much
 younger than its attempt's end."""
@@ -239,7 +239,7 @@ def describe_log_streams(reconciler: Reconciler, request: dict[str, Any]) -> dic
 
 
 def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
-    """DescribeLogGroups: the one group, where it fits what is asked for."""
+    """DescribeLogGroups: the one group, where it fits the request."""
     prefix, pattern = request.get("logGroupNamePrefix"), request.get("logGroupNamePattern")
     if prefix is not None and pattern is not None:
         raise invalid("logGroupNamePrefix and logGroupNamePattern are mutually exclusive.")

@@ -1,4 +1,4 @@
-"""Which log streams there are: one for every node of every attempt of every job."""
+"""The log streams: one for every node of every attempt of every job."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
 
     Args:
         session: On the database.
-        store: Where the files lie.
+        store: The store that holds the files.
         prefix: Of the names; empty for all.
         since: Attempts that ended before this Unix time [ms] are left out.
     """

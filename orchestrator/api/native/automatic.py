@@ -1,6 +1,6 @@
 """Automatic evaluations: jobs that the controller submits beside a training whose spec has a section ``evaluation``.
 
-What is known of a training's checkpoints is a row of the database (:class:`orchestrator.persistence.models.AutomaticEvaluation`), which changes in
+The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.models.AutomaticEvaluation`), which changes in
 the transaction that adds the job: a controller that is killed at any moment neither loses nor doubles an evaluation. A training never
 waits for one, and the reconcile loop neither: this has a thread of its own.
 """
@@ -80,7 +80,7 @@ class AutomaticEvaluations:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop looking; what was submitted goes on."""
+        """Stop looking; submitted evaluations continue."""
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(timeout=10)
@@ -197,7 +197,7 @@ class AutomaticEvaluations:
             row.problem = problem or row.problem  # it stands until an evaluation is submitted
 
     def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
-        """Submit the evaluation, as the training's owner, in one transaction with what is known of the training's checkpoints."""
+        """Submit the evaluation, as the training's owner, in one transaction with the progress through the training's checkpoints."""
         reconciler, run = self._reconciler, training.run
         reconciler.check_writable(adds=True)
         reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine

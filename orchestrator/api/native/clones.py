@@ -38,13 +38,13 @@ from shared_store.wording import Refused, shown
 def clone(
     reconciler: Reconciler, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
 ) -> dict[str, Any]:
-    """Submit a job whose run begins at iteration 0 with the weights of ``source``; what can be refused is refused before a job exists.
+    """Submit a job whose run begins at iteration 0 with the weights of ``source``; refusals come before a job exists.
 
     Args:
         controller: The controller.
         source: Whose weights.
         name: Of the new run, and of its job.
-        changes: What is different in it, and which checkpoint is meant.
+        changes: The changes of its spec, and the checkpoint.
         idempotency_key: A second call with it answers what the first one did.
 
     Raises:
@@ -55,7 +55,7 @@ def clone(
 
 
 def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> dict[str, Any]:
-    """The definition that :func:`clone` would register, its queue and whose weights it would begin with; nothing is submitted.
+    """The definition that :func:`clone` would register, its queue, and the run and checkpoint of its weights; nothing is submitted.
 
     Raises ClientError as :func:`clone`.
     """
@@ -129,7 +129,7 @@ def _check_submission(reconciler: Reconciler, spec: Spec, changes: Changes, name
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:
-    """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
+    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another run."""
     job = answered(context, name)
     if job is None:
         return None
@@ -159,7 +159,7 @@ def _changed(session: Session, source: Run, name: str, changes: Changes) -> Spec
 
 
 def _choose(source: Run, changes: Changes) -> Checkpoint:
-    """Raises ClientError where there is no such checkpoint, or what it says of itself can't be read."""
+    """Raises ClientError where the checkpoint does not exist, or its description can't be read."""
     chosen = choose(source, changes.checkpoint)
     if chosen is None:
         raise ClientError(f"run {source.name} has no checkpoint yet, so there are no weights to begin with", 404)
@@ -171,7 +171,7 @@ def _choose(source: Run, changes: Changes) -> Checkpoint:
 
 
 def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
-    """Refuse what the weights can't fit, as far as settings tell; shapes of observations and actions only the rank knows."""
+    """Refuse settings that the weights don't fit; only the rank knows the shapes of observations and actions."""
     assert spec.train is not None
     manifest, name = chosen.manifest, spec.train.algorithm
     where = f"run {source.name}: checkpoint {chosen.name}"

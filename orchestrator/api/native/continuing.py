@@ -17,7 +17,7 @@ from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.excerpts import excerpt
-from orchestrator.domain.gang import gang_needs
+from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.spec.compile import compile_definition, compile_submission
@@ -61,15 +61,23 @@ def answered(context: Context, run: str) -> Job | None:
 
 def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:
     """The definition of the job, which the caller may submit and which the queue could have. Raises ClientError."""
+    definition = _definition(context, spec, directory)
+    _check_fit(context, spec, gang_needs(definition["nodeProperties"]), what)
+    return definition
+
+
+def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
-    queue = context.queue(spec.queue)
-    permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(queue.name))
+    permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(context.queue(spec.queue).name))
     check_tracks(context.reconciler.store, spec.model_dump(mode="json", exclude_none=True))
-    shape = gang_needs(definition["nodeProperties"]).shape
-    if problem := fit_in_queue(context.session, context.reconciler.engine, queue, shape).problem:
-        raise ClientError(f"{what}: {problem}")
     limits.check_document("RegisterJobDefinition", definition)
     return definition
+
+
+def _check_fit(context: Context, spec: Spec, gang: GangSpec, what: str) -> None:
+    queue, engine = context.queue(spec.queue), context.reconciler.engine
+    if problem := fit_in_queue(context.session, engine, queue, gang.shape).problem:
+        raise ClientError(f"{what}: {problem}")
 
 
 def submit(
@@ -90,8 +98,9 @@ def submit(
         environment: Added on every node.
         tags: Of the job.
     """
-    definition = check(context, spec, directory, what)
-    registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
+    definition = batch.validate("RegisterJobDefinition", _definition(context, spec, directory))
+    registered, gang = definitions.register(context, definition)
+    _check_fit(context, spec, gang, what)
     request = compile_submission(spec, registered["jobDefinitionArn"], environment, tags)
     answer = submission.submit_job(context, batch.validate("SubmitJob", request))
     context.session.flush()

@@ -37,7 +37,7 @@ _MOST_CURVES = 4096
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which jobs: those of some states and of a queue whose name, id, run or owner has a text. Empty fields mean all."""
+    """A filter of jobs: by states, by queue, and by a text in their name, id, run or owner. Empty fields mean all."""
 
     statuses: tuple[Status, ...] = ()
     queue: str = ""
@@ -76,7 +76,7 @@ def find_jobs(
 
 
 def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE) -> dict[str, Any]:
-    """``jobs``, ``total`` and ``counts`` (by state, of all states) of what is wanted."""
+    """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter."""
     conditions = wanted.conditions()
     with reconciler.database.session() as session:
         grouped = select(Job.status, func.count()).where(*conditions).group_by(Job.status)
@@ -98,7 +98,7 @@ def ids_of(session: Session, wanted: Wanted) -> list[str]:
 
 
 def kind_of(spec: Mapping[str, Any] | None) -> str:
-    """What a job does, by its spec: one of :data:`orchestrator.spec.model.KINDS`."""
+    """The kind of a job, by its spec: one of :data:`orchestrator.spec.model.KINDS`, or ``command``."""
     return next((kind for kind in KINDS if (spec or {}).get(kind)), "command")
 
 
@@ -142,7 +142,7 @@ def _row(reconciler: Reconciler, job: Job, is_visible: bool) -> dict[str, Any]:
 
 
 def _told(reconciler: Reconciler, job: Job, main: int) -> dict[str, Any] | None:
-    """How far a training is: what its main node said last, and its curve; None before its first iteration."""
+    """Progress of a training: the last report of its main node, and its curve; None before its first iteration."""
     if not job.attempts:
         return None
     curve = curves.of(reconciler.store.run(job.run), job)

@@ -38,7 +38,7 @@ def read_keys(request: Request) -> list[dict[str, Any]]:
 
 @router.post("/keys")
 def make_key(request: Request, body: KeyRequest) -> dict[str, Any]:
-    """Make a key; ``secretAccessKey`` is told this once. From the first key on everybody needs one. Only on loopback."""
+    """Create a key; only this answer has its ``secretAccessKey``. From the first key on everybody needs one. Only on loopback."""
     key = create_key(request, body.name, tuple(body.queues), body.read_only)
     return {**key.describe(), "secretAccessKey": key.secret}
 
@@ -92,7 +92,7 @@ def _writable(request: Request, operation: Operation) -> KeyStore:
 
 
 def _carry_out(body: Callable[[], _Value]) -> _Value:
-    """Raises ClientError for what the keys' file, or the name of a key, does not allow."""
+    """Raises ClientError for errors of the keys' file, or of the name of a key."""
     try:
         return body()
     except KeyUsageError as error:

@@ -58,7 +58,7 @@ class CreateRequest(_Strict):
     track: list[str] = Field(min_length=1, max_length=64, description="a preset, random:SEED, or a track of the store")
     laps: int = Field(default=3, ge=1, le=100)
     ranking: Ranking = "total"
-    continuous: bool = Field(default=False, description="a car that leaves the road is put back and goes on")
+    continuous: bool = Field(default=False, description="a car that leaves the road is put back and continues")
     off_track_penalty: _Seconds = 1.0
     crash_penalty: _Seconds = 1.0
     max_resets: int = Field(default=100, ge=0, le=10_000, description="in one lap")
@@ -87,7 +87,7 @@ class EnterRequest(RaceRequest):
 
 
 class RerunRequest(_Strict):
-    """Where an entry is raced once more."""
+    """The request for another race of an entry."""
 
     directory: str = Field(default="", description="working directory of the job")
 
@@ -100,7 +100,7 @@ class DisqualifyRequest(_Strict):
 
 @router.get("/leagues")
 def list_leagues(request: Request) -> list[dict[str, Any]]:
-    """All leagues by name, with their rules; ``problem`` says of one what is altered."""
+    """All leagues by name, with their rules; an altered one has a ``problem``."""
     store = reconciler_of(request).store
     try:
         return [_described(leagues.find(store, name)) for name in leagues.names(store)]
@@ -163,7 +163,7 @@ def league_table(
 
 @router.get("/leagues/{name}/entries/{number}")
 def read_entry(request: Request, name: str, number: int) -> Any:
-    """An entry with its race and, where it is disqualified, the ruling; ``problem`` says what is altered of it or of its model."""
+    """An entry with its race and, where it is disqualified, the ruling; ``problem`` tells what was altered in it or in its model."""
     reconciler = reconciler_of(request)
     stored, _ = _find(reconciler, name)
     found: dict[str, Any] = {"entry": number}
@@ -188,7 +188,7 @@ def race(
     body: RaceRequest,
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
-    """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key answers what the first one did."""
+    """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key gets the answer of the first one."""
     reconciler = reconciler_of(request)
     stored, league = _find(reconciler, name)
     model = find_model(reconciler, body.model, body.version)
@@ -267,7 +267,7 @@ def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest
 
 
 def entered_jobs(request: Request, name: str) -> set[str]:
-    """The jobs whose races are entries of a league; of an altered entry nothing is known."""
+    """The jobs whose races are entries of a league, without those of altered entries."""
     stored, _ = _find(reconciler_of(request), name)
     found = set()
     for number in stored.numbers():
@@ -277,7 +277,7 @@ def entered_jobs(request: Request, name: str) -> set[str]:
 
 
 def _find(reconciler: Reconciler, name: str) -> tuple[StoredLeague, League]:
-    """Raises ClientError: there is no such league, or its rules were altered."""
+    """Raises ClientError where the league does not exist, or its rules were altered."""
     try:
         stored = leagues.find(reconciler.store, name)
         return stored, stored.definition()
@@ -299,13 +299,13 @@ def _described(stored: StoredLeague) -> dict[str, Any]:
 
 
 def _caller() -> str:
-    """Whose the caller's leagues and entries are: a command with a controller of its own is this user's, as one on loopback is."""
+    """The owner of the caller's leagues and entries. A command with a controller of its own acts for this user, like one on loopback."""
     identity = permissions.current_identity.get()
     return f"user {user_name(os.getuid())}" if identity == permissions.THIS_PROCESS else identity.name
 
 
 def _racer(body: RaceRequest) -> str:
-    """Who races: the caller, unless it says another name. Raises ClientError."""
+    """Name of the racer: the caller's, unless the request gives another. Raises ClientError."""
     if body.racer is None:
         return _caller().removeprefix("key ").removeprefix("user ")
     if not _RACER.fullmatch(body.racer):
@@ -416,7 +416,7 @@ def _summary(reconciler: Reconciler, league: League, model: Model, checkpoint: C
 
 
 def _verify(model: Model) -> None:
-    """Raise ClientError where the model is not as it was registered."""
+    """Raise ClientError where the model has changed since its registration."""
     try:
         model.verify()
     except DamagedBundle as error:

@@ -48,7 +48,7 @@ def read_model(
     version: int | None = Query(default=None, ge=1, description="the newest where absent"),
     verify: bool = Query(default=False, description="read every file and check its digest"),
 ) -> Any:
-    """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
+    """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` names the damaged files."""
     reconciler = reconciler_of(request)
     model = find_model(reconciler, name, version)
     permissions.check(Operation.READ_MODEL, owner_of_model(model))
@@ -105,7 +105,7 @@ def find_model(reconciler: Reconciler, name: str, version: int | None) -> Model:
 
 
 def owner_of_model(model: Model) -> RunRecord:
-    """Whose a model is: of the queue of the run that it comes from; of one that is damaged, nobody's but of keys with all queues."""
+    """The owner of a model: that of the run that it comes from. A damaged model is visible to keys with all queues alone."""
     try:
         queue = model.facts().get("queue")
     except DamagedBundle:

@@ -1,4 +1,4 @@
-"""Queues and compute as a whole: what waits and why, what shares have used, how full the hosts are, how the engines answer."""
+"""Queues and compute as a whole: waiting jobs and their reasons, usage of shares, load of hosts, health of engines."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> l
 
 
 def _shares(queue: Queue, used: Mapping[tuple[str, str], float], held: Held) -> list[dict[str, Any]]:
-    """Each active share of a queue with a policy: its weight, what it has used lately, and what it holds; first come those that used least.
+    """Each active share of a queue with a policy: its weight, its recent usage, and the resources that it holds; the least used come first.
 
     ``used``: GPU-seconds, or CPU-seconds of jobs without GPUs, decayed by the policy; ``score``: the same times the weight, by which
     shares are served.
@@ -155,7 +155,7 @@ def _amounts(attempts: Iterable[Attempt]) -> dict[str, float]:
 
 
 def _taken(held: Held) -> dict[str, Resources]:
-    """What the nodes of all gangs hold, by host."""
+    """The resources that the nodes of all gangs hold, by host."""
     found: dict[str, Resources] = defaultdict(Resources)
     for _, attempt in held:
         for each in placements_of(attempt):
@@ -176,7 +176,7 @@ def _engines(reconciler: Reconciler, capacities: Mapping[str, Capacity]) -> list
             "name": name,
             "queue": own[name],
             "elastic": engine.is_elastic([name]),
-            "queuesByItself": isinstance(capacities[name], Queued),
+            "queuesByItself": isinstance(capacities.get(name), Queued),
             "toldAt": health.told_at,
             "problem": health.problem,
             "failing": health.failing,

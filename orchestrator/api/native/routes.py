@@ -95,7 +95,7 @@ def permitted_job(session: Session, reference: str, operation: Operation) -> Job
 
 
 def _jobs_of_run(session: Session, reference: str) -> str:
-    """Which jobs made the run of this name, for who names it where a job is meant; empty where no visible job did."""
+    """A hint at the jobs that made the run of this name, for a caller who gives it in place of a job; empty without a visible job."""
     query = select(Job).where(Job.run == reference).order_by(Job.created_at)
     made = [job for job in session.scalars(query) if permissions.is_visible(job)]
     if not made:
@@ -137,7 +137,7 @@ def _limit(capacity: Queued) -> dict[str, Any] | None:
 
 @router.post("/plan")
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
-    """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
+    """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
     reconciler = reconciler_of(request)
     wanted, definition = _gang_of(body), body.definition
     check_tracks(reconciler.store, wanted.spec)
@@ -187,7 +187,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             "plan the job with fewer nodes"
         )
     name = engine_of(placements[0].host)
-    images = reconciler.engine.engines[name].images
+    images = reconciler.engine.engines[name].traits.images
     return {
         "engine": name,
         "computeEnvironment": compute_environment,
@@ -227,7 +227,7 @@ def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: Job
 
 
 def _gang_of(body: PlanRequest) -> GangSpec:
-    """What the job of a plan needs. Raises ClientError."""
+    """The gang of a plan's job. Raises ClientError."""
     definition = validate("RegisterJobDefinition", body.definition)
     if definition["type"] != "multinode" or "nodeProperties" not in definition:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
@@ -405,7 +405,7 @@ def _stored(follower: LogFollower) -> Iterator[str]:
 
 
 def _trouble(error: Exception) -> str:
-    """The last line of a stream that can't go on: of no node and no attempt."""
+    """The last line of a stream that can't continue: of no node and no attempt."""
     text = f"the log can't be read now: {excerpt(' '.join(str(error).split()), LONGEST_REASON)}"
     return _json_lines([LogLine(timestamp(time.time()), 0, 0, None, "e", text)])
 

@@ -24,7 +24,9 @@ METRICS_A_PAGE = 10_000
 
 
 class _ChangesRequest(BaseModel):
-    nodes: int | None = Field(default=None, ge=1, description="another number of nodes; the worlds are dealt out anew")
+    nodes: int | None = Field(
+        default=None, ge=1, description="another number of nodes; the worlds are distributed anew"
+    )
     set: list[str] = Field(default_factory=list, description="key.path=value changes of the spec")
     directory: str = Field(default="", description="working directory of the job")
     checkpoint: int | Literal["best", "latest"] | None = None
@@ -93,7 +95,7 @@ def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[d
 
 
 def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
-    """How good a checkpoint was in the worlds of its training: ``mean``, ``low``, ``high`` of the return, ``episodes``."""
+    """The result of a checkpoint in the worlds of its training: ``mean``, ``low``, ``high`` of the return, ``episodes``."""
     if summary is None:
         return None
     told = summary.get("return")
@@ -132,7 +134,7 @@ def resume_run(
     body: ResumeRequest,
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
-    """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
+    """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.RESUME_RUN)
     return runs.resume(reconciler, run, body.changes(), idempotency_key)
@@ -145,7 +147,7 @@ def clone_run(
     body: CloneRequest,
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
-    """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key answers what the first one did."""
+    """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key gets the answer of the first one."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.CLONE_RUN)
     if body.dry_run:

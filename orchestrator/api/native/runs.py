@@ -94,7 +94,7 @@ def describe_run(reconciler: Reconciler, session: Session, run: Run) -> dict[str
 
 
 def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
-    """Name, iteration, size [bytes], reward and creation time [Unix s]; with ``verify`` also what is wrong with it."""
+    """Name, iteration, size [bytes], reward and creation time [Unix s]; with ``verify`` also its ``problem``."""
     facts: dict[str, Any] = {"name": checkpoint.name, "iteration": checkpoint.iteration, "epoch": checkpoint.epoch}
     facts["path"] = str(checkpoint.path)
     try:
@@ -117,7 +117,7 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
 
 
 def spec_of(session: Session, run: Run) -> Mapping[str, Any] | None:
-    """The spec with which a run goes on: that of its newest job, else the one that it was created with. Raises DamagedRow."""
+    """The spec with which a run continues: that of its newest job, else the one that it was created with. Raises DamagedRow."""
     newest = newest_job(session, run)
     if newest:
         with reading(newest):
@@ -193,7 +193,7 @@ def _resume(
 
 
 def _answered(context: Context, run: Run) -> dict[str, Any] | None:
-    """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
+    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another run."""
     job = answered(context, run.name)
     if job is None:
         return None
@@ -221,7 +221,7 @@ def _check_algorithm(run: Run, before: Spec, changed: Mapping[str, Any]) -> None
     new = setting_at(changed, "train.algorithm") or Train.model_fields["algorithm"].default
     if before.train and new != before.train.algorithm:
         raise ClientError(
-            f"run {run.name}: train.algorithm is {before.train.algorithm} and can't become {shown(new)}, which can't go on from its "
+            f"run {run.name}: train.algorithm is {before.train.algorithm} and can't become {shown(new)}, which can't continue from its "
             "state; start a new run for that"
         )
 
@@ -230,7 +230,7 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
     """A run is one history: the settings on which its state depends can't change."""
     if before.train is None or after.train is None:
         if before.kind != after.kind:
-            raise ClientError(f"run {run.name} is a {before.kind} job; it can't go on as {after.kind}")
+            raise ClientError(f"run {run.name} is a {before.kind} job; it can't continue as {after.kind}")
         return
     was, wanted = (dict(each.train) for each in (before, after))  # type: ignore[arg-type]
     if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
@@ -257,7 +257,7 @@ def _shown(value: Any) -> str:
 
 
 def _check_rate(run: Run, chosen: Checkpoint, after: Spec, assignments: Sequence[str]) -> None:
-    """Refuse a learning rate that would have no effect: an adapted one goes on from the checkpoint, unless the setting differs."""
+    """Refuse a learning rate that would have no effect: an adapted one continues from the checkpoint, unless the setting differs."""
     if after.train is None or after.train.algorithm not in _RATES:
         return
     name = after.train.algorithm
@@ -275,7 +275,7 @@ def _check_rate(run: Run, chosen: Checkpoint, after: Spec, assignments: Sequence
     differs = setting_at(saved, f"train.{name}.{key}") != asked  # then it counts
     if not differs and not math.isclose(rate, asked, rel_tol=1e-6):  # a rate may be a float32
         raise ClientError(
-            f"run {run.name}: train.{name}.{key} is {asked!r} already, so that the run would go on with "
+            f"run {run.name}: train.{name}.{key} is {asked!r} already, so that the run would continue with "
             f"the rate of its checkpoint, which is {rate:.3g} now; set another value{hint}"
         )
 
@@ -301,18 +301,18 @@ def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint)
     if chosen.iteration >= after.train.iterations and not owing:
         raise ClientError(
             f"run {run.name} is complete at iteration {chosen.iteration} of {after.train.iterations}; "
-            f"to go on: --set train.iterations={chosen.iteration * 2}",
+            f"to continue: --set train.iterations={chosen.iteration * 2}",
             CONFLICT,
         )
 
 
 def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
-    """How many worlds the run goes on with: those that it has, whatever ranks there are. Refuses what does not fit them."""
+    """Number of worlds with which the run continues: those that it has, whatever the number of ranks. Raises ClientError where they don't fit."""
     assert before.train is not None and after.train is not None
     ranks = after.nodes.max * after.ranks_per_node
     wanted = after.train.worlds * ranks
     changed = before.train.worlds != after.train.worlds
-    if changed and chosen is None:  # nothing is there that would have to be dealt out
+    if changed and chosen is None:  # no checkpoint holds worlds yet
         return wanted
     worlds = _worlds_of(session, run, before, chosen)
     if changed and wanted != worlds:
@@ -320,17 +320,17 @@ def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Check
         raise ClientError(
             f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {wanted} "
             f"({counted(after.nodes.max, 'node')} × {counted(after.ranks_per_node, 'rank')} × {after.train.worlds}); "
-            "leave train.worlds as it is: the worlds are dealt out to whatever ranks there are"
+            "leave train.worlds as it is: the worlds are distributed over all ranks"
         )
     if worlds < ranks:
         raise ClientError(
-            f"run {run.name}: {counted(worlds, 'world')} can't be dealt out to {counted(ranks, 'rank')}; use fewer nodes"
+            f"run {run.name}: {counted(worlds, 'world')} can't be distributed over {counted(ranks, 'rank')}; use fewer nodes"
         )
     return worlds
 
 
 def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | None) -> int:
-    """How many worlds the run has: as its checkpoint says, else as its newest job was told or had by its spec."""
+    """Number of worlds of the run, by its checkpoint, else by its newest job's variables or spec."""
     assert before.train is not None
     try:
         if chosen and isinstance(told := chosen.manifest.get("worlds"), int):

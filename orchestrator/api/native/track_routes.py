@@ -1,4 +1,4 @@
-"""The native API of the racer's tracks: what there is to drive on."""
+"""The native API of the racer's tracks."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ const curves = page.dataset.curves && page.querySelector("[data-charts]") ? new 
 const log = page.querySelector("[data-log]") ? new JobLog(page, address) : null;
 let stream = null;
 
-/** Follow the job; what the page has of its log and its curves says where the stream goes on. */
+/** Follow the job; the page's positions in its log and its curves are the place where the stream continues. */
 function follow() {
   stream?.close();
   const url = new URL(`${address}/stream`, location.origin);

@@ -1,5 +1,5 @@
 // Live parts of a page, over one stream of server-sent events. A hidden page closes its stream, since a browser opens only six
-// connections to a server, and goes on with the last event that it has.
+// connections to a server, and continues after the last event that it has.
 import { fill } from "./bind.js";
 
 const AGAIN = 3000;

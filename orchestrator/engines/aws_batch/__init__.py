@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting
+from orchestrator.engines.api import Engine, EngineError, EngineType, Option, SecretValues, Setting, Traits
+
+TRAITS = Traits(elastic=True, images=True, users=True, secrets=SecretValues.REFERENCES)
 
 
 def _make(setting: Setting) -> Engine:
@@ -22,4 +24,4 @@ OPTIONS = (
 )
 """Each stands over the key of the same name, with ``_``, in ``aws.json``."""
 
-ENGINE = EngineType(_make, OPTIONS)
+ENGINE = EngineType(_make, OPTIONS, TRAITS)

@@ -13,7 +13,7 @@ from shared_store.wording import explain, nearest, shown
 
 
 class AwsConfig(BaseModel):
-    """Where jobs go on AWS."""
+    """The account, the queue and the resources on AWS that jobs use."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -27,7 +27,7 @@ class AwsConfig(BaseModel):
     """EFS file system; without one ``store`` must be on the instances already."""
     access_point: str | None = None
     store: str = "/muster/store"
-    """Where a node sees the shared volume."""
+    """Path of the shared volume on a node."""
     store_is_shared: bool | None = None
     """Whether the controller's own store is that volume; None: where it is mounted from it."""
     job_role: str | None = None

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,14 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.aws_batch import TRAITS
 from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
+from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.view import CachedView
 from shared_store.outcomes import EX_TEMPFAIL, Outcome
 from shared_store.wording import counted
 
@@ -49,8 +53,12 @@ _GRACE = 25.0
 """Grace time [s] of a supervisor: AWS kills containers after 30, and it has to record what did not leave in time before that."""
 _CAPACITY_AGE = 60.0
 """Seconds for which AWS's answer about its size is kept."""
+_ANSWER = 10.0
+"""Seconds that a caller waits for that answer."""
 _STRAGGLE = 180.0
 """Seconds after a job's end within which AWS says of every node that it ended, too."""
+_ENDING = _STRAGGLE + 60.0
+"""Seconds that AWS may take to end a job before its controller is told that it does not."""
 _BLAME = 60.0
 """Seconds that a failed main node waits for its children's ends: AWS ends them now, and one may have been the cause."""
 _FIXED = 6.0
@@ -63,6 +71,8 @@ _TRANSIENT = (
     *("TooManyRequestsException", "ThrottlingException", "RequestLimitExceeded", "ServerException"),
     *("ExpiredToken", "ExpiredTokenException"),  # a person logs in again
 )
+_FAILURES = (ClientError, BotoCoreError, ResponseParserError)
+"""Exceptions of boto3: AWS refuses, is not reached, or answers nonsense."""
 _AWAY = 15.0
 """Seconds for which an AWS that did not answer is left alone."""
 
@@ -74,6 +84,8 @@ class _Watched:
     next: float = 0.0
     """When AWS is asked again (monotonic [s])."""
     status: GangStatus | None = None
+    trouble: str = ""
+    """Why AWS could not be asked the last time."""
     over_since: float | None = None
     """When AWS first said that the job is over (monotonic [s])."""
     main_stopped: int | None = None
@@ -94,8 +106,7 @@ class AwsBatchEngine:
     """One account's AWS Batch, as ``$MUSTER_HOME/aws.json`` describes it."""
 
     name = "aws-batch"
-    elastic = True
-    images = True
+    traits = TRAITS
     address: str | None = None  # nodes on AWS do not reach this machine
 
     def __init__(self, home: Path) -> None:
@@ -115,8 +126,9 @@ class AwsBatchEngine:
             self._logs = session.client("logs", endpoint_url=url, config=twice)
         except (BotoCoreError, NoRegionError) as error:
             raise EngineError(f"AWS: {error}; see `aws configure`") from None
-        self._limits: dict[str, tuple[float, int]] = {}
-        """By job queue: when it was asked for (monotonic [s]), and its vCPUs."""
+        self._vcpus = CachedView(
+            self.config.max_vcpus, self._max_vcpus, name="aws capacity", silence="AWS Batch has not answered yet"
+        )
         self._gangs: dict[str, _Watched] = {}
         self._lock = threading.Lock()
         self._check_queue()
@@ -125,17 +137,15 @@ class AwsBatchEngine:
         """The limits of the queue's compute environments.
 
         AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
-        is taken as their number, and what does not exist waits there with AWS's own reason.
+        is taken as their number, and what does not exist waits there with AWS's own reason. Until AWS has told them, for which it
+        may lack a permission, ``max_vcpus`` of the configuration counts.
+
+        Raises NotYet where AWS did not answer the last time: what it told before may be wrong.
         """
-        queue = self.config.job_queue
-        asked, vcpus = self._limits.get(queue, (0.0, self.config.max_vcpus))
-        if not asked or time.monotonic() - asked > _CAPACITY_AGE:
-            try:
-                vcpus = self._max_vcpus(queue)
-            except (ClientError, BotoCoreError, ResponseParserError):
-                pass  # as before
-            self._limits[queue] = (time.monotonic(), vcpus)
-        name = f"{self.name}/{queue.rpartition('/')[2]}"
+        vcpus = self._vcpus.get(_CAPACITY_AGE, _ANSWER)
+        if (trouble := self._vcpus.trouble) and self._vcpus.taken > -inf:
+            raise NotYet(trouble)
+        name = f"{self.name}/{self.config.job_queue.rpartition('/')[2]}"
         return Queued(Limit(name, Resources(float(vcpus), vcpus // 4, vcpus * _MEMORY)))
 
     def plan(self, gang: Gang) -> Plan[Requests]:
@@ -174,26 +184,26 @@ class AwsBatchEngine:
         return watched.status
 
     def stop(self, handle: Handle, grace: float) -> None:
-        """AWS's own grace is 30 s, whatever ``grace`` says. Waits for as long as AWS says that something of it runs."""
+        """AWS's own grace is 30 s, whatever ``grace`` says."""
         with self._lock:
             watched = self._gangs.setdefault(handle.gang, _Watched())
-        asked = False
-        while True:
+        job, asked = f"job {handle.facts['aws']}", False
+
+        def step() -> str:
+            nonlocal asked
+            problem: EngineError | None = None
             try:
                 if not asked:
-                    self._batch.terminate_job(jobId=handle.facts["aws"], reason="ended by Muster")
+                    self._terminate(handle)
                     asked = True
-            except (ClientError, BotoCoreError, ResponseParserError) as error:
-                if isinstance(error, ClientError) and not _is_transient(error):
-                    if any(node.running for node in self._look_again(handle, watched)):
-                        time.sleep(self.config.poll)
-                        raise EngineError(
-                            f"AWS Batch does not end job {handle.facts['aws']}: {_words(error)}"
-                        ) from None
-                    break  # AWS has forgotten the job
-            if not any(node.running for node in self._look_again(handle, watched)):
-                break
-            time.sleep(self.config.poll)
+            except EngineError as error:
+                problem = error
+            running = sum(node.running for node in self._look_again(handle, watched))
+            if problem is not None and running:  # else AWS has forgotten the job
+                raise problem
+            return (watched.trouble or f"{counted(running, 'node')} of {job} running") if running else ""
+
+        stop_within(_ENDING, step, engine=self.name, gang=handle.gang, pause=self.config.poll)
         if watched.logs is not None:
             watched.logs.finish()
         with self._lock:
@@ -223,6 +233,15 @@ class AwsBatchEngine:
                 f"AWS Batch ({where}) has no job queue {queue}; see `muster aws status`, or make it with `muster aws up`"
             )
 
+    def _terminate(self, handle: Handle) -> None:
+        """Ask AWS to end the job. Raises NotYet where it does not answer, EngineError where it refuses."""
+        try:
+            self._batch.terminate_job(jobId=handle.facts["aws"], reason="ended by Muster")
+        except _FAILURES as error:
+            if isinstance(error, ClientError) and not _is_transient(error):
+                raise EngineError(f"AWS Batch does not end job {handle.facts['aws']}: {_words(error)}") from None
+            raise NotYet(f"AWS Batch does not answer: {_words(error)}") from None
+
     # -- starting -----------------------------------------------------------------------------------------------------
 
     def _find(self, queue: str, name: str) -> str | None:
@@ -250,13 +269,15 @@ class AwsBatchEngine:
     # -- watching -----------------------------------------------------------------------------------------------------
 
     def _look_again(self, handle: Handle, watched: _Watched) -> GangStatus:
-        """Ask AWS; where it does not answer nothing has changed."""
+        """Ask AWS; where it does not answer, the last status stays, and says that it is an old one."""
         try:
-            watched.status, pause = self._look(handle, watched), self.config.poll
-        except (ClientError, BotoCoreError, ResponseParserError) as error:
-            said = _words(error) if isinstance(error, ClientError) else str(error)
-            waits = NodeStatus(NodePhase.UNREACHABLE, words=f"AWS Batch does not answer: {said}")
-            watched.status, pause = watched.status or [waits] * handle.nodes, _AWAY
+            watched.status, watched.trouble, pause = self._look(handle, watched), "", self.config.poll
+        except _FAILURES as error:
+            watched.trouble, pause = f"AWS Batch does not answer: {_words(error)}", _AWAY
+            known = watched.status or [NodeStatus(NodePhase.UNREACHABLE, words=watched.trouble)] * handle.nodes
+            watched.status = [
+                dataclasses.replace(node, stale=watched.trouble) if node.running else node for node in known
+            ]
         watched.next = time.monotonic() + pause
         return watched.status
 
@@ -347,15 +368,19 @@ class AwsBatchEngine:
 
     # -- capacity -----------------------------------------------------------------------------------------------------
 
-    def _max_vcpus(self, queue: str) -> int:
-        found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
-        order = [each["computeEnvironment"] for each in found[0]["computeEnvironmentOrder"]] if found else []
-        described = self._batch.describe_compute_environments(computeEnvironments=order) if order else {}
+    def _max_vcpus(self) -> int:
+        """The vCPUs of the queue's largest compute environment: a gang is in one of them. Raises NotYet."""
+        try:
+            found = self._batch.describe_job_queues(jobQueues=[self.config.job_queue])["jobQueues"]
+            order = [each["computeEnvironment"] for each in found[0]["computeEnvironmentOrder"]] if found else []
+            described = self._batch.describe_compute_environments(computeEnvironments=order) if order else {}
+        except _FAILURES as error:
+            raise NotYet(f"AWS Batch does not tell its capacity: {_words(error)}") from None
         sizes = [
             int((each.get("computeResources") or {}).get("maxvCpus", 0))
             for each in described.get("computeEnvironments", [])
         ]
-        return max([*sizes, 0]) or self.config.max_vcpus  # a gang is in one of them
+        return max([*sizes, 0]) or self.config.max_vcpus
 
 
 def _waiting(handle: Handle, index: int, status: str, detail: Mapping[str, Any], parent: Mapping[str, Any]) -> str:
@@ -394,6 +419,6 @@ def _is_transient(error: ClientError) -> bool:
     return answer.get("Error", {}).get("Code") in _TRANSIENT or status >= 500 or status == 429
 
 
-def _words(error: ClientError) -> str:
-    told = error.response.get("Error", {})
+def _words(error: Exception) -> str:
+    told = error.response.get("Error", {}) if isinstance(error, ClientError) else {}
     return f"{told.get('Message') or told.get('Code') or error}"

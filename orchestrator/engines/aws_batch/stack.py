@@ -120,7 +120,7 @@ class Stack:
         return str(found["StackId"])
 
     def follow(self, stack: str, since: float) -> Iterator[Event]:
-        """What happens to the stack (an id) from ``since`` (Unix time [s]) on, until it rests."""
+        """Events of the stack (an id) from ``since`` (Unix time [s]) on, until it rests."""
         seen: set[str] = set()
         while True:
             status = self._status(stack)
@@ -162,7 +162,7 @@ class Stack:
         return told
 
     def jobs(self, queue: str) -> dict[str, int]:
-        """How many jobs of the queue are in each state in which they use or wait for instances."""
+        """Numbers of the queue's jobs by state, of the states in which they use or wait for instances."""
         with _said():
             pages = self._session.client("batch").get_paginator("list_jobs")
             states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING")
@@ -288,7 +288,7 @@ def write_config(home: Path, stack: Stack, endpoint_url: str | None) -> Path:
 
 @contextmanager
 def _said() -> Iterator[None]:
-    """What AWS or boto3 refuses, as one line."""
+    """Report a refusal of AWS or boto3 in one line."""
     try:
         yield
     except NoCredentialsError:

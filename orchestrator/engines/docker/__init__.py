@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from orchestrator.engines.api import Engine, EngineError, EngineType, Setting
+from orchestrator.engines.api import Engine, EngineError, EngineType, SecretValues, Setting, Traits
+
+TRAITS = Traits(images=True, users=True, secrets=SecretValues.ENVIRONMENT, gpu_ids=True)
 
 
 def _make(setting: Setting) -> Engine:
@@ -13,4 +15,4 @@ def _make(setting: Setting) -> Engine:
     return DockerEngine(setting.home, setting.cpus, setting.gpus)
 
 
-ENGINE = EngineType(_make)
+ENGINE = EngineType(_make, traits=TRAITS)

@@ -43,16 +43,19 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.docker import TRAITS
 from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
 from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
 from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
+from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store import __version__
 from shared_store.files import DamagedFile
 from shared_store.layout import Store
 from shared_store.outcomes import read_outcome
+from shared_store.wording import counted
 
 log = logging.getLogger("muster.engines")
 
@@ -65,14 +68,15 @@ _TRIES = 64
 """Subnets that are tried before a gang can't be started: others on this machine may hold some."""
 _LOOK = 1.0
 """Seconds for which a look at a node waits for the rest of its log."""
+_COPYING = 300.0
+"""Seconds for which a stop waits for the logs of containers that have ended."""
 
 
 class DockerEngine:
     """One machine's Docker Engine."""
 
     name = "docker"
-    elastic = False
-    images = True
+    traits = TRAITS
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
         """Args:
@@ -140,8 +144,8 @@ class DockerEngine:
                 with ThreadPoolExecutor(len(found)) as pool:
                     list(pool.map(lambda container: _stop(container, grace), found.values()))
                 # what is not copied yet would go with the container
-                for copy in self._copies_of(handle.gang).values():
-                    copy.wait()
+                copies = list(self._copies_of(handle.gang).values())
+                stop_within(_COPYING, lambda: _uncopied(copies), engine=self.name, gang=handle.gang, pause=0.05)
             self._ended[handle.gang] = dict(enumerate(self._observe(handle)))
             for gang in list(self._ended)[:-_REMEMBERED]:  # other stops do the same
                 self._ended.pop(gang, None)
@@ -284,7 +288,7 @@ class DockerEngine:
         return status
 
     def _settle(self, handle: Handle, index: int, state: Mapping[str, Any], words: str) -> bool:
-        """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written.
+        """Record the end of a node without a supervisor, as a supervisor does: the log is whole, then the outcome is written.
 
         False while the log is not whole yet.
         """
@@ -377,6 +381,12 @@ def _addresses(subnet: str, count: int) -> list[str]:
     if count > 250:
         raise EngineError(f"{count} nodes: the docker engine has room for 250 on a gang's network")
     return [f"{subnet.rpartition('.')[0]}.{index + 2}" for index in range(count)]
+
+
+def _uncopied(copies: Sequence[FollowedLog]) -> str:
+    """The number of copies that are under way, in words; empty once all have ended."""
+    left = sum(not copy.wait(0.0) for copy in copies)
+    return f"{counted(left, 'log')} not copied to the end" if left else ""
 
 
 def _stop(container: Container, grace: float) -> None:

@@ -15,7 +15,7 @@ from orchestrator.engines.toolkit.mounts import mounts_of
 from shared_store.contract import BUS_VARIABLES, NodeContract, sealed_in_image
 
 STORE, KERNELS = "/muster/store", "/muster/kernels"
-"""Where a container of an image with Muster finds the store and the cache of compiled kernels."""
+"""Paths of the store and of the cache of compiled kernels in a container of an image with Muster."""
 GANG, NODE, PLAIN = "muster.gang", "muster.node", "muster.plain"
 """Labels of containers and networks: whose they are, and whether they run without a supervisor."""
 

@@ -34,6 +34,7 @@ from orchestrator.engines.api import (
     Transient,
     node_plans,
 )
+from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.environment import inherited
@@ -54,7 +55,7 @@ log = logging.getLogger("muster.engines")
 _ID = re.compile(r"[0-9]{1,10}")
 """A user or a group by its number."""
 _UNSEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
-"""What reading ``/proc/<pid>`` raises for a process that is gone or another user's; any other error says nothing about it."""
+"""Errors of reading ``/proc/<pid>`` of a process that is gone or another user's; any other error says nothing about it."""
 _REMEMBERED = 256
 """Gangs whose nodes' ends are known after they were stopped: the controller asks once more when all has ended."""
 
@@ -76,8 +77,7 @@ class LocalEngine:
     """One machine as an engine."""
 
     name = "local"
-    elastic = False
-    images = False
+    traits = TRAITS
     address: str | None = None
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
@@ -267,7 +267,7 @@ def _address(gang: Gang, index: int) -> str:
 
 
 def _port(gang: str) -> int:
-    """Where the nodes of a gang meet. Raises Transient where no port is free."""
+    """A port for the nodes of a gang to meet at. Raises Transient where none is free."""
     try:
         return free_port(gang)
     except OSError as error:
@@ -276,7 +276,7 @@ def _port(gang: str) -> int:
 
 @dataclass(frozen=True)
 class _Shim:
-    """What is known of a node that runs."""
+    """The shim of a node that runs."""
 
     pid: int
     port: int

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from orchestrator.engines.api import Engine, EngineType, Setting
+from orchestrator.engines.api import Engine, EngineType, Setting, Traits
+
+TRAITS = Traits(elastic=True)
 
 
 def _make(setting: Setting) -> Engine:
@@ -11,4 +13,4 @@ def _make(setting: Setting) -> Engine:
     return RayEngine(setting.home)
 
 
-ENGINE = EngineType(_make)
+ENGINE = EngineType(_make, traits=TRAITS)

@@ -8,13 +8,13 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.toolkit.environment import inherited
+from orchestrator.engines.toolkit.view import View
 
 _FRESH = 8.0
 """Seconds after which the last report is stale: the head does not answer."""
@@ -27,13 +27,16 @@ class Watch:
 
     def __init__(self, head: str, environment: Mapping[str, str]) -> None:
         self.head, self._environment = head, environment
-        self.seen: dict[str, Any] = {}
-        self._error: dict[str, Any] = {}
-        self._heard = -_FRESH
+        self._reports = View[dict[str, Any]]({})
         self._told = threading.Event()
         self._closing = threading.Event()
         self._process: subprocess.Popen[str] | None = None
         threading.Thread(target=self._listen, name="ray watch", daemon=True).start()
+
+    @property
+    def seen(self) -> dict[str, Any]:
+        """The last report, however old it is (see :meth:`problem`); empty before the first."""
+        return self._reports.value
 
     def first(self) -> dict[str, Any]:
         """The first report; ``{"error": …}`` where the cluster can't be used."""
@@ -43,13 +46,13 @@ class Watch:
         if self.seen:
             return self.seen
         self.close()
-        return self._error
+        return {"error": self.problem()}
 
     def problem(self) -> str:
-        """Why nothing is known of the cluster now."""
-        if time.monotonic() - self._heard < _FRESH:
+        """Why the last report is stale: nothing is known of the cluster now."""
+        if self._reports.age < _FRESH:
             return ""
-        return str(self._error.get("error") or f"the Ray head at {self.head} does not answer")
+        return self._reports.trouble or f"the Ray head at {self.head} does not answer"
 
     def close(self) -> None:
         self._closing.set()
@@ -77,14 +80,14 @@ class Watch:
                     continue  # a word of Ray's own
                 said = json.loads(line)
                 if "error" in said:
-                    self._error = said
+                    self._reports.missed(str(said["error"]))
                 else:
-                    self.seen, self._heard, self._error = said, time.monotonic(), {}
+                    self._reports.answered(said)
                 self._told.set()
             code = self._process.wait()
             reader.join(1.0)
             if not self._told.is_set():
-                self._error = {"error": _why_no_watch(code, errors)}
+                self._reports.missed(_why_no_watch(code, errors))
                 self._told.set()
             self._closing.wait(2.0)
 

@@ -25,7 +25,7 @@ import ray
 from orchestrator.engines.ray import node as ray_node
 from orchestrator.engines.ray.bundles import STRATEGY, bundle_of, selector_of
 from orchestrator.engines.ray.folder import NEW, Folder
-from orchestrator.engines.ray.gang import Gang
+from orchestrator.engines.ray.gang import DrivenGang
 
 _LINGER = 15.0
 """Seconds for which the place of a gang that is over is kept for the job's next attempt."""
@@ -38,7 +38,7 @@ class Driver:
 
     def __init__(self, folder: Folder, join: str, commands: int) -> None:
         self.folder, self.join, self.commands = folder, join, commands
-        self.gang: Gang | None = None
+        self.gang: DrivenGang | None = None
         self.group: Any = None
         self.key: Any = None
         """The bundles and the pinned machines for which the placement group was made."""
@@ -67,7 +67,7 @@ class Driver:
             else:
                 self.idle_since = time.monotonic()
 
-    def _step(self, gang: Gang) -> None:
+    def _step(self, gang: DrivenGang) -> None:
         if gang.phase == "joining":
             self._place(gang)
         elif gang.phase == "placing":
@@ -87,7 +87,7 @@ class Driver:
                 gang.clear()
                 self.idle_since = time.monotonic()
 
-    def _place(self, gang: Gang) -> None:
+    def _place(self, gang: DrivenGang) -> None:
         """Keep the placement group of the attempt before where it fits, else ask for another."""
         bundles = [bundle_of(node) for node in gang.plan["nodes"]]
         pins = [node["pin"] for node in gang.plan["nodes"]]
@@ -105,7 +105,7 @@ class Driver:
             self.key = key
         gang.phase, gang.why, self._told_to_leave = "placing", "waits for its placement group", False
 
-    def _await_place(self, gang: Gang) -> None:
+    def _await_place(self, gang: DrivenGang) -> None:
         if self.group.wait(0.1):
             where = ray.util.placement_group_table(self.group)["bundles_to_node_id"]
             for index, node in enumerate(gang.nodes):
@@ -138,7 +138,7 @@ class Driver:
                 self._stop(self.gang, command["grace"])
         return False
 
-    def _stop(self, gang: Gang, grace: float) -> None:
+    def _stop(self, gang: DrivenGang, grace: float) -> None:
         if gang.phase == "placing":  # it asks for machines that nobody wants any more
             ray.util.remove_placement_group(self.group)
             self.group = None
@@ -150,7 +150,7 @@ class Driver:
         if self.folder.state(name).exists():
             return
         try:
-            self.gang = Gang(json.loads(self.folder.plan(name).read_bytes()), self.folder)
+            self.gang = DrivenGang(json.loads(self.folder.plan(name).read_bytes()), self.folder)
         except OSError:
             return  # it was stopped meanwhile
         self.gang.tell()
@@ -171,7 +171,7 @@ class Driver:
 
 
 def _why_waiting(nodes: list[Mapping[str, Any]]) -> str:
-    """What a placement group that pends waits for."""
+    """The reason why a placement group is pending."""
     free = ray._private.state.available_resources_per_node()
     full, new = [], []
     for node in nodes:

@@ -36,18 +36,22 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.ray import TRAITS
 from orchestrator.engines.ray.bundles import in_words
 from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray.folder import LEASE, NEW, Folder
 from orchestrator.engines.ray.request import GangRequest, NodeRequest
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
+from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store.files import read_json, write_json
 from shared_store.ports import first_port
 
 DEFAULT_ADDRESS = "127.0.0.1:6379"
 _SUSPECT, _SUSPECT_IF_SILENT = 20.0, 70.0
 """Seconds for which a machine that lost its part of a gang is no host: until Ray, too, knows whether it is there."""
+_ENDING = 4 * LEASE
+"""Seconds beyond the grace time that a gang may take to end: a driver that hangs is killed after two leases, its actors follow in one."""
 _KEPT = 7 * 86400.0
 """Seconds for which a job's folder is kept when it is over."""
 
@@ -56,8 +60,7 @@ class RayEngine:
     """One Ray cluster."""
 
     name = "ray"
-    elastic = True
-    images = False
+    traits = TRAITS
 
     def __init__(self, home: Path, address: str | None = None) -> None:
         """Args:
@@ -99,7 +102,11 @@ class RayEngine:
         """The machines that have CPUs, and those that the autoscaler could add (``ray/+1``, …).
 
         One that was added for a gang is called what the gang's placement calls it until that is over.
+
+        Raises NotYet while the head does not answer: what it said before may be wrong.
         """
+        if problem := self._watch.problem():
+            raise NotYet(problem)
         machines = self._machines()
         hosts = [Host(name, m["cpus"], _ids(m["gpus"]), m["memory"], single=True) for name, m in machines.items()]
         for shape in [*self._grows, *self._watch.seen.get("grows", [])]:
@@ -200,10 +207,14 @@ class RayEngine:
         gang = handle.gang
         folder = Folder.of(self.home, _job(gang))
         asked, patience = 0.0, time.monotonic() + grace + 2 * LEASE
-        while (state := read_json(folder.state(gang))) is None or state["phase"] != "stopped":
-            if state is None and not folder.plan(gang).exists():
-                break
-            if state is not None and state["phase"] == "stopping" and state["why"]:
+
+        def step() -> str:
+            nonlocal asked
+            state = read_json(folder.state(gang))
+            phase = state["phase"] if state is not None else ""
+            if phase == "stopped" or (state is None and not folder.plan(gang).exists()):
+                return ""
+            if state is not None and phase == "stopping" and state["why"]:
                 raise EngineError(f"{state['why']}; its CPUs and GPUs are not given to other jobs until it is gone")
             now = time.monotonic()
             if now > patience and state is not None:  # frozen; its actors have missed it for long enough
@@ -213,7 +224,9 @@ class RayEngine:
                 asked = now
                 if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
                     self._outwait(folder, gang)
-            time.sleep(0.02)
+            return f"its driver says {phase}" if phase else "its driver has said nothing yet"
+
+        stop_within(grace + _ENDING, step, engine=self.name, gang=gang, pause=0.02)
         with self._lock:
             self._grown.pop(gang, None)
 
@@ -297,7 +310,7 @@ def _request(gang: Gang, node: NodePlan, machines: Mapping[str, Mapping[str, Any
 
 
 def _status(node: Mapping[str, Any], state: Mapping[str, Any], driven: bool) -> NodeStatus:
-    """How a node is, by what its driver says; ``driven``: the driver is there, or had nothing more to do."""
+    """The status of a node, by its driver's report; ``driven``: the driver is there, or had nothing more to do."""
     gpus = tuple(filter(None, node.get("gpus", "").split(",")))
     if not (node["running"] and driven):
         over = ended(node["address"], node["code"], node["detail"], gpus)

@@ -1,4 +1,4 @@
-"""What the Ray engine and the driver of a job tell each other: files in ``$MUSTER_HOME/ray/<job>/``, and a named pipe.
+"""Messages between the Ray engine and the driver of a job: files in ``$MUSTER_HOME/ray/<job>/``, and a named pipe.
 
 The driver outlives the controller. Whoever finds a reader at the pipe's other end has found it; what it knows is in its state files.
 """

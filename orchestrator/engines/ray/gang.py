@@ -31,7 +31,7 @@ _STARTING = 60.0
 """Seconds that an actor may take to start: a machine that Ray believes alive may be frozen."""
 
 
-class Gang:
+class DrivenGang:
     """One attempt: its actors, and what is known of its nodes."""
 
     def __init__(self, plan: Mapping[str, Any], folder: Folder) -> None:

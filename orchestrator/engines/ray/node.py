@@ -65,7 +65,7 @@ class Node:
         return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": problem}
 
     def free_port(self, gang: str) -> int:
-        """Where the nodes of a gang meet, on this node's machine; 0 where no port is free."""
+        """A port of this node's machine for the gang's nodes to meet at; 0 where none is free."""
         from shared_store.ports import free_port
 
         with contextlib.suppress(OSError):

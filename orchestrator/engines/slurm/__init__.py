@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orchestrator.engines.api import Engine, EngineType, Option, Setting
+from orchestrator.engines.api import Engine, EngineType, Option, Setting, Traits
 
 SBATCH = (
     Option("partition", "a partition"),
@@ -15,6 +15,8 @@ SBATCH = (
     Option("exclude", "nodes that it must not have"),
 )
 """Options that sbatch has by the same names."""
+
+TRAITS = Traits(elastic=True)
 
 
 def _make(setting: Setting) -> Engine:
@@ -30,4 +32,5 @@ ENGINE = EngineType(
         Option("gpu", "a type of GPU, as a100"),
         Option("nice", "sbatch's --nice of a job without priority", int),
     ),
+    TRAITS,
 )

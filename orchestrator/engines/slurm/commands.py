@@ -1,4 +1,4 @@
-"""Slurm's own commands: calling them, and a snapshot of its jobs that is at most a second old while it is used."""
+"""Slurm's own commands: calling them, and reading their answers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ import pwd
 import re
 import socket
 import subprocess
-import threading
-import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from orchestrator.domain.hosts import Host
-from orchestrator.engines.api import EngineError
+from orchestrator.engines.api import EngineError, NotYet
 from orchestrator.engines.toolkit.environment import inherited
 
 _LIMIT = 30.0
@@ -23,8 +20,6 @@ _AWAY = re.compile(
     r"(?i)unable to contact|connection (refused|timed out)|socket timed out|not responding|zero bytes|try again"
 )
 _UNCONFIGURED = re.compile("Could not establish a configuration source|resolve_ctls_from_dns_srv")
-_HOSTS_AGE = 10.0
-"""Seconds for which a picture of all hosts holds."""
 _AWAY_STATES = frozenset(
     {"DOWN", "DRAIN", "DRAINED", "DRAINING", "ERROR", "FAIL", "FAILING", "INVAL", "INVALID_REG"}
     | {"MAINT", "MAINTENANCE", "NOT_RESPONDING", "UNKNOWN"}
@@ -32,7 +27,7 @@ _AWAY_STATES = frozenset(
 """Words of a node's state that mean that nothing can start there now. ``POWERED_DOWN`` is none: Slurm boots such a node for a job."""
 
 
-class Unreachable(EngineError):
+class Unreachable(NotYet):
     """slurmctld does not answer now; it may later."""
 
 
@@ -103,99 +98,6 @@ def list_jobs() -> dict[str, SlurmJob]:
         if len(fields) == 5:  # a comment of somebody's may have lines
             found[fields[0]] = SlurmJob(*fields)
     return found
-
-
-class Jobs:
-    """A snapshot of this user's jobs, refreshed in the background: a Slurm that does not answer delays no caller for long."""
-
-    def __init__(self) -> None:
-        self._trouble: str | None = None
-        """Why there is no newer picture."""
-        self._jobs: Mapping[str, SlurmJob] = {}
-        self._taken = 0.0
-        self._late = False
-        """A caller has timed out on a refresh: later ones take the snapshot as it is."""
-        self._lock, self._looked = threading.Lock(), threading.Event()
-        self._looked.set()
-
-    def get(self, number: str, since: float, age: float) -> SlurmJob | None:
-        """The job; None if Slurm no longer knows it. Raises Unreachable if that can't be determined.
-
-        Args:
-            number: The job's.
-            since: When it was submitted (monotonic [s]): an older picture does not have it.
-            age: Seconds for which a picture holds.
-        """
-        if time.monotonic() - self._taken > age:
-            self._look()
-            if not self._looked.wait(0.0 if self._late else 2.0):
-                self._late = True
-        if number not in self._jobs and self._taken <= since:
-            raise Unreachable(self._trouble or "slurmctld has not answered yet")
-        return self._jobs.get(number)
-
-    def fresh(self) -> Mapping[str, SlurmJob]:
-        """A picture taken now. Raises EngineError."""
-        started = time.monotonic()
-        try:
-            jobs = list_jobs()
-        except EngineError as error:
-            self._trouble = str(error)
-            raise
-        with self._lock:
-            if started > self._taken:
-                self._jobs, self._taken, self._trouble = jobs, started, None
-        return jobs
-
-    def away(self) -> str | None:
-        """Why slurmctld can't be asked, where it could not the last time; looks again in the background."""
-        if self._trouble:
-            self._look()
-        return self._trouble
-
-    @property
-    def trouble(self) -> str | None:
-        """Why the picture is an old one."""
-        return self._trouble or ("slurmctld has not answered yet; see `scontrol ping`" if self._late else None)
-
-    def _look(self) -> None:
-        with self._lock:
-            if not self._looked.is_set():
-                return
-            self._looked.clear()
-        threading.Thread(target=self._take, name="squeue", daemon=True).start()
-
-    def _take(self) -> None:
-        try:
-            self.fresh()
-        except EngineError:
-            pass  # noted
-        finally:
-            self._late = False
-            self._looked.set()
-
-
-class Hosts:
-    """The cluster's nodes, looked at in the background once they are known."""
-
-    def __init__(self) -> None:
-        self._hosts = list_hosts()
-        self._taken = time.monotonic()
-        self._lock = threading.Lock()
-
-    def get(self) -> Sequence[Host]:
-        if time.monotonic() - self._taken > _HOSTS_AGE and self._lock.acquire(blocking=False):
-            self._taken = time.monotonic()
-            threading.Thread(target=self._take, name="scontrol", daemon=True).start()
-        return self._hosts
-
-    def _take(self) -> None:
-        try:
-            self._hosts = list_hosts()
-        except EngineError:
-            pass  # the last picture stands
-        finally:
-            self._lock.release()
 
 
 def list_hosts() -> list[Host]:

@@ -19,12 +19,12 @@ import json
 import re
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from orchestrator.domain.hosts import Queued
+from orchestrator.domain.hosts import Host, Queued
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -37,11 +37,21 @@ from orchestrator.engines.api import (
     Plan,
     node_plans,
 )
-from orchestrator.engines.slurm.commands import Hosts, Jobs, SlurmJob, Unreachable, address_of_this_machine, call
+from orchestrator.engines.slurm import TRAITS
+from orchestrator.engines.slurm.commands import (
+    SlurmJob,
+    Unreachable,
+    address_of_this_machine,
+    call,
+    list_hosts,
+    list_jobs,
+)
 from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
 from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
+from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.view import CachedView
 from shared_store.layout import Store
 from shared_store.outcomes import Outcome
 
@@ -52,7 +62,12 @@ _LOOK = 0.3
 _AGAIN = 2.0
 """Seconds after which a job that is still there is cancelled: it may have had no step yet, or Slurm can't reach a node."""
 _KILLING = 60.0
-"""Seconds after which a job that was killed and is still there is reported; Slurm's KillWait is 30 s by default."""
+"""Seconds beyond the grace time after which a job that is still there is reported; Slurm's KillWait is 30 s by default."""
+_SILENCE = "slurmctld has not answered yet; see `scontrol ping`"
+_HOSTS_AGE, _JOBS_AGE = 10.0, 1.0
+"""Seconds for which a view of all hosts, and of this user's jobs, holds."""
+_ANSWER = 2.0
+"""Seconds that a look at a job waits for squeue."""
 _PATIENCE = 5.0
 """Seconds for which a launch waits for sbatch, which tries for longer where slurmctld is away: other jobs wait meanwhile."""
 _FORGOTTEN = "0"
@@ -69,21 +84,25 @@ class SlurmEngine:
     """A Slurm cluster, by the commands of this machine."""
 
     name = "slurm"
-    elastic = True
-    images = False
+    traits = TRAITS
 
     def __init__(self) -> None:
         """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""
-        self._hosts = Hosts()
+        self._hosts = CachedView[Sequence[Host]]((), list_hosts, name="scontrol", silence=_SILENCE)
+        self._hosts.read()
         self.address = address_of_this_machine()
-        self._jobs = Jobs()
+        self._jobs = CachedView[Mapping[str, SlurmJob]]({}, list_jobs, name="squeue", silence=_SILENCE)
         self._submitted: dict[str, float] = {}
         self._submitting = threading.Lock()
         self._pending: dict[str, Future[str]] = {}
         """Submissions that are not answered, by gang."""
 
     def capacity(self) -> Queued:
-        return Queued(self._hosts.get())
+        """Raises NotYet where slurmctld did not answer the last time: what it said before may be wrong."""
+        hosts = self._hosts.get(_HOSTS_AGE)
+        if trouble := self._hosts.trouble:
+            raise NotYet(f"Slurm: {trouble}")
+        return Queued(hosts)
 
     def plan(self, gang: Gang) -> Plan[Submission]:
         """With the whole script; the nodes' addresses are known when Slurm has placed them."""
@@ -96,7 +115,8 @@ class SlurmEngine:
         facts = {**store_facts(gang), "main": gang.main, "output": plan.request.output}
         patience = 0.0 if self._pending else _PATIENCE
         if gang.name not in self._pending:
-            if trouble := self._jobs.away():
+            if trouble := self._jobs.trouble:
+                self._jobs.refresh()
                 raise NotYet(f"Slurm: {trouble}", unknown=True)
             self._begin(gang.name, facts, plan.request)
         pending = self._pending[gang.name]
@@ -132,36 +152,16 @@ class SlurmEngine:
         ]
 
     def stop(self, handle: Handle, grace: float) -> None:
-        number, deadline, asked, killed = handle.facts["slurm"], time.monotonic() + grace, False, 0.0
-        give_up = deadline + _KILLING
-        while True:
-            try:
-                job = self._job(handle, _LOOK)
-                if job is None or job.state in OVER:
-                    self._submitted.pop(number, None)
-                    return
-                now = time.monotonic()
-                if now > give_up and killed:
-                    raise EngineError(
-                        f"Slurm: job {number} is {job.state} on {job.hosts} since it was killed {_KILLING:.0f} s ago: something of it "
-                        f"can't be killed (`scontrol show job {number}`, and ps on that host, say what)"
-                    )
-                if job.state in QUEUED:
-                    _cancel(number)
-                elif not asked and grace > 0:
-                    # to the script alone, which tells the nodes: it knows whether they have been started yet
-                    _cancel("--batch", "--signal=USR1", number)
-                    asked = True
-                elif now >= deadline and not killed:
-                    # the step at once; to end the job, Slurm asks once more and waits for KillWait
-                    _cancel("--signal=KILL", f"{number}.0")
-                    killed = now
-                elif now >= deadline and now - killed > _AGAIN:
-                    _cancel(number)
-                    killed = now
-            except Unreachable:
-                pass  # a cluster that does not answer can't say that the job is over
-            time.sleep(_LOOK)
+        ending = _Ending(handle.facts["slurm"], grace)
+
+        def step() -> str:
+            job = self._job(handle, _LOOK)
+            if job is None or job.state in OVER:
+                self._submitted.pop(ending.number, None)
+                return ""
+            return ending.next(job)
+
+        stop_within(grace + _KILLING, step, engine=self.name, gang=handle.gang, pause=_LOOK)
 
     def close(self) -> None:
         """Slurm's jobs go on."""
@@ -186,7 +186,7 @@ class SlurmEngine:
 
     def _find(self, gang: str, facts: Mapping[str, Any]) -> str | None:
         """The number of a gang that was submitted before: its controller died, or sbatch's answer was lost. Raises EngineError."""
-        for job in self._jobs.fresh().values():
+        for job in self._jobs.read().values():
             if job.comment == gang:
                 return job.number
         run = Store(facts["store"]).run(facts["run"])
@@ -209,11 +209,42 @@ class SlurmEngine:
                 f"Slurm refuses the job{where}: {error}; `muster submit --dry-run` shows what it is asked for"
             ) from error
 
-    def _job(self, handle: Handle, age: float = 1.0) -> SlurmJob | None:
-        """None where Slurm has forgotten it. Raises Unreachable."""
+    def _job(self, handle: Handle, age: float = _JOBS_AGE) -> SlurmJob | None:
+        """None where Slurm has forgotten it. Raises Unreachable: no view since it was submitted."""
         number = handle.facts["slurm"]
-        job = self._jobs.get(number, self._submitted.get(number, 0.0), age)
+        job = self._jobs.get(age, _ANSWER).get(number)
+        if job is None and self._jobs.taken <= self._submitted.get(number, 0.0):
+            raise Unreachable(self._jobs.trouble or _SILENCE)
         return job if job is not None and job.comment == handle.gang else None
+
+
+class _Ending:
+    """The end of one job: asked by a signal, then killed."""
+
+    def __init__(self, number: str, grace: float) -> None:
+        self.number = number
+        self._due, self._asked, self._killed = time.monotonic() + grace, grace <= 0, 0.0
+
+    def next(self, job: SlurmJob) -> str:
+        """Cancel the job, where that is due; returns its state in words. Raises Unreachable."""
+        now, number = time.monotonic(), self.number
+        if job.state in QUEUED:
+            _cancel(number)
+        elif not self._asked:
+            # to the script alone, which tells the nodes: it knows whether they have been started yet
+            _cancel("--batch", "--signal=USR1", number)
+            self._asked = True
+        elif now >= self._due and not self._killed:
+            # the step at once; to end the job, Slurm asks once more and waits for KillWait
+            _cancel("--signal=KILL", f"{number}.0")
+            self._killed = now
+        elif now >= self._due and now - self._killed > _AGAIN:
+            _cancel(number)
+            self._killed = now
+        state = f"job {number} is {job.state}{f' on {job.hosts}' if job.hosts else ''}"
+        if not self._killed:
+            return state
+        return f"{state} although it was killed (`scontrol show job {number}`, and ps on that host, say what is left of it)"
 
 
 def _cancel(*arguments: str) -> None:
@@ -240,7 +271,7 @@ def _queued(job: SlurmJob, trouble: str) -> NodeStatus:
 
 
 def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int, outcome: Outcome | None) -> NodeStatus:
-    """How one node is, by its outcome, else by what srun says of its task, else by its job."""
+    """The status of one node: by its outcome, else by what srun says of its task, else by its job."""
     task = _task(facts, index)
     meeting = _MEETING.search(said)
     address = json.loads(meeting[1])["addresses"][task] if meeting else ""

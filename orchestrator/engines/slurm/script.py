@@ -59,7 +59,7 @@ class Submission:
     script: str
     """Standard input of ``sbatch``."""
     output: str
-    """Where Slurm writes what ``srun`` and the nodes' supervisors say."""
+    """Path of the job's output: the messages of ``srun`` and of the nodes' supervisors."""
     partition: str | None
 
 
@@ -74,7 +74,7 @@ def shown(script: str, credential: str | None) -> str:
 
 
 def output_path(gang: Gang) -> str:
-    """Where Slurm writes what ``srun`` and the nodes' supervisors say."""
+    """Path of the job's output: the messages of ``srun`` and of the nodes' supervisors."""
     return str(Store(gang.store).run(gang.run).logs(gang.job, gang.attempt) / "slurm.out")
 
 

@@ -6,16 +6,16 @@ import threading
 from dataclasses import dataclass, field
 
 from orchestrator.domain.hosts import Capacity, Host, Hosts
-from orchestrator.engines.api import Cause, Gang, GangStatus, Handle, NodePhase, NodeStatus, Plan, node_plans
+from orchestrator.engines.api import Cause, Gang, GangStatus, Handle, NodePhase, NodeStatus, Plan, Traits, node_plans
 from orchestrator.engines.toolkit.endings import ended
 
 
 @dataclass
 class FakeCluster:
-    """What runs on the machines of fake engines: it outlives each of them."""
+    """The machines of fake engines, and the gangs on them: they outlive each of the engines."""
 
     gangs: dict[str, list[NodeStatus]] = field(default_factory=dict)
-    """How the nodes of each gang are, by its name; a test may put other statuses there."""
+    """Statuses of the nodes of each gang, by its name; a test may put other ones there."""
     launched: list[Plan[Gang]] = field(default_factory=list)
     """Plans of the gangs that were started, in their order."""
 
@@ -28,8 +28,8 @@ class FakeEngine:
     """An engine that starts nothing. A node runs from its launch on until a test, or a stop, ends it."""
 
     name = "fake"
-    elastic = False
-    images = False
+    traits = Traits()
+    """A test may give an engine others."""
     address: str | None = None
 
     def __init__(self, cluster: FakeCluster | None = None, capacity: Capacity | None = None) -> None:
@@ -47,7 +47,7 @@ class FakeEngine:
         self.threads: set[str] = set()
         """Names of the threads on which it was called for its hosts, launches and looks."""
         self.closed = 0
-        """How often it was closed."""
+        """Number of times that it was closed."""
 
     def capacity(self) -> Capacity:
         self._called()

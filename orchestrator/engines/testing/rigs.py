@@ -21,11 +21,11 @@ end="$MUSTER_STORE/ends/$MUSTER_JOB_ID-$AWS_BATCH_JOB_NODE_INDEX"
 until [ -e "$end" ]; do sleep 0.05; done
 exit "$(cat "$end")"
 """
-"""What a node runs: it leaves with the exit code that is written to its file."""
+"""Script of a node: it leaves with the exit code that is written to its file."""
 
 
 class Rig(Protocol):
-    """What the suite needs of an engine's surroundings."""
+    """The surroundings of an engine, as the suite needs them."""
 
     engine: Engine
 
@@ -42,7 +42,7 @@ class Rig(Protocol):
         ...
 
     def exit_code(self, handle: Handle, index: int, status: NodeStatus) -> int | None:
-        """How a node ended: as the engine saw it, else by its outcome in the store."""
+        """The exit code of a node: the engine's, else that of its outcome in the store."""
         ...
 
 

@@ -30,7 +30,7 @@ class Mount:
     source: str
     """Directory on the host."""
     target: str
-    """Where the node sees it."""
+    """Path on the node."""
     read_only: bool = False
 
 

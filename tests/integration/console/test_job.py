@@ -39,7 +39,7 @@ def store(console: Console) -> Store:
 
 @pytest.fixture(scope="module")
 def training(console: Console, store: Store) -> str:
-    """Id of a job that waits to go on with the run."""
+    """Id of a job that waits to continue the run."""
     return str(console.client.post("/api/runs/taught/resume", {"set": ["train.iterations=20"]})["jobId"])
 
 
@@ -291,7 +291,9 @@ def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, store: 
     await_status(console.client, job, "RUNNING")
     visitor = console.visitor()
     assert visitor.submit(f"/jobs/{job}/stop").json()["question"]["title"] == f"Stop runs ({job[:8]})?"
-    saved = visitor.submit(f"/jobs/{job}/save")
+    saved = wait_for(  # a job may run before its node is on the bus
+        lambda: answer if (answer := visitor.submit(f"/jobs/{job}/save")).status_code != 503 else None, 20, "the node"
+    )
     assert saved.status_code == 409 and "nothing to save" in saved.json()["message"]
     assert visitor.submit(f"/jobs/{job}/stop", confirmed="yes").json()["message"].endswith("is asked to stop")
     ended = await_status(console.client, job, "FAILED")

@@ -66,6 +66,14 @@ def test_jobs_are_found_by_state_queue_and_part_of_a_name(console: Console, many
     assert "it is one of waiting" in visitor.page("/?state=x", 400).text
 
 
+@pytest.mark.parametrize("path", ["/", "/jobs/stream"])
+@pytest.mark.parametrize("query", ["state=failed&state=waiting", "queue=lab&page=1&queue=default", "page=1&page=1"])
+def test_a_filter_that_an_address_gives_twice_is_refused_by_name(console: Console, path: str, query: str) -> None:
+    answer = console.visitor().http.get(f"{path}?{query}", headers={"Accept": "application/json"})
+    assert answer.status_code == 400
+    assert answer.json()["message"] == f"the address has {query.partition('=')[0]} 2 times; give it once"
+
+
 def test_a_waiting_job_says_why_it_waits(console: Console, many: list[str]) -> None:
     told = console.visitor().page("/?search=job-119").text
     assert "RUNNABLE" in told and "4" in told and "cpu" in told.lower(), told

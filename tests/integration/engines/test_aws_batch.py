@@ -17,7 +17,7 @@ import boto3
 import pytest
 
 from orchestrator.domain.hosts import Limit, Placement
-from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.engines.api import EngineError, NotYet, Transient
 from orchestrator.engines.aws_batch import engine as aws_batch
 from orchestrator.engines.aws_batch.config import is_mounted_from
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
@@ -135,7 +135,7 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     )
 
 
-def test_what_aws_is_sent_is_the_request_of_the_plan(bench: AwsBench) -> None:
+def test_aws_gets_the_request_of_the_plan(bench: AwsBench) -> None:
     sent: dict[str, dict[str, Any]] = {}
     for client, name in ((bench.engine._batch, "RegisterJobDefinition"), (bench.engine._submitting, "SubmitJob")):
         client.meta.events.register(
@@ -162,7 +162,7 @@ def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: AwsBench) -> No
         bench.engine.plan(bench.gang(nodes=6, commands=many))
 
 
-def test_what_was_submitted_by_a_controller_that_died_is_found(bench: AwsBench) -> None:
+def test_a_job_that_a_dead_controller_submitted_is_found(bench: AwsBench) -> None:
     gang = bench.gang()
     handle = bench.launch(gang)
     successor = AwsBatchEngine(bench.home)
@@ -203,7 +203,7 @@ def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_d
     assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
 
 
-def test_where_a_child_s_death_is_ignored_it_is(bench: AwsBench) -> None:
+def test_a_gang_that_ignores_a_child_s_death_continues(bench: AwsBench) -> None:
     script = f"[ $NODE_RANK = 1 ] && exit 3; {LAST}; sleep 1; echo done without it"
     handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
     assert bench.ended(handle)[0].exit_code == 0
@@ -279,7 +279,9 @@ def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(
     assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
 
 
-def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench) -> None:
+def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(
+    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
 
     def reason() -> str:
@@ -295,7 +297,20 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
     away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
     [node] = away.engine.observe(handle)
-    assert node.running and "does not answer" in node.words
+    assert node.running and "does not answer" in node.words and node.stale == node.words
+    bench.engine._batch, there = nowhere, bench.engine._batch
+    monkeypatch.setattr(aws_batch, "_ENDING", 0.1)
+    with pytest.raises(
+        Transient, match=r"^the aws-batch engine has not ended gang .*; last answer: AWS Batch does not"
+    ):
+        bench.engine.stop(handle, 0)
+    [node] = bench.engine.observe(handle)
+    assert "500" in node.words and "does not answer" in node.stale, "the last status, told as an old one"
+    monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
+    with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):
+        bench.engine.capacity()
+    bench.engine._batch = there
+    assert bench.engine.capacity().limits == limit
     with pytest.raises(NotYet, match="does not answer"):
         away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
 
@@ -323,7 +338,7 @@ def test_a_store_that_is_mounted_from_the_volume_is_the_volume(path: str, volume
     assert is_mounted_from(Path(path), volume, MOUNTS) is found
 
 
-def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
+def test_a_missing_configuration_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"aws\.json is missing: .*muster aws up"):
         AwsBatchEngine(tmp_path)
 
@@ -347,7 +362,7 @@ def test_a_damaged_configuration_is_refused_in_one_line(tmp_path: Path, text: st
     assert str(refused.value) == f"{tmp_path / 'aws.json'}: {message}"
 
 
-def test_what_is_wrong_from_the_start_is_said_at_the_start(aws: Serving, tmp_path: Path) -> None:
+def test_an_unusable_endpoint_queue_or_key_is_reported_at_the_start(aws: Serving, tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"127\.0\.0\.1:9\) does not answer: .*endpoint_url in aws\.json"):
         AwsBench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
     with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):

@@ -103,7 +103,7 @@ def test_the_template_is_clean() -> None:
     assert problems == [] and TEMPLATE.stat().st_size < 51_200, (problems, "CloudFormation takes no more in a request")
 
 
-def test_every_resource_is_created_and_the_outputs_are_what_the_engine_reads(account: Account) -> None:
+def test_every_resource_is_created_and_the_outputs_make_the_engine_s_configuration(account: Account) -> None:
     resources = account.client("cloudformation").describe_stack_resources(StackName="muster")["StackResources"]
     declared = {line[2:].split(":")[0] for line in _section("Resources") if line[:2] == "  " and line[2:3].isalpha()}
     resources = [each for each in resources if "LogicalResourceId" in each]
@@ -185,7 +185,7 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
 
 
 def test_the_compute_environment_can_be_changed_where_it_is_and_a_failed_create_leaves_no_volume() -> None:
-    """What moto allows and AWS does not: an update in place with a service role of one's own."""
+    """Moto allows it and AWS does not: an update in place with a service role of one's own."""
     environment, volume = _resource("ComputeEnvironment"), _resource("FileSystem")
     assert "ReplaceComputeEnvironment: false" in environment
     assert not [line for line in environment if line.startswith("ServiceRole:")]
@@ -217,7 +217,7 @@ def test_roles_allow_no_more_than_they_must(account: Account) -> None:
     assert iam.list_attached_role_policies(RoleName=account.physical("JobRole"))["AttachedPolicies"] == []
 
 
-def test_the_engine_works_on_what_up_has_written(
+def test_the_engine_works_with_the_configuration_that_up_has_written(
     account: Account, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     for name, value in account.env.items():
@@ -244,7 +244,7 @@ def test_the_engine_works_on_what_up_has_written(
     assert definition["type"] == "multinode" and definition["tags"]["muster:digest"]
 
 
-def test_status_says_what_is_there_and_writes_what_the_engine_needs(account: Account) -> None:
+def test_status_lists_the_resources_and_writes_the_engine_s_configuration(account: Account) -> None:
     shown = account.muster("status")
     assert shown.returncode == 0, shown.stderr
     assert "muster in us-east-1: CREATE_COMPLETE" in shown.stdout and "not pushed yet" in shown.stdout

@@ -242,7 +242,7 @@ def test_the_log_of_a_gang_that_is_stopped_is_whole(bench: DockerBench) -> None:
     assert bench.log() == ["ready", *map(str, range(100_000, 160_001))]
 
 
-def test_a_gang_is_asked_to_leave_and_then_made_to(bench: DockerBench) -> None:
+def test_a_gang_gets_sigterm_and_after_the_grace_sigkill(bench: DockerBench) -> None:
     polite = bench.ready(bench.gang(POLITE, 2))
     assert bench.stopped(polite, 10.0) == [75, 75]
     assert bench.log().count("saved") == 2
@@ -263,7 +263,7 @@ def test_a_container_that_is_killed_or_removed_is_a_node_that_ended(
     assert bench.engine.observe(handle)[1].exit_code in (137, None)
 
 
-def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(bench: DockerBench) -> None:
+def test_a_missing_image_fails_in_docker_s_words_and_leaves_nothing(bench: DockerBench) -> None:
     gang = bench.gang(image="muster-test-missing:1")
 
     def refused() -> str | None:
@@ -344,7 +344,7 @@ def test_with_muster_in_the_image_the_supervisor_writes_log_and_outcome(bench: D
 
 
 @pytest.mark.parametrize("image", [PLAIN, SUPERVISED])
-def test_the_containers_that_docker_has_are_those_of_the_plan(bench: DockerBench, image: str) -> None:
+def test_docker_creates_the_containers_of_the_plan(bench: DockerBench, image: str) -> None:
     gang = bench.gang("exec sleep 600", 2, image=image, container={"linuxParameters": {"initProcessEnabled": True}})
     plan = bench.engine.plan(gang)
     handle = bench.launch(gang)

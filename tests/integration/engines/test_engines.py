@@ -50,7 +50,7 @@ def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Pat
     assert refused.stderr.endswith("see `scontrol ping`\n")
 
 
-def test_slurm_without_its_configuration_is_said_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_configuration_of_slurm_is_reported_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need_slurm()
     if Path("/etc/slurm/slurm.conf").exists():
         pytest.skip("this machine belongs to a cluster")
@@ -83,7 +83,7 @@ def test_an_engine_that_may_not_mount_says_so_by_its_name(engine: str, monkeypat
         ("/a/../b", "/mnt"),
     ],
 )
-def test_what_is_mounted_and_where_are_absolute_paths(source: str, target: str) -> None:
+def test_source_and_target_of_a_mount_must_be_absolute_paths(source: str, target: str) -> None:
     with pytest.raises(EngineError, match=r"^volume .*: two absolute paths without '..' are needed$"):
         with_mounts(["true"], [Mount(source, target)])
 
@@ -94,7 +94,7 @@ def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
         make_engine("kubernetes", Setting(tmp_path))
 
 
-def test_what_an_engine_s_own_commands_hand_on_to_jobs_is_without_the_other_engines_secrets(
+def test_jobs_inherit_no_secrets_of_other_engines_from_an_engine_s_commands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"):

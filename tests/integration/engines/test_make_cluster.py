@@ -35,7 +35,7 @@ def make_cluster(folder: Path, *arguments: str) -> tuple[subprocess.CompletedPro
 
 
 @pytest.mark.parametrize("kept", [False, True], ids=["on the command line", "in the cluster's environment"])
-def test_a_port_that_is_taken_is_said_before_anything_is_started(tmp_path: Path, kept: bool) -> None:
+def test_a_port_in_use_is_reported_before_anything_starts(tmp_path: Path, kept: bool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         if kept:

@@ -64,7 +64,7 @@ def test_the_image_is_pushed_under_its_version_and_latest(registry: str, docker_
 
 
 @pytest.mark.usefixtures("docker_client")
-def test_what_is_missing_is_one_line() -> None:
+def test_a_missing_registry_or_image_is_reported_in_one_line() -> None:
     for arguments, said in (
         ((), "make push needs REGISTRY, such as REGISTRY=registry.example.com:5000/robots"),
         (("REGISTRY=r", "IMAGE=muster-test-no-such"), "there is no image muster-test-no-such; make image builds it"),

@@ -1,4 +1,4 @@
-"""What Ray's actor does on a node, without Ray: it starts the supervisor, and nothing of the node outlives its stop or its own death."""
+"""The work of Ray's actor on a node, without Ray: it starts the supervisor, and nothing of the node outlives its stop or its own death."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def contract(tmp_path: Path) -> NodeContract:
 
 
 def pids(contract: NodeContract) -> list[int]:
-    """What the rank and what escaped of it printed."""
+    """The process ids that the rank and its escaped process printed."""
 
     def both() -> list[int] | None:
         lines = [line.text for line in LogFollower(Store(contract.store).run("run"), "ray-node").drain()]
@@ -51,7 +51,7 @@ def pids(contract: NodeContract) -> list[int]:
     return found
 
 
-def test_a_stopped_node_leaves_nothing_and_what_can_not_be_killed_is_named(
+def test_a_stopped_node_leaves_nothing_and_names_a_process_that_can_not_be_killed(
     contract: NodeContract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))

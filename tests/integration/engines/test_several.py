@@ -28,7 +28,7 @@ def lines(served: Serving, *arguments: str) -> list[str]:
 
 
 @pytest.mark.usefixtures("docker_client")
-def test_the_cores_of_one_machine_are_handed_out_once(tmp_path: Path) -> None:
+def test_two_engines_on_one_machine_share_its_cores(tmp_path: Path) -> None:
     served = Serving(tmp_path, "--engine", "local", "--engine", "docker", "--cpus", "1")
     try:
         first = served.gang("import time; time.sleep(300)", cpus="0.95")

@@ -26,7 +26,7 @@ from tests.support.engines.slurm_cluster import GPUS, NODES
 bench = slurm_bench
 
 
-def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: SlurmBench) -> None:
+def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBench) -> None:
     hosts = bench.engine.capacity().machines
     assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
         (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
@@ -178,7 +178,7 @@ def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(benc
 
 
 def look(handle: Handle) -> list[NodeStatus]:
-    """What an engine without a memory sees, once it has asked."""
+    """The status that a new engine, without a memory, gets from Slurm."""
     engine = SlurmEngine()
     return wait_for(  # type: ignore[no-any-return]
         lambda: status if not (status := list(engine.observe(handle)))[0].running else None, 10, "an answer"
@@ -236,14 +236,16 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
         ),
     ],
 )
-def test_what_slurm_can_t_do_is_refused_in_one_line(bench: SlurmBench, changes: dict[str, Any], why: str) -> None:
+def test_a_gang_that_slurm_can_t_start_is_refused_in_one_line(
+    bench: SlurmBench, changes: dict[str, Any], why: str
+) -> None:
     with pytest.raises(EngineError, match=why) as refused:
         bench.launch(bench.gang(**changes))
     assert "\n" not in str(refused.value) and not isinstance(refused.value, NotYet)
     assert not bench.cluster.run("squeue", "-h")
 
 
-def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: SlurmBench) -> None:
+def test_the_script_has_the_options_of_the_queue_and_of_the_job(bench: SlurmBench) -> None:
     options = {"partition": "urgent", "qos": "high", "gpu": "a100", "nice": "100", "hosts": "x"}
     gang = bench.gang(
         nodes=2, gpus=2, options=options, timeout=3600, priority=30, title='my "job" é', bus="tcp/1", bus_token="secret"
@@ -271,7 +273,7 @@ def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: SlurmBench) -
     )
 
 
-def test_the_script_that_slurm_has_is_that_of_the_plan(bench: SlurmBench) -> None:
+def test_slurm_gets_the_script_of_the_plan(bench: SlurmBench) -> None:
     gang = bench.gang(nodes=2, bus="tcp/127.0.0.1:1", bus_token="the credential")
     plan = bench.engine.plan(gang)
     handle = bench.ready(gang)
@@ -281,7 +283,7 @@ def test_the_script_that_slurm_has_is_that_of_the_plan(bench: SlurmBench) -> Non
     assert plan.document == plan.request.script.replace("the credential", "\\u2026"), "all of it but the credential"
 
 
-def test_a_gang_is_asked_to_leave_and_then_made_to(bench: SlurmBench) -> None:
+def test_a_gang_gets_sigterm_and_after_the_grace_sigkill(bench: SlurmBench) -> None:
     polite = bench.ready(bench.gang(POLITE, 3))
     assert bench.stopped(polite, 30.0) == [75, 75, 75]
     assert bench.log().count("saved") >= 3  # Slurm signals every process of a step, and the supervisor its rank
@@ -299,7 +301,7 @@ def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: SlurmBench
         assert not bench.processes() and not any(n.running for n in bench.engine.observe(handle))
 
 
-def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: SlurmBench) -> None:
+def test_a_directory_missing_on_a_node_is_one_line_with_the_node_s_name(bench: SlurmBench) -> None:
     nowhere = bench.launch(bench.gang(nodes=2, directory="/no/such/place"))
     # what a node with another disk at the store's path finds: no such epoch
     other = bench.start(bench.gang(nodes=1, epoch=2, suffix="2"))
@@ -311,7 +313,7 @@ def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: SlurmBench) 
     assert " is not the controller's: run run has epoch 1 there, not 2" in node.words
 
 
-def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
+def test_a_first_node_that_lacks_this_python_or_the_store_is_reported_in_one_line(
     bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
@@ -349,7 +351,7 @@ def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
         ("CONFIGURING", "None", "Slurm: n1 is being made ready (job 5)"),
     ],
 )
-def test_what_slurm_says_of_a_job_that_waits_is_said_in_words(state: str, reason: str, words: str) -> None:
+def test_slurm_s_reason_for_a_waiting_job_is_put_into_words(state: str, reason: str, words: str) -> None:
     assert waiting(SlurmJob("5", state, reason, "n1", "")).startswith(words)
 
 
@@ -368,7 +370,7 @@ def test_what_slurm_says_of_a_job_that_waits_is_said_in_words(state: str, reason
         ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
     ],
 )
-def test_how_slurm_ended_a_job_is_the_end_of_a_node_that_left_no_outcome(
+def test_a_node_without_an_outcome_ends_as_slurm_ended_its_job(
     state: str, cause: Cause | None, code: int, words: str
 ) -> None:
     assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (cause, code, words)

@@ -258,7 +258,7 @@ def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server
     stopped = shared_server.muster("stop", "greeter")
     assert stopped.returncode == 0 and "ended: stopped by the user" in stopped.stdout
     run = shared_server.detail(submitted["jobId"])["run"]
-    assert f"go on with: muster resume {run}\n" in stopped.stdout
+    assert f"continue with: muster resume {run}\n" in stopped.stdout
     refused(["resume", "greeter"], shared_server.home, 2, f"greeter is a job, not a run; its run is {run}")
     assert json.loads(shared_server.muster("show", "greeter", "--json").stdout)["status"] == "FAILED"
     assert "FAILED already" in shared_server.muster("stop", "greeter").stdout

@@ -32,6 +32,7 @@ from orchestrator.engines.api import (
     NodeStatus,
     NotYet,
     Plan,
+    Traits,
     Transient,
     read_handle,
 )
@@ -56,7 +57,7 @@ def gang(directory: Path, name: str = "job", host: str = HOST, script: str = "ex
 class Fake:
     """An engine whose calls do what a test wants, and note on which thread they did."""
 
-    name, elastic, images, address = "engine", False, False, None
+    name, traits, address = "engine", Traits(), None
 
     def __init__(self) -> None:
         self.free, self.threads, self.closed = threading.Event(), set[str](), 0
@@ -155,7 +156,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
         wait_for(lambda: not says(), 10, "that it answers again")
         launched(several, gang(tmp_path, "other"))
     assert [record.getMessage() for record in caplog.records] == [said, "the engine engine answers again"]
-    assert fake.threads == {"MainThread", "engine engine"}, "the first look at its hosts comes before the thread"
+    assert fake.threads == {"engine engine"}, "the constructor's thread calls no engine"
     assert fake.closed == 1
 
 

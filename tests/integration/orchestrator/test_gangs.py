@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from orchestrator.api.batch import rules
+from orchestrator.api.native import continuing
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from orchestrator.domain.gang import GangSpec, gang_needs
@@ -22,6 +23,8 @@ from orchestrator.engines.api import EngineError
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
 from orchestrator.server import Server
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.model import validate
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
 from tests.support.orchestrator.jobs import await_status, detail
 from tests.support.processes import parent, processes_of, processes_of_job
@@ -265,17 +268,21 @@ def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
     assert processes_of(tmp_path) == []
 
 
-def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: list[int] = []
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of nodes of each document that is read for its gang, in order."""
+    found: list[int] = []
 
     def counting(node_properties: Mapping[str, Any]) -> GangSpec:
-        read.append(node_properties["numNodes"])
+        found.append(node_properties["numNodes"])
         return gang_needs(node_properties)
 
-    for module in (rules, gangs):
+    for module in (rules, gangs, continuing):
         monkeypatch.setattr(module, "gang_needs", counting)
+    return found
+
+
+def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(tmp_path: Path, read: list[int]) -> None:
     server = Server(tmp_path, port=0, cpus=2)
     server.start()
     try:
@@ -286,3 +293,24 @@ def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(
     finally:
         server.close()
     assert read == [2, 2], "when the definition is registered, and when the job is submitted with its overrides"
+
+
+def test_a_job_that_resumes_a_run_is_read_once_for_its_definition_and_once_with_its_overrides(
+    tmp_path: Path, read: list[int]
+) -> None:
+    spec = validate({"name": "say", "command": ["echo", "here"], "resources": {"cpus": 0.1, "memory": 64}}, "job.yaml")
+    server = Server(tmp_path, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+            registered = client.batch("RegisterJobDefinition", **compile_definition(spec, str(tmp_path)))
+            submitted = client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"]))
+            run = await_status(client, submitted["jobId"], "SUCCEEDED")["run"]
+            read.clear()
+            resumed = client.post(f"/api/runs/{run}/resume", {})["jobId"]
+            await_status(client, resumed, "SUCCEEDED")
+            client.batch("DescribeJobs", jobs=[resumed, f"{resumed}#0"])
+            client.batch("ListJobs", multiNodeJobId=resumed, jobStatus="SUCCEEDED")
+    finally:
+        server.close()
+    assert read == [1, 1]

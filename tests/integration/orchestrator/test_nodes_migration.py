@@ -1,4 +1,6 @@
-"""Databases whose attempts had their nodes as JSON (schema 0008), brought up to date: nothing is lost, and their jobs go on.
+"""Databases of schema 0008, brought up to date: nothing is lost, and their jobs continue.
+
+Since then the nodes of attempts, then JSON, have become rows, and two columns say that they hold compute environments.
 
 ``schema_0008.sql`` was written by the version that had that schema: its controller had run jobs into every state when it was
 killed. The row of job ``submitted`` is a copy of that of ``runnable``, and ``starting`` lacks the handle of its gang, as where the
@@ -16,7 +18,7 @@ from sqlalchemy import create_engine, select, text
 
 from orchestrator.client import Client
 from orchestrator.domain.hosts import Placement
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from shared_store.epoch import Claim, take_epoch
@@ -78,6 +80,24 @@ def test_every_node_is_a_row_that_says_what_the_json_said_and_back_again(old: st
     assert nodes_as_json(old) == told
 
 
+def test_queues_keep_their_compute_environments_in_order_and_back_again(old: str) -> None:
+    engine = create_engine(old)
+    with engine.begin() as connection:
+        row = "'lab', 'ENABLED', 5, '[\"b\", \"a\"]', '[]', :no, '{}', 7"
+        columns = "name, state, priority, environments, limits, deleting, tags, created_at"
+        connection.execute(text(f"INSERT INTO job_queues ({columns}) VALUES ({row})"), {"no": False})
+    database = Database(old)
+    with database.session() as session:
+        queues = {queue.name: queue.compute_environments for queue in session.scalars(select(JobQueue))}
+        assert queues == {"default": ["local"], "lab": ["b", "a"]}
+    database.close()
+    migrate(old, "downgrade", "0010")
+    with engine.connect() as connection:
+        rows = connection.execute(text("SELECT name, CAST(environments AS VARCHAR) FROM job_queues")).all()
+    engine.dispose()
+    assert {name: json.loads(names) for name, names in rows} == queues
+
+
 @pytest.mark.parametrize(
     "damaged",
     [
@@ -113,7 +133,7 @@ def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old:
     database.close()
 
 
-def test_jobs_in_every_state_go_on_where_the_older_controller_left_them(old: str, tmp_path: Path) -> None:
+def test_jobs_in_every_state_continue_where_the_older_controller_left_them(old: str, tmp_path: Path) -> None:
     (tmp_path / "home").mkdir(mode=0o700)
     store = Store(tmp_path / "home" / "store").open()
     before = nodes_as_json(old)

@@ -1,4 +1,4 @@
-"""A run's worlds are the same whatever ranks there are: dealt out again at a resume, and at a restart with more room."""
+"""A run's worlds are the same on any number of ranks: distributed anew at a resume, and at a restart with more room."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_resume_on_more_ranks_than_worlds_is_refused(
 ) -> None:
     tiny = ["--nodes", "30", "--set", "resources.cpus=0.1", "--set", "train.iterations=9"]
     done = server.muster("resume", resized[0], *tiny)
-    assert done.returncode == 2 and "21 worlds can't be dealt out to 30 ranks; use fewer nodes" in done.stderr
+    assert done.returncode == 2 and "21 worlds can't be distributed over 30 ranks; use fewer nodes" in done.stderr
 
 
 def test_the_worlds_are_known_without_a_readable_checkpoint(

@@ -1,4 +1,4 @@
-"""What a run can't go on with is refused with one line that says what differs, before a process starts where that is possible."""
+"""A change with which a run can't continue is refused with one line that names the difference, before a process starts where possible."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
         ("train.ppo.activation=relu", ["train.ppo.activation is not set and can't become 'relu'"]),
         ("train.ppo.init_std=0.5", ["train.ppo.init_std is not set and can't become 0.5", "has learnt"]),
         ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 node × 1 rank × 9)", "leave train.worlds"]),
-        ("nodes=9", ["8 worlds can't be dealt out to 9 ranks; use fewer nodes"]),
+        ("nodes=9", ["8 worlds can't be distributed over 9 ranks; use fewer nodes"]),
     ],
 )
 def test_another_task_seed_network_or_number_of_worlds(

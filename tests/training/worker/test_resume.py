@@ -1,4 +1,4 @@
-"""Every task goes on bit for bit: in a fresh process, and with its worlds dealt out to another number of ranks."""
+"""Every task continues bit for bit: in a fresh process, and with its worlds distributed over another number of ranks."""
 
 from __future__ import annotations
 

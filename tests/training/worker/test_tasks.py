@@ -1,4 +1,4 @@
-"""Tasks on the CPU: rewards and resets by hand, exact resume, the same worlds however they are dealt out."""
+"""Tasks on the CPU: rewards and resets by hand, exact resume, the same worlds on any number of ranks."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def test_metrics_are_compared_but_not_times(store: Path, capsys: pytest.CaptureF
 def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
     store: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The worlds of one rank, dealt out to two by hand."""
+    """The worlds of one rank, split over two by hand."""
     checkpoint = list_checkpoints(run(store, "twin"))[-1]
     content = torch.load(checkpoint.path / "rank-0.pt", weights_only=True)
     for rank, (first, last) in enumerate(((0, 3), (3, 8))):

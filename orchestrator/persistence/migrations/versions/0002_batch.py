@@ -39,7 +39,7 @@ def _attempt_columns() -> tuple[sa.Column[Any], ...]:
 
 
 def _named(*columns: sa.Column[Any]) -> tuple[sa.Column[Any], ...]:
-    """What queues, compute environments and policies have in common, around ``columns``."""
+    """The columns shared by queues, compute environments and policies, around ``columns``."""
     return (
         sa.Column("name", sa.String(), primary_key=True),
         *columns,

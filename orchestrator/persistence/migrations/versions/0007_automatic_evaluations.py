@@ -1,4 +1,4 @@
-"""What is known of the checkpoints of trainings that are evaluated automatically."""
+"""A table of the progress of trainings' automatic evaluations."""
 
 import sqlalchemy as sa
 from alembic import op

@@ -30,3 +30,9 @@ def test_each_node_has_its_own_number_of_ranks_and_one_where_none_is_said() -> N
 def test_a_number_of_ranks_that_is_none_is_refused(value: str) -> None:
     with pytest.raises(MalformedOptions, match=f"MUSTER_RANKS_PER_NODE is '{value}'"):
         gang_needs(properties("1", value))
+
+
+def test_a_node_keeps_the_name_of_the_container_in_its_ecs_properties() -> None:
+    given = properties(None, None)
+    given["nodeRangeProperties"][1]["ecs"] = "main"
+    assert [node.ecs for node in gang_needs(given).nodes] == [None, "main"]

@@ -10,7 +10,7 @@ from orchestrator.engines.toolkit import backoff as module
 from orchestrator.engines.toolkit.backoff import Backoff
 
 
-def test_what_is_not_tried_any_more_is_forgotten_and_what_still_waits_is_not() -> None:
+def test_an_action_that_is_not_tried_any_more_is_forgotten_and_a_waiting_one_is_kept() -> None:
     backoff = Backoff(logging.getLogger("test"), first=0.0)
     backoff.failed(("start", "over"), "can't start")
     waiting = Backoff(logging.getLogger("test"), first=60.0)
@@ -20,7 +20,7 @@ def test_what_is_not_tried_any_more_is_forgotten_and_what_still_waits_is_not() -
     assert not backoff and waiting.said(("start", "waits")) == "can't start"
 
 
-def test_what_fails_at_every_other_try_is_logged_once_and_waits_longer_and_longer(
+def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer_each_time(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     moment = 0.0

@@ -1,4 +1,4 @@
-"""How an engine answers, as a person sees it: well, with an error that is tried again, or not at all."""
+"""An engine's health as a person sees it: it answers, it fails and is tried again, or it does not answer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def served() -> Iterator[tuple[FakeEngine, Runner]]:
     asked.close()
 
 
-def test_an_engine_that_told_its_hosts_says_when(served: tuple[FakeEngine, Runner]) -> None:
+def test_an_engine_s_health_has_the_time_of_its_last_answer(served: tuple[FakeEngine, Runner]) -> None:
     health = served[1].health
     assert health.told_at is not None and time.time() * 1000 - 60_000 < health.told_at <= time.time() * 1000
     assert (health.problem, health.failing, health.retry) == (None, 0, None)

@@ -43,7 +43,7 @@ def test_a_node_that_runs_has_no_end(fields: dict[str, Any]) -> None:
         (None, Cause.HOST_LOST),
     ],
 )
-def test_an_exit_code_says_what_ended_a_process_of_the_local_engine(code: int | None, cause: Cause) -> None:
+def test_an_exit_code_gives_the_cause_of_a_local_process_s_end(code: int | None, cause: Cause) -> None:
     node = ended("127.64.0.1", code, "words")
     assert (node.phase, node.cause, node.exit_code, node.words) == (ENDED, cause, code, "words")
 
@@ -58,7 +58,9 @@ def test_an_exit_code_says_what_ended_a_process_of_the_local_engine(code: int | 
         ({"ExitCode": 137, "OOMKilled": True}, Cause.OUT_OF_MEMORY, OUT_OF_MEMORY),
     ],
 )
-def test_docker_s_state_of_a_container_says_what_ended_it(state: dict[str, Any], cause: Cause, words: str) -> None:
+def test_docker_s_state_of_a_container_gives_the_cause_of_its_end(
+    state: dict[str, Any], cause: Cause, words: str
+) -> None:
     pytest.importorskip("docker")
     from orchestrator.engines.docker.engine import _ended
 
@@ -80,7 +82,7 @@ def test_docker_s_state_of_a_container_says_what_ended_it(state: dict[str, Any],
         ({"running": False, "detail": "early", "cause": "stopped"}, "stopped", "", (ENDED, Cause.STOPPED, "early")),
     ],
 )
-def test_what_ray_s_driver_says_of_a_node_is_its_phase(
+def test_a_report_of_ray_s_driver_becomes_the_node_s_phase(
     node: dict[str, Any], phase: str, why: str, seen: tuple[Any, ...]
 ) -> None:
     told = {"running": True, "address": "10.0.0.1", "code": None, "detail": "", "started": True, "gpus": "0,1", **node}
@@ -121,14 +123,14 @@ def test_a_job_in_slurm_s_queue_is_queued_until_its_nodes_are_made_ready(state: 
         (None, MEETING, (ENDED, None, None)),
     ],
 )
-def test_slurm_s_job_and_what_srun_says_are_a_node_s_phase(
+def test_slurm_s_job_and_srun_s_output_become_the_node_s_phase(
     found: SlurmJob | None, output: str, seen: tuple[Any, ...]
 ) -> None:
     node = slurm_node({"main": 0, "output": "/store/slurm.out"}, found, output, 0, None)
     assert (node.phase, node.cause, node.exit_code) == seen
 
 
-def test_on_slurm_an_outcome_says_more_than_the_job() -> None:
+def test_on_slurm_an_outcome_takes_precedence_over_the_job_s_state() -> None:
     outcome = Outcome(0, 1, 75, None, "left on request", None, 1.0, 1.0)
     node = slurm_node({"main": 0, "output": ""}, job("CANCELLED"), MEETING, 0, outcome)
     assert (node.phase, node.cause, node.exit_code, node.address) == (ENDED, Cause.EXIT, 75, "10.0.0.1")
@@ -146,7 +148,9 @@ def test_on_slurm_an_outcome_says_more_than_the_job() -> None:
         (None, "CannotPullContainerError: no such image", None),
     ],
 )
-def test_aws_s_exit_code_and_reason_say_what_ended_a_node(code: int | None, reason: str, cause: Cause | None) -> None:
+def test_aws_s_exit_code_and_reason_give_the_cause_of_a_node_s_end(
+    code: int | None, reason: str, cause: Cause | None
+) -> None:
     pytest.importorskip("boto3")
     from orchestrator.engines.aws_batch.engine import _ended
 

@@ -1,11 +1,11 @@
-"""What ``--dry-run`` shows of a gang on Ray: the placement group that is asked for, pins and all."""
+"""The output of ``--dry-run`` for a gang on Ray: the requested placement group with its pins."""
 
 from __future__ import annotations
 
 from orchestrator.engines.ray.bundles import in_words
 
 
-def test_the_placement_group_is_shown_as_it_is_asked_for() -> None:
+def test_the_plan_shows_the_requested_placement_group() -> None:
     node = {"cpus": 1.5, "gpus": 1, "memory": 256, "host": "ray/n1", "pin": "abc"}
     new = {"cpus": 1.0, "gpus": 0, "memory": 64, "host": "ray/+1", "pin": None}
     assert in_words({"main": 0, "nodes": [node, new]}) == (

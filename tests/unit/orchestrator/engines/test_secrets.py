@@ -1,4 +1,4 @@
-"""Where the secrets of jobs come from, and what is said where they can't be given."""
+"""Sources of jobs' secrets, and the message where one can't be supplied."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_variables_leave_the_controllers_environment() -> None:
         (f"{MANAGER}db:a::", "has no key 'a'"),
     ],
 )
-def test_what_is_missing_is_named_without_a_value(file: Path, value_from: str, message: str) -> None:
+def test_a_missing_secret_is_named_without_a_value(file: Path, value_from: str, message: str) -> None:
     with pytest.raises(SecretsError) as caught:
         Secrets(str(file)).of(asking(value_from), "default")
     assert message in str(caught.value) and "hunter2" not in str(caught.value) and "\n" not in str(caught.value)

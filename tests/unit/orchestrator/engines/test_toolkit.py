@@ -1,4 +1,4 @@
-"""What engines share: the environment of what they start, waiting with an end, and outcomes and logs in a supervisor's place."""
+"""The toolkit of engines: the environment of started processes, waiting with an end, and outcomes and logs in a supervisor's place."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shared_store.layout import Store
 from shared_store.log_files import LIMIT, LogWriter
 
 
-def test_what_is_started_inherits_all_but_the_controller_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_started_process_inherits_all_variables_but_the_controller_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "os.environ", {name: "secret" for name in PRIVATE} | {"HOME": "/root", "PGHOST": "db", "A": "1"}
     )

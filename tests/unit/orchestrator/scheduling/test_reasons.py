@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.fit import fit
 from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue
 from tests.support.orchestrator.scheduling import (
     compute_environment,
@@ -49,6 +52,25 @@ def test_without_any_host_the_job_says_so() -> None:
         "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 1 CPU, 0 GPUs, 100 MiB; "
         "the largest host has nothing: there is no host"
     )
+
+
+def test_while_an_engine_has_not_told_its_hosts_its_jobs_wait_and_say_so() -> None:
+    silent = replace(compute_environment("silent", hosts=()), unknown="the ray engine has not answered yet")
+    there = compute_environment("there")
+    queues = [
+        queue("silent", compute_environments=("silent",)),
+        queue("both", compute_environments=("silent", "there")),
+    ]
+    waiting = line(job("ant", queue="silent"), job("cart", queue="both"), job("huge", gang(node(64)), queue="both"))
+    decisions = decide(snapshot([host(cpus=4)], waiting, queues=queues, compute_environments=[silent, there]))
+    assert started(decisions) == "cart:a", "in a compute environment that is known"
+    assert reason(decisions, "ant") == (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 1 CPU, 0 GPUs, 100 MiB in all; "
+        "the ray engine has not answered yet"
+    )
+    assert reason(decisions, "huge").endswith("the ray engine has not answered yet"), "it may have that much"
+    asked = fit(gang(node(64)), queues[1], {"silent": silent, "there": there}, [host(cpus=4)])
+    assert (asked.allocation, asked.problem) == (None, None), "it is not refused"
 
 
 def test_a_job_with_more_cpus_than_any_compute_environment_may_use_says_so_and_holds_up_nobody() -> None:

@@ -209,7 +209,7 @@ def test_a_key_of_the_run_s_history_is_refused_by_name_and_leads_to_a_clone(key:
 
 def test_a_job_does_not_become_one_of_another_kind() -> None:
     before, after = changed("train")[0], changed("command")[0]
-    with pytest.raises(ClientError, match="run ant is a train job; it can't go on as command"):
+    with pytest.raises(ClientError, match="run ant is a train job; it can't continue as command"):
         _check_changes(RUN, before, after)
 
 
@@ -303,7 +303,7 @@ def test_a_learning_rate_that_would_have_no_effect_is_refused_in_whatever_form_i
     with pytest.raises(ClientError) as refused:
         _check_rate(RUN, chosen, after, [form])
     assert str(refused.value).startswith(
-        f"run ant: train.{name}.{key} is 0.001 already, so that the run would go on with the rate of its checkpoint, "
+        f"run ant: train.{name}.{key} is 0.001 already, so that the run would continue with the rate of its checkpoint, "
         "which is 0.0004 now; set another value"
     )
     _check_rate(RUN, chosen, after, ["train.iterations=9"])

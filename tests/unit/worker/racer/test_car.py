@@ -85,7 +85,7 @@ def turned(angle: np.ndarray) -> np.ndarray:
     return np.abs((angle + math.pi) % (2 * math.pi) - math.pi)
 
 
-def test_points_are_projected_as_the_tracks_geometry_projects_them() -> None:
+def test_projected_points_agree_with_the_tracks_geometry() -> None:
     random = np.random.default_rng(5)
     count = 600
     which = random.integers(0, len(TRACKS), count)
@@ -117,7 +117,7 @@ def test_points_are_projected_as_the_tracks_geometry_projects_them() -> None:
     assert 0.2 < rows["on_road"].mean() < 0.95  # both kinds were there
 
 
-def test_places_and_ways_are_those_of_the_tracks_geometry() -> None:
+def test_places_and_distances_agree_with_the_tracks_geometry() -> None:
     random = np.random.default_rng(6)
     count = 300
     which = random.integers(0, len(TRACKS), count)
@@ -138,7 +138,7 @@ def test_places_and_ways_are_those_of_the_tracks_geometry() -> None:
         np.testing.assert_allclose(moved.numpy()[mine], advance(track, along[mine], other[mine]), atol=1e-4)
 
 
-def test_the_window_of_the_search_is_as_long_as_it_says() -> None:
+def test_the_search_window_covers_its_reach_and_no_more() -> None:
     for track in TRACKS:
         window = road.window_of(track)
         lengths = [np.roll(track.steps, -row)[:window].sum() for row in range(len(track.steps))]
@@ -149,7 +149,7 @@ def test_the_window_of_the_search_is_as_long_as_it_says() -> None:
         )
 
 
-def test_what_is_close_to_the_centre_line_is_on_the_road() -> None:
+def test_a_point_close_to_the_centre_line_is_on_the_road() -> None:
     random = np.random.default_rng(7)
     for track in TRACKS:
         clear = road.clear_of(track)
@@ -200,7 +200,7 @@ def test_without_lag_the_car_drives_the_circle_of_its_steering_at_once() -> None
     assert (x, y) == pytest.approx((radius * math.sin(heading), radius * (1 - math.cos(heading))), abs=1e-4)
 
 
-def test_rectangles_touch_where_a_line_through_both_says_so() -> None:
+def test_rectangles_touch_exactly_where_they_overlap() -> None:
     first = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, math.pi / 4], [0, 0, 0]], np.float32)
     # beside it by a hair; a hair too far; corner to corner, turned; a turned corner that reaches; far
     second = np.array([[0.339, 0, 0], [0.341, 0, 0], [0.33, 0.24, 0], [0.3, 0, 0], [3, 0, 1]], np.float32)

@@ -1,4 +1,4 @@
-"""Where a car is on its track, against circles and ovals that are worked out by hand."""
+"""The place of a car on its track, compared with circles and ovals computed by hand."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_between_two_waypoints_the_width_changes_evenly() -> None:
     np.testing.assert_allclose(found.width, [math.sqrt(2) + 0.25 * (1.25 - math.sqrt(2)), 1.0])
 
 
-def test_driven_backwards_left_progress_and_waypoints_turn_round() -> None:
+def test_driving_backwards_reverses_left_progress_and_waypoints() -> None:
     found = project(square(), [[1.2, 0.3], [4.25, 2.6]], backwards=True)
     assert list(found.left) == [False, True]
     np.testing.assert_allclose(found.along, [14.8, 9.4])
@@ -80,7 +80,7 @@ def test_driven_backwards_left_progress_and_waypoints_turn_round() -> None:
     assert list(mixed.left) == [True, False] and list(mixed.before) == [2, 3]
 
 
-def test_at_a_waypoint_the_driver_has_it_behind() -> None:
+def test_a_waypoint_that_the_car_has_reached_counts_as_the_one_behind() -> None:
     track = square()
     forth, back = project(track, track.center), project(track, track.center, backwards=True)
     rows = np.arange(32)
@@ -90,7 +90,7 @@ def test_at_a_waypoint_the_driver_has_it_behind() -> None:
     assert not forth.left.any() and not back.left.any(), "on the line is not to the left of it"
 
 
-def test_behind_the_outside_of_a_corner_the_corner_is_nearest() -> None:
+def test_the_corner_is_the_nearest_point_for_a_car_outside_it() -> None:
     found = project(square(), [[4.3, -0.4]])
     np.testing.assert_allclose(found.point, [[4, 0]])
     assert found.distance[0] == pytest.approx(0.5) and not found.left[0]
@@ -144,12 +144,12 @@ def test_a_place_along_the_track_projects_to_itself_in_both_directions() -> None
     np.testing.assert_allclose(behind, place_at(track, [track.length - 1.0])[0])
 
 
-def test_a_car_that_crosses_the_start_line_has_come_on() -> None:
+def test_crossing_the_start_line_counts_as_progress() -> None:
     track = square()
     np.testing.assert_allclose(advance(track, [15.9, 0.2, 3.0, 5.0], [0.2, 15.9, 3.5, 4.0]), [0.3, -0.3, 0.5, -1.0])
 
 
-def test_many_points_at_once_are_seen_as_each_by_itself() -> None:
+def test_many_points_at_once_give_the_same_results_as_one() -> None:
     track = make_preset("oval", spacing=0.02)  # 1,000 waypoints: three blocks
     points = np.random.default_rng(1).uniform(-4, 4, (2500, 2))
     whole, one = project(track, points), project(track, points[2345])

@@ -125,13 +125,13 @@ def test_a_hyperparameter_that_is_also_a_setting_is_refused() -> None:
     assert spec.train.given() == {"clip": 0.1, "learning_rate": 1e-4, "schedule": "fixed"}
 
 
-def test_tasks_and_algorithms_that_know_none_refuse_them() -> None:
+def test_tasks_and_algorithms_without_hyperparameters_refuse_them() -> None:
     assert refused({"lr": 1e-4}, "Ant") == ": AntConfig has none; settings of PPO stand under train.ppo"
     assert refused({"lr": 1e-4}, "mine:Task").startswith(": task 'mine:Task' is not installed, so they are not known")
     assert refused({"lr": 1e-4}, algorithm="rsl_rl").startswith(": they are settings of ppo and sac")
 
 
-def test_a_file_of_them_is_read_at_the_submission_and_is_not_needed_again(tmp_path: Path) -> None:
+def test_a_file_of_hyperparameters_is_read_at_the_submission_and_not_needed_again(tmp_path: Path) -> None:
     file, yaml = tmp_path / "hyperparameters.json", tmp_path / "racer.yaml"
     file.write_text(json.dumps({"lr": "0.0002", "loss_type": "mean_squared_error"}))
     yaml.write_text(f"name: racer\ntrain:\n  task: Racer\n  worlds: 8\n  iterations: 1\n  hyperparameters: {file}\n")
@@ -153,5 +153,5 @@ def test_a_file_of_them_is_read_at_the_submission_and_is_not_needed_again(tmp_pa
         assert words in str(found.value) and "\n" not in str(found.value)
 
 
-def test_editors_know_the_key() -> None:
+def test_the_schema_for_editors_has_the_key() -> None:
     assert "hyperparameters" in schema()["$defs"]["Train"]["properties"]

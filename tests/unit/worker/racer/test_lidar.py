@@ -61,7 +61,7 @@ def racer(lidar: LidarConfig, worlds: int = 16) -> Racer:
     return Racer(config, worlds, seed=5)
 
 
-def test_every_sector_sees_the_nearest_obstacle_as_numpy_works_it_out() -> None:
+def test_every_sector_sees_the_nearest_obstacle_that_numpy_computes() -> None:
     lidar = LidarConfig(sectors=6, rays=3, range=2.0, field=2.5)
     task = racer(lidar)
     distances = expected(task, lidar)
@@ -69,7 +69,7 @@ def test_every_sector_sees_the_nearest_obstacle_as_numpy_works_it_out() -> None:
     np.testing.assert_allclose(seen(task), np.clip(distances, 0.15, 2.0), atol=1e-4)
 
 
-def test_levels_tell_in_which_part_of_the_range_the_nearest_obstacle_is() -> None:
+def test_levels_mark_the_part_of_the_range_that_holds_the_nearest_obstacle() -> None:
     lidar = LidarConfig(sectors=16, rays=1, levels=3, least=0.2, range=1.4)
     task = racer(lidar)
     distances = expected(task, lidar)
@@ -80,7 +80,7 @@ def test_levels_tell_in_which_part_of_the_range_the_nearest_obstacle_is() -> Non
 
 
 @pytest.mark.parametrize(("sensor", "size"), [("LIDAR", 64), ("SECTOR_LIDAR", 8), ("DISCRETIZED_SECTOR_LIDAR", 64)])
-def test_a_lidar_of_deepracers_sensors_is_one(sensor: str, size: int) -> None:
+def test_a_lidar_among_deepracer_s_sensors_becomes_the_task_s_lidar(sensor: str, size: int) -> None:
     space = {"action_space": FIVE, "sensor": ["FRONT_FACING_CAMERA", sensor]}
     config = RacerPixelsAndStateConfig(action_space=space)
     lidar = config.lidar_of(config.actions())
@@ -120,7 +120,7 @@ def test_a_lidar_of_deepracers_sensors_is_one(sensor: str, size: int) -> None:
         ),
     ],
 )
-def test_a_lidar_that_can_not_be_is_refused_in_one_line(task: str, config: dict[str, Any], words: str) -> None:
+def test_an_impossible_lidar_is_refused_in_one_line(task: str, config: dict[str, Any], words: str) -> None:
     with pytest.raises(SpecError) as found:
         validate({"name": "x", "train": {"task": task, "worlds": 1, "iterations": 1, "config": config}}, "x.yaml")
     assert str(found.value).startswith(f"x.yaml: train.config.{words}") and "\n" not in str(found.value)

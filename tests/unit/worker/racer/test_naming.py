@@ -1,4 +1,4 @@
-"""What a job calls a track, and its picture."""
+"""Names of tracks in jobs, and pictures of tracks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_name_that_means_nothing_is_refused_with_the_nearest_one(store: Store,
     assert words in str(told.value) and "\n" not in str(told.value)
 
 
-def test_a_track_is_not_called_as_a_preset_is(store: Store) -> None:
+def test_a_track_can_not_have_the_name_of_a_preset(store: Store) -> None:
     with pytest.raises(BadTrack, match="track oval: a preset is called so; choose another name"):
         keep(store, make_random(1, "oval"), {})
 

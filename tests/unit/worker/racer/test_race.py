@@ -86,7 +86,7 @@ def test_a_trial_ends_with_its_first_mishap_where_no_car_is_put_back() -> None:
     assert [told[name] for name in ("total_time", "best_lap", "average_lap")] == [None] * 3
 
 
-def test_penalties_are_part_of_a_lap_s_time_and_not_of_its_lap_time() -> None:
+def test_penalties_count_in_a_trial_s_time_but_not_in_its_lap_time() -> None:
     _, _, race = drive(gain=0.0, learns=True, trials=1, continuous=True, off_track_penalty=2.5)
     (trial,) = race.summary()["trials"]
     assert (trial["status"], trial["off_tracks"], trial["resets"]) == ("lap_complete", 1, 1)
@@ -169,7 +169,7 @@ def test_a_choice_is_identified_by_its_number(tmp_path: Path) -> None:
     assert last[SIM_TRACE_COLUMNS.index("episode_status")] == "time_up"
 
 
-def test_laps_are_dealt_the_tracks_in_turn_and_the_table_has_what_the_summary_has(tmp_path: Path) -> None:
+def test_trials_use_the_tracks_in_turn_and_the_table_agrees_with_the_summary(tmp_path: Path) -> None:
     task, played, race = drive(trials=3, track=["oval", "chicane"], seconds=10.0)
     assert [trial.track for trial in race.trials] == ["oval", "chicane", "oval"]
     assert race.summary()["track"] == ["oval", "chicane"]

@@ -66,7 +66,7 @@ def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
     assert task.ended.terms[:, task.ended.columns.index("metric_progress")].tolist() == [100.0, 100.0]
 
 
-def test_what_is_known_of_a_car_is_what_the_tracks_geometry_says() -> None:
+def test_the_state_of_a_car_agrees_with_the_track_s_geometry() -> None:
     task = racer(32, track=("oval", "random:4"), start="random", start_sideways=(-0.4, 0.4), alternate_direction=True)
     random = torch.Generator().manual_seed(4)
     for step in range(120):
@@ -178,7 +178,7 @@ def test_controls_arrive_as_late_as_the_latency_says() -> None:
     assert set(arrived.tolist()) == {0, 1, 2, 3}
 
 
-def test_factors_say_how_the_car_obeys() -> None:
+def test_factors_and_offsets_change_the_car_s_response() -> None:
     fields = {"speed_factor": (0.5, 0.6), "steering_factor": (1.2, 1.4), "steering_offset": (0.1, 0.2)}
     task = racer(64, track="oval", speed_lag=0.0, steering_lag=0.0, **fields)
     task.step(torch.tensor([[0.5, 1.0]] * 64))
@@ -313,7 +313,7 @@ def test_a_track_of_the_store_is_found_by_the_ranks_of_a_job(tmp_path: Any, monk
     assert [track.digest for track in circuit.tracks] == [OVAL.digest, hills.digest]
 
 
-def test_a_metadata_file_says_what_its_content_says(tmp_path: Any) -> None:
+def test_a_metadata_file_is_equal_to_its_content_in_the_configuration(tmp_path: Any) -> None:
     import json
 
     file = tmp_path / "model_metadata.json"

@@ -167,7 +167,7 @@ def test_worlds_that_were_put_back_go_on_bit_for_bit_from_their_state() -> None:
     assert (known(first, "counts") == known(second, "counts")).all()
 
 
-def test_without_it_a_mishap_ends_the_episode_and_is_counted_as_one() -> None:
+def test_without_resets_a_mishap_ends_the_episode_and_is_counted_once() -> None:
     task = racer(track="oval", trace=True)
     while not task.dones[0]:
         task.step(straight(task))

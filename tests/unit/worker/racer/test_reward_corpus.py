@@ -53,7 +53,7 @@ def filled(drawn: list[dict[str, Any]]) -> Any:
 
 @pytest.fixture(scope="module")
 def rewarded() -> tuple[list[dict[str, Any]], dict[str, tuple[np.ndarray, dict[str, Failure]]]]:
-    """What was tried, and the rewards and errors of every function that compiles; all in one module of Warp."""
+    """The inputs, and the rewards and errors of every function that compiles; all in one module of Warp."""
     drawn = tried()
     names = [name for name in CORPUS if name not in OUTSIDE]
     found = kernels([warp_function(translate(CORPUS[name]).snippet) for name in names], "corpus")

@@ -244,7 +244,7 @@ def test_a_check_and_a_translation_import_neither_torch_nor_warp() -> None:
     assert not {"torch", "warp", "numpy", "newton"} & set(loaded)
 
 
-def test_a_change_is_named_and_nan_is_none() -> None:
+def test_a_changed_parameter_is_named_and_nan_counts_as_unchanged() -> None:
     nan = float("nan")
     assert confined.changed({"a": [nan, (1, 2)]}, {"a": [nan, (1, 2)]}) == ""
     assert confined.changed({"a": [1, (1, 2)]}, {"a": [1, (1, 3)]}) == "params['a'][1][1]"

@@ -63,7 +63,7 @@ def driven() -> Racer:
     )
 
 
-def test_a_function_is_told_what_the_tracks_geometry_says(driven: Racer) -> None:
+def test_a_function_s_parameters_agree_with_the_track_s_geometry(driven: Racer) -> None:
     random, seen = torch.Generator().manual_seed(4), dict.fromkeys(("reversed", "off", "crashed", "left"), 0)
     for step in range(60):
         poses, tracks, backwards = (known(driven, name) for name in ("poses", "tracks", "backwards"))
@@ -150,7 +150,7 @@ def test_an_object_is_in_the_camera_where_a_corner_of_it_is_in_the_image(
     assert told(task, 0)["object_in_camera"] is sees
 
 
-def test_compiled_and_called_a_function_earns_the_same(driven: Racer) -> None:
+def test_a_compiled_function_earns_the_same_as_a_called_one(driven: Racer) -> None:
     config = driven.config
     assert driven.notes() == ["reward.py: compiled to the device"] and not driven.waits_for_host
     called = Racer(

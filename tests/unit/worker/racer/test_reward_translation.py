@@ -255,7 +255,7 @@ def test_code_that_the_guard_refuses_does_not_run() -> None:
 
 
 class RaceSensor:
-    """What the racer's simulator is to a task: it gives the arrays, here filled with samples."""
+    """In place of the racer's simulator: it gives the task its arrays, here filled with samples."""
 
     arrays_type = RaceArrays
     needs_bodies = False

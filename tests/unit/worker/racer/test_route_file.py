@@ -22,7 +22,7 @@ OVAL = make_preset("oval")
 
 
 def saved(rows: object, **options: bool) -> bytes:
-    """What numpy.save writes."""
+    """The bytes that numpy.save writes."""
     stream = io.BytesIO()
     np.save(stream, np.asarray(rows) if not isinstance(rows, np.ndarray) else rows, **options)
     return stream.getvalue()

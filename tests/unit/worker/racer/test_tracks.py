@@ -84,7 +84,7 @@ def test_a_seed_means_the_same_bytes_for_ever() -> None:
     assert make_preset("chicane").digest == "9cc12ee1408c11ec774e63f705727f224aaec5b525cb8bc758478b7dcbaac5f3"
 
 
-def test_what_is_asked_of_a_drawn_track_is_kept() -> None:
+def test_a_drawn_track_has_the_requested_measures() -> None:
     track = make_random(3, length=60.0, width=0.8, spacing=0.2, roughness=1.0, least_radius=1.5, direction=CLOCKWISE)
     assert track.length == pytest.approx(60.0) and len(track.center) == 300
     assert track.least_radius >= 1.5 and track.direction == CLOCKWISE
