@@ -145,7 +145,7 @@ def _read_window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dic
     totals = {
         name or "all": str(sum(counts.get(each, 0) for each in states or Status)) for name, states in GROUPS.items()
     }
-    shown = f"{start + 1}–{start + len(rows)} of {total}" if rows else "none"
+    shown = f"{start + 1}–{start + len(rows)} of {total}" if rows else ""
     return rows, {**totals, "shown": shown, "more": "yes" if start + len(rows) < total else ""}
 
 

@@ -35,7 +35,9 @@ class PageRoute(APIRoute):
                 return failure(request, str(error), error.status, kind_of(error))
             except RequestValidationError as error:
                 first = error.errors()[0]
-                return failure(request, f"{'.'.join(map(str, first['loc']))}: {first['msg']}", 400)
+                name = ".".join(map(str, first["loc"][1:])) or str(first["loc"][0])
+                said = first["msg"].replace("Input should be", "expected a value")
+                return failure(request, f"{name} {str(first['input'])[:100]!r}: {said}", 400)
             except DatabaseError as error:
                 return failure(request, str(error), 503, "ServerException")
             except DamagedFile as error:

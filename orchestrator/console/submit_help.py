@@ -127,8 +127,8 @@ def told(about: Mapping[str, Any] | None) -> str:
     choice = ", ".join(map(str, about.get("enum") or about.get("examples") or ()))
     default = about.get("default")
     parts = (
-        re.sub(r":\w+:|`", "", str(about.get("description") or "").partition("\n")[0]),
+        re.sub(r":\w+:|`", "", str(about.get("description") or "").partition("\n")[0]).rstrip("."),
         f"one of {choice}" if choice else bounds(about),
-        "" if default is None or isinstance(default, dict | list) else f"default {default}",
+        "" if default is None or isinstance(default, dict | list) else f"by default {default}",
     )
     return "; ".join(filter(None, parts))

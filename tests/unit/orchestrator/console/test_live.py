@@ -12,12 +12,14 @@ from typing import Any, cast
 from fastapi import Request
 
 from orchestrator.api.errors import ClientError
+from orchestrator.api.http.access import Access
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 
 
 def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
-    state = SimpleNamespace(closing=threading.Event())
-    told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state))
+    state = SimpleNamespace(closing=threading.Event(), access=Access())
+    scope = {"server": ("127.0.0.1", 80)}
+    told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state), scope=scope)
     return cast(Request, told)
 
 
