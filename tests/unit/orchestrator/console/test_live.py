@@ -12,11 +12,12 @@ from typing import Any, cast
 from fastapi import Request
 
 from orchestrator.api.errors import ClientError
+from orchestrator.api.http.access import Access
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 
 
 def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
-    state = SimpleNamespace(closing=threading.Event())
+    state = SimpleNamespace(closing=threading.Event(), access=Access())
     told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state))
     return cast(Request, told)
 
@@ -26,7 +27,7 @@ def written(looks: Sequence[Callable[[], Sequence[Event] | None]]) -> list[str]:
     left: Iterator[Callable[[], Any]] = iter(looks)
 
     async def read() -> str:
-        answer = stream(request_of(), lambda: next(left)(), interval=0)
+        answer = stream(request_of(authorization="Bearer x"), lambda: next(left)(), interval=0)
         return "".join([bytes(cast(bytes, each)).decode() async for each in answer.body_iterator])
 
     return asyncio.run(read()).split("\n\n")[:-1]
