@@ -137,6 +137,7 @@ class Operation(StrEnum):
     CREATE_KEY = "POST /api/keys"
     DELETE_KEY = "DELETE /api/keys/{name}"
     LIST_TRACKS = "GET /api/tracks"
+    MAKE_TRACK = "POST /api/tracks"
     READ_WEBHOOKS = "GET /api/webhooks"
     TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 

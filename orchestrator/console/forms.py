@@ -9,10 +9,12 @@ from __future__ import annotations
 import hmac
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any, TypeVar
 from urllib.parse import parse_qs
 
 from fastapi import Request, Response
 from fastapi.responses import JSONResponse, RedirectResponse
+from pydantic import BaseModel, ValidationError
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Refusal
@@ -21,6 +23,7 @@ from orchestrator.console.pages import form_token, render, wants_page
 TOKEN = "form_token"
 """The field of a form that other web pages can't know."""
 _MOST_FIELDS = 5000
+_Body = TypeVar("_Body", bound=BaseModel)
 _OPEN = "/login"
 """Path of the login form, which is sent without a session; browsers tell its origin."""
 
@@ -86,6 +89,15 @@ async def check_form(request: Request) -> None:
     given = request.headers.get("x-form-token") or (await sent_form(request)).one(TOKEN)
     if not hmac.compare_digest(given.encode(), form_token(request).encode()):
         raise Refusal("AccessDeniedException", "this form is of another session; load the page again and repeat")
+
+
+def body_of(kind: type[_Body], given: Mapping[str, Any]) -> _Body:
+    """A request's body made of a form's texts. Raises ClientError that names the first wrong field."""
+    try:
+        return kind.model_validate(given)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ClientError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def done(request: Request, path: str, message: str = "") -> Response:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 from fastapi import Depends, Query, Request, Response
-from pydantic import BaseModel, ValidationError
 
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import reconciler_of
@@ -18,7 +17,7 @@ from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.league_routes import LEAGUE_TAG, MODEL_TAG
 from orchestrator.api.native.model_routes import list_models
 from orchestrator.api.permissions import current_identity
-from orchestrator.console.forms import Form, Question, done, sent_form
+from orchestrator.console.forms import Form, Question, body_of, done, sent_form
 from orchestrator.console.live import Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
@@ -37,7 +36,6 @@ _RACES = 20
 _INTERVAL = 2.0
 """Seconds between two looks at them; each reads all entries."""
 _recent = Recent(_INTERVAL * 0.9)
-_Body = TypeVar("_Body", bound=BaseModel)
 
 
 @router.get("/leagues")
@@ -57,7 +55,7 @@ def create(request: Request, form: Form = Depends(sent_form)) -> Response:
     given = {key: value.strip() for key, value in given.items() if value.strip()}
     given |= {key: _moment(key, given[key]) for key in ("opens", "closes") if key in given}
     given["track"] = [each.strip() for each in form.every("track") if each.strip()]
-    body = _body(api.CreateRequest, {"name": "", **given})
+    body = body_of(api.CreateRequest, {"name": "", **given})
     league = api.create_league(request, body)
     return done(request, f"/leagues/{league['name']}", f"created league {league['name']}")
 
@@ -99,7 +97,7 @@ def race_stream(request: Request, name: str) -> Response:
 @router.post("/leagues/{name}/races")
 def race(request: Request, name: str, form: Form = Depends(sent_form)) -> Response:
     """Submit the race of a model."""
-    started = api.race(request, name, _body(api.RaceRequest, _racer(form)), None)
+    started = api.race(request, name, body_of(api.RaceRequest, _racer(form)), None)
     reference = f"{started['model']}@{started['version']}"
     told = f"submitted the race of {reference} as {started['jobId'][:8]}; enter it here when it has ended"
     return done(request, f"/leagues/{name}", told)
@@ -108,7 +106,7 @@ def race(request: Request, name: str, form: Form = Depends(sent_form)) -> Respon
 @router.post("/leagues/{name}/entries")
 def enter(request: Request, name: str, form: Form = Depends(sent_form)) -> Response:
     """Make an entry of a race that has ended, for good."""
-    entry = api.enter(request, name, _body(api.EnterRequest, {**_racer(form), "job": form.one("job")}))
+    entry = api.enter(request, name, body_of(api.EnterRequest, {**_racer(form), "job": form.one("job")}))
     return done(request, f"/leagues/{name}/entries/{entry['entry']}", f"entry {entry['entry']} of {name}")
 
 
@@ -146,7 +144,7 @@ def entry(request: Request, name: str, number: int) -> Response:
 @router.post("/leagues/{name}/entries/{number}/disqualify")
 def disqualify(request: Request, name: str, number: int, form: Form = Depends(sent_form)) -> Response:
     """Say for good that an entry does not count."""
-    body = _body(api.DisqualifyRequest, {"reason": form.one("reason").strip()})
+    body = body_of(api.DisqualifyRequest, {"reason": form.one("reason").strip()})
     text = f"The entry stays as it is, and the table says for good that it does not count: {body.reason}"
     form.confirm(Question(f"Disqualify entry {number} of {name}?", text, "Disqualify"))
     api.disqualify(request, name, number, body)
@@ -159,15 +157,6 @@ def _racer(form: Form) -> dict[str, Any]:
     if not name or (sign and not (version.isascii() and version.isdecimal() and len(version) < 10)):
         raise ClientError("model: choose one, such as fast@1")
     return {"model": name, "version": int(version) if sign else None, "racer": form.one("racer").strip() or None}
-
-
-def _body(kind: type[_Body], given: Mapping[str, Any]) -> _Body:
-    """A request's body made of a form's texts. Raises ClientError that names the first wrong field."""
-    try:
-        return kind.model_validate(given)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ClientError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def _moment(key: str, text: str) -> float:

@@ -7,13 +7,14 @@ from functools import partial
 from typing import Any
 from urllib.parse import quote
 
-from fastapi import Query, Request, Response
+from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api import permissions
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
-from orchestrator.api.native.track_routes import list_tracks, picture
-from orchestrator.api.permissions import Operation
+from orchestrator.api.native.track_routes import MakeRequest, list_tracks, make_track, picture
+from orchestrator.api.permissions import Operation, current_identity
+from orchestrator.console.forms import Form, body_of, done, sent_form
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
@@ -35,7 +36,19 @@ def tracks(request: Request, name: str = Query(default="", max_length=130)) -> R
     """All tracks; with ``name`` that one, so that any seed can be looked at."""
     if name:
         return track(request, name)
-    return render(request, "tracks.html", tracks=[facts(each) for each in known(request)])
+    may_make = current_identity.get().queues is None
+    shown = [facts(each) for each in known(request)]
+    return render(request, "tracks.html", tracks=shown, may_make=may_make, presets=stored.PRESETS)
+
+
+@router.post("/tracks")
+def make(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """Make a track, for good: of the preset that was chosen, else of the seed."""
+    given = {key: value for key in MakeRequest.model_fields if (value := form.one(key).strip())}
+    if "preset" in given:
+        given.pop("seed", None)
+    track = make_track(request, body_of(MakeRequest, {"name": "", **given}))
+    return done(request, f"/tracks/{quote(track['name'], safe='')}", f"made track {track['name']}")
 
 
 @router.get("/tracks/{name}")

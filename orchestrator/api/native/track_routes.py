@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.api import permissions
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation
+from orchestrator.api.permissions import Operation, Shared
 from orchestrator.api.turns import Turns
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ServerError, UsageError
@@ -20,6 +21,23 @@ from orchestrator.spec.tracks import ask
 
 router = APIRouter()
 _turns = Turns("other tracks are being drawn")
+_Measure = Annotated[float | None, Field(default=None, allow_inf_nan=False)]
+
+
+class MakeRequest(BaseModel):
+    """A new track: of a preset or of a seed, with measures [m]; absent ones are those of ``muster tracks make``."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(max_length=128)
+    preset: str | None = Field(default=None, max_length=128, description="exact straights and arcs")
+    seed: int | None = Field(default=None, ge=0, lt=2**63, description="of a random closed curve")
+    length: _Measure
+    width: _Measure
+    spacing: _Measure
+    direction: str | None = Field(default=None, max_length=128, description="counter-clockwise or clockwise")
+    roughness: _Measure
+    least_radius: _Measure
 
 
 @router.get("/tracks")
@@ -37,6 +55,23 @@ def list_tracks(
     return [_ask(reconciler, {"action": "show", "name": name, "rings": rings})]
 
 
+@router.post("/tracks")
+def make_track(request: Request, body: MakeRequest) -> dict[str, Any]:
+    """Make a track from a preset or a seed, and keep it in the store, for good."""
+    reconciler = reconciler_of(request)
+    permissions.check(Operation.MAKE_TRACK, Shared())
+    reconciler.check_writable(adds=True)
+    if (body.preset is None) == (body.seed is None):
+        raise ClientError("give one of preset and seed")
+    measures = body.model_dump(exclude={"name", "preset", "seed"}, exclude_none=True)
+    for key in ("roughness", "least_radius"):
+        if body.preset is not None and key in measures:
+            raise ClientError(f"{key} belongs to seed; a preset's curves follow from its length")
+    order = {"action": "make", "name": body.name, "preset": body.preset, "seed": body.seed, "measures": measures}
+    made: dict[str, Any] = _ask(reconciler, order, 400)
+    return made
+
+
 def picture(reconciler: Reconciler, name: str) -> bytes:
     """The PNG of a track. Raises ClientError."""
     with TemporaryDirectory() as folder:
@@ -45,11 +80,12 @@ def picture(reconciler: Reconciler, name: str) -> bytes:
         return path.read_bytes()
 
 
-def _ask(reconciler: Reconciler, order: Mapping[str, Any]) -> Any:
+def _ask(reconciler: Reconciler, order: Mapping[str, Any], status: int = 404) -> Any:
+    """``status``: of the answer where the order can't be carried out. Raises ClientError."""
     try:
         with _turns.turn():
             return ask({**order, "store": str(reconciler.store.path)})
     except UsageError as error:
-        raise ClientError(str(error), 404) from None
+        raise ClientError(str(error), status) from None
     except ServerError as error:
         raise ClientError(str(error), 503) from None

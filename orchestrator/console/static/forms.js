@@ -64,10 +64,21 @@ export function startForms() {
     const told = await send(button?.getAttribute("formaction") ?? form.getAttribute("action"), fields);
     if (button) button.disabled = false;
     if (told) follow(told, form);
+    else if (form.matches("[data-fields]")) blame(form);
   });
   for (const box of document.querySelectorAll("[data-mark-all]")) {
     box.addEventListener("change", () => markAll(box.checked));
   }
+}
+
+/** The refusal stands at the field that its first word names, until something in the form is changed. */
+function blame(form) {
+  const told = document.querySelector("[data-message]").textContent;
+  const field = form.elements.namedItem(told.split(/[: ]/, 1)[0]);
+  if (!field?.setCustomValidity) return;
+  field.setCustomValidity(told);
+  field.reportValidity();
+  form.addEventListener("input", () => field.setCustomValidity(""), { once: true });
 }
 
 function follow(told, form) {

@@ -105,6 +105,7 @@ TABLE = {
     Operation.CREATE_KEY: SHARED_WRITE,
     Operation.DELETE_KEY: SHARED_WRITE,
     Operation.LIST_TRACKS: SHARED_READ,
+    Operation.MAKE_TRACK: SHARED_WRITE,
     Operation.READ_WEBHOOKS: ALL_READ,
     Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
@@ -217,6 +218,7 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
         lambda key: world.delete_key(key),
         of_ours(of.LIST_TRACKS),
+        lambda key: world.native_call(key, of.MAKE_TRACK, {"name": world.fresh(), "seed": 7}),
         of_ours(of.READ_WEBHOOKS),
         of_ours(of.TEST_WEBHOOK, {}),
     ]

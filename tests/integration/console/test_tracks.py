@@ -57,3 +57,47 @@ def test_the_api_lists_tracks_and_draws_them(console: Console) -> None:
     ]
     (drawn,) = console.client.get("/api/tracks", name="oval", rings="true")
     assert len(drawn["rings"]["inner"]) == len(drawn["rings"]["outer"]) == drawn["waypoints"]
+
+
+def test_a_form_makes_a_track_for_good(console: Console) -> None:
+    visitor = console.visitor()
+    assert visitor.page("/tracks").all("form", action="/tracks", method="post")
+    sent = {"name": "ring", "preset": "oval", "seed": "7", "length": "25", "width": "", "direction": "clockwise"}
+    answer = visitor.submit("/tracks", **sent)
+    assert answer.json() == {"location": "/tracks/ring", "message": "made track ring"}
+    page = visitor.page("/tracks/ring")
+    assert "Direction clockwise" in page.text and "preset oval" in page.text
+    assert visitor.page("/tracks").all("img", alt="Outline of ring")
+    again = visitor.submit("/tracks", **sent)
+    assert again.status_code == 400 and "ring" in again.json()["message"]
+    (drawn,) = console.client.get("/api/tracks", name="ring")
+    assert drawn["origin"] == {"preset": "oval", "length": 25.0, "direction": "clockwise"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"length": "2"}, "length 2 m: expected 4 to 1000 m"),
+        ({"length": "long"}, "length: Input should be a valid number"),
+        ({"least_radius": "nan"}, "least_radius: Input should be a finite number"),
+        ({"seed": "-1"}, "seed: Input should be greater than or equal to 0"),
+        ({"seed": ""}, "give one of preset and seed"),
+        ({"preset": "oval", "roughness": "0.5"}, "roughness belongs to seed"),
+        ({"preset": "ovall"}, "did you mean oval?"),
+        ({"name": "../out"}, "../out"),
+        ({"name": "oval"}, "a preset is called so; choose another name"),
+    ],
+)
+def test_a_track_that_can_t_be_made_is_refused_by_the_name_of_its_field(
+    console: Console, wrong: dict[str, str], told: str
+) -> None:
+    answer = console.visitor().submit("/tracks", **{"name": "wrong", "seed": "7", **wrong})
+    assert answer.status_code == 400 and told in answer.json()["message"], answer.text
+    assert "wrong" not in [each["name"] for each in console.client.get("/api/tracks")]
+
+
+@pytest.mark.parametrize("key", ["reader", "lab"])
+def test_only_a_writing_key_of_all_queues_makes_tracks(console: Console, key: str) -> None:
+    visitor = console.visitor(key)
+    assert not visitor.page("/tracks").all("form", action="/tracks", method="post")
+    assert visitor.submit("/tracks", name="theirs", seed="7").status_code == 403

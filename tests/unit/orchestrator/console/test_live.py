@@ -18,8 +18,7 @@ from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 
 def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
     state = SimpleNamespace(closing=threading.Event(), access=Access())
-    scope = {"server": ("127.0.0.1", 80)}
-    told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state), scope=scope)
+    told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state))
     return cast(Request, told)
 
 
@@ -28,7 +27,7 @@ def written(looks: Sequence[Callable[[], Sequence[Event] | None]]) -> list[str]:
     left: Iterator[Callable[[], Any]] = iter(looks)
 
     async def read() -> str:
-        answer = stream(request_of(), lambda: next(left)(), interval=0)
+        answer = stream(request_of(authorization="Bearer x"), lambda: next(left)(), interval=0)
         return "".join([bytes(cast(bytes, each)).decode() async for each in answer.body_iterator])
 
     return asyncio.run(read()).split("\n\n")[:-1]
