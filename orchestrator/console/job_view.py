@@ -142,7 +142,7 @@ def show(request: Request, reference: str) -> Response:
         raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
     run = permitted_run(reconciler_of(request), detail["run"], Operation.READ_RUN)
     command = [sys.executable, "-P", "-m", "worker.telemetry.view", "--training", str(run.path), "--job", detail["id"]]
-    views.start(detail["id"], [*command, "--port", "0", "--framed-by", f"http://{request.headers['host']}"])
+    views.start(detail["id"], [*command, "--port", "0", "--framed-by", _origin(request)])
     return done(request, f"/jobs/{detail['id']}", "the live view starts")
 
 
@@ -156,4 +156,19 @@ def close(request: Request, reference: str) -> Response:
 
 def is_near(request: Request) -> bool:
     """Whether the browser names this machine as its own, so that it reaches other ports of loopback too."""
-    return is_loopback(urlsplit(f"//{request.headers.get('host', '')}").hostname or "")
+    try:
+        return is_loopback(_host(request)[0])
+    except ValueError:
+        return False
+
+
+def _origin(request: Request) -> str:
+    """The console's origin as the browser has it, made anew of its parts: it becomes a part of the viewer's policy."""
+    name, port = _host(request)
+    return f"{request.url.scheme}://{f'[{name}]' if ':' in name else name}:{port}"
+
+
+def _host(request: Request) -> tuple[str, int]:
+    """Name and port in the address of the console. Raises ValueError where it is malformed."""
+    parts = urlsplit(f"//{request.headers.get('host', '')}")
+    return parts.hostname or "", parts.port or (443 if request.url.scheme == "https" else 80)

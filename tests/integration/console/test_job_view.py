@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -59,6 +61,25 @@ def test_a_view_ends_when_nobody_looks_at_its_page(monkeypatch: pytest.MonkeyPat
     views.start("a", script(OPEN))
     wait_for(lambda: views.state("a", is_seen=True) == SHOWN, 20, "the view")
     shown(views, "a", State())
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("127.0.0.1:8080", "http://127.0.0.1:8080"),
+        ("LOCALHOST", "http://localhost:80"),
+        ("[::1]:8080", "http://[::1]:8080"),
+        ("127.0.0.1:8080; script-src *", None),
+        ("127.0.0.1 *", None),
+        ("robots.example:8080", None),
+        ("", None),
+    ],
+)
+def test_a_viewer_may_be_framed_by_the_console_of_this_machine_alone(host: str, origin: str | None) -> None:
+    request = cast(Any, SimpleNamespace(headers={"host": host}, url=SimpleNamespace(scheme="http")))
+    assert job_view.is_near(request) == (origin is not None)
+    if origin is not None:
+        assert job_view._origin(request) == origin
 
 
 def test_what_can_t_be_watched_is_refused_in_one_line(console: Console) -> None:
