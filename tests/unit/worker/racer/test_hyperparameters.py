@@ -138,7 +138,7 @@ def test_a_file_of_hyperparameters_is_read_at_the_submission_and_not_needed_agai
     spec = load(str(yaml))
     assert spec.train is not None and spec.train.given() == {"learning_rate": 0.0002, "schedule": "fixed"}
     assert spec.notes == ()
-    assert "hyperparameters" not in json.dumps(compile_definition(spec, str(tmp_path)))
+    assert "hyperparameters" not in json.dumps(compile_definition(spec, "/"))
     for content, words in (
         ("[", f"racer.yaml:6: train.hyperparameters: {file}: not JSON"),
         ("[1]", f"racer.yaml:6: train.hyperparameters: {file}: not a JSON object"),
