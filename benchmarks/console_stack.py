@@ -41,7 +41,7 @@ LEAST = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
-"""The directives without any of which NiceGUI's page stays empty or unstyled, and those that forbid what it does not need."""
+"""NiceGUI's page stays empty or unstyled if any directive that permits something is left out; the others forbid everything else."""
 
 
 def main() -> None:
@@ -68,7 +68,9 @@ def main() -> None:
             for name, policy in (("the console's", POLICY), ("the least", LEAST)):
                 with nicegui(python, source, 50, policy) as (url, _):
                     policies.append((name, *under(browser, url)))
-            seen = watch.check("during the measurement")  # of a browser that is gone nobody knows that it was ours
+            seen = watch.check(
+                "during the measurement"
+            )  # before the close: the load of a closed browser would count as that of other processes
             browser.close()
         TABLE.write_text(table(found, policies, load.told([seen])))
         print(TABLE.read_text())

@@ -32,14 +32,14 @@ router = page_router()
 _MOST = 2
 """Views at once on a server: each takes a share of a processor and some 0.8 GB of memory."""
 _UNSEEN = 300.0
-"""Time after which a view ends whose job nobody looks at [s]."""
+"""A view ends after this time without a visitor on its job's page [s]."""
 _AT = "the view is at "
 """The words of `muster view` before its address."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Of one job's view: of all fields at most one is filled."""
+    """The state of one job's view; at most one field is filled."""
 
     is_starting: bool = False
     url: str = ""
@@ -101,7 +101,7 @@ class Views:
         self._views: dict[str, _View] = {}
 
     def state(self, job: str, *, is_seen: bool = False) -> State:
-        """Of the job's view; ``is_seen``: somebody looks at its page."""
+        """The state of the job's view; ``is_seen``: a visitor has the job's page open."""
         view = self._views.get(job)
         if view is None:
             return State()

@@ -157,10 +157,13 @@ def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> M
 
 
 class Recent:
-    """Values that many open pages need at once: each is computed at most once in ``seconds``. Any thread may call."""
+    """Values that many open pages need at once: each is computed at most once in ``seconds``. Any thread may call.
 
-    def __init__(self, seconds: float = INTERVAL * 0.9) -> None:
-        self._seconds, self._lock = seconds, threading.Lock()
+    ``most``: number of values; beyond it the one goes that was asked for longest ago.
+    """
+
+    def __init__(self, seconds: float = INTERVAL * 0.9, most: int = _MOST_KEPT) -> None:
+        self._seconds, self._most, self._lock = seconds, most, threading.Lock()
         self._kept: OrderedDict[Hashable, tuple[threading.Lock, list[tuple[float, Any]]]] = OrderedDict()
 
     def get(self, key: Hashable, compute: Callable[[], _Value]) -> _Value:
@@ -168,7 +171,7 @@ class Recent:
         with self._lock:
             lock, kept = self._kept.setdefault(key, (threading.Lock(), []))
             self._kept.move_to_end(key)
-            while len(self._kept) > _MOST_KEPT:
+            while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
         with lock:
             now = time.monotonic()

@@ -80,7 +80,7 @@ def _version(request: Request, name: str, version: int) -> Mapping[str, Any] | N
 
 
 def _parent(request: Request, run: str) -> Mapping[str, Any] | None:
-    """The run and checkpoint of which a run is a clone; None where there is none, or the caller may not know it."""
+    """The run and checkpoint from which a run was cloned; None without one, or where the caller may not see it."""
     try:
         parent = run_detail(request, run).get("parent")
     except (ClientError, DamagedFile, OSError):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import secrets
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
+from math import inf
 from typing import Any
 
 from fastapi import Depends, Query, Request, Response
@@ -21,6 +20,7 @@ from orchestrator.api.native.routes import PlanRequest
 from orchestrator.api.permissions import Operation
 from orchestrator.api.turns import Turns
 from orchestrator.console.forms import TOKEN, Form, done, sent_form
+from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import Group, document, filled, groups, races, tasks, written
@@ -44,7 +44,8 @@ train:
   worlds: 128
   iterations: 100
 """
-_MOST_KEPT = 1000
+_sent = Recent(inf, 1000)
+"""Id and name of the jobs of the last forms, by sender and the form's random name: a form that is sent again makes no second job."""
 _turns = Turns("other reward functions are being tried")
 """Each is tried in a process of its own."""
 
@@ -142,38 +143,16 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
 def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Submit the job of a YAML, as ``muster submit`` does; a form that is sent again leads to the job that it made."""
     permissions.check(Operation.SUBMIT_JOB)
-    sender = permissions.current_identity.get().name
-    job, name, is_new = _sent.once((sender, form.one("once")), lambda: _submitted(request, form))
-    return done(
-        request, f"/jobs/{job}", f"{'submitted' if is_new else 'this form has already submitted'} {name} as {job[:8]}"
-    )
+    sender, once, is_new = permissions.current_identity.get().name, form.one("once"), False
 
+    def make() -> tuple[str, str]:
+        nonlocal is_new
+        is_new = True
+        return _submitted(request, form)
 
-class _Sent:
-    """The jobs of the forms that were sent last: a second click, or a form that a browser sends again, makes no second job."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[str, str], tuple[threading.Lock, list[tuple[str, str]]]] = OrderedDict()
-
-    def once(self, form: tuple[str, str], make: Callable[[], tuple[str, str]]) -> tuple[str, str, bool]:
-        """The id and the name of the form's job, and whether ``make`` has made it just now. What ``make`` raises is not kept.
-
-        ``form``: its sender and its random name; a form without one makes a job each time.
-        """
-        if not form[1]:
-            return *make(), True
-        with self._lock:
-            lock, made = self._kept.setdefault(form, (threading.Lock(), []))
-            while len(self._kept) > _MOST_KEPT:
-                self._kept.popitem(last=False)
-        with lock:
-            if is_new := not made:
-                made.append(make())
-            return *made[0], is_new
-
-
-_sent = _Sent()
+    job, name = _sent.get((sender, once), make) if once else make()
+    told = "submitted" if is_new else "this form has already submitted"
+    return done(request, f"/jobs/{job}", f"{told} {name} as {job[:8]}")
 
 
 def _submitted(request: Request, form: Form) -> tuple[str, str]:
