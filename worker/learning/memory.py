@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Learner = tuple[type[Algorithm], Any]
 """An algorithm, and its settings."""
 FEW, MORE = 64, 2048
-"""Numbers of worlds in the measured builds, after a build that loads kernels and libraries; the memory that both have in common is not
+"""Numbers of worlds in the measured builds, after one that loads kernels and libraries; the memory that both have in common is not
 the worlds' (networks, a batch of fixed size)."""
 CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
 """Number of worlds from which memory is checked beforehand: on CPU the OOM killer strikes without a message; on GPU a too large build
@@ -105,7 +105,7 @@ class Need:
 def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: Gang) -> Need:
     """Measure the memory of this task's worlds with this algorithm. Takes some seconds; every rank calls it."""
     load_kernels(learner[0], gang)
-    _taken(task_type, config, learner, FEW, gang)
+    _taken(task_type, config, learner, MORE, gang)  # what torch sets up once for batches of this size is not the worlds'
     few, more = (_taken(task_type, config, learner, worlds, gang) for worlds in (FEW, MORE))
     world = max(more - few, 0) / (MORE - FEW)
     return Need(max(few - FEW * world, 0.0), world)

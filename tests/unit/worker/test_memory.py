@@ -35,8 +35,9 @@ def test_too_many_worlds_are_refused_before_they_are_built() -> None:
     )
     assert found, refusal.value
     assert float(found[1]) == pytest.approx(free / 1e9, rel=0.2)
-    # a rollout of 16 steps alone has 16 x (4 states twice, their latents, noise, samples, ...) floats: 1 to 40 KB a world
-    assert 200 < float(found[2].replace(",", "")) < 8000
+    # a rollout of 16 steps alone has 16 x (4 states twice, their latents, noise, samples, ...) floats: 1 to 40 KB a world,
+    # and what the allocator of a process of many tests holds besides
+    assert 200 < float(found[2].replace(",", "")) < 16_000
     fit = int(found[3].replace(",", ""))
     assert fit == pytest.approx(0.9 * free / (float(found[2].replace(",", "")) * 1e9 / 200e6), rel=0.25)
 
