@@ -105,9 +105,9 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
         echo(f"  parent:      run {parent.get('run')}, checkpoint {parent.get('checkpoint')}")
     for evaluation in found.get("evaluations") or []:
         changed = ", ".join(f"{place} {value}" for place, value in flattened(evaluation.get("config") or {}))
-        echo(
-            f"  evaluation:  {in_one_line(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
-        )
+        seed = evaluation.get("seed")
+        worlds = "at the end of the training" if seed is None else f"seed {seed}"
+        echo(f"  evaluation:  {in_one_line(evaluation)}, {worlds}{f', with {changed}' if changed else ''}")
     if judged := found.get("judged"):
         echo(
             f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {counted(judged['episodes'], 'episode')}"
