@@ -21,7 +21,7 @@ from orchestrator.server import Server
 from shared_store.checkpoints import list_checkpoints, retain
 from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang
-from tests.support.orchestrator.trained import SPEC, add_checkpoint
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
 
@@ -286,6 +286,20 @@ def test_evaluations_that_could_never_start_are_refused_with_the_training(
         home=controller.home,
     )
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    with controller.server.reconciler.database.session() as session:
+        assert not session.scalars(select(Job)).all()
+
+
+@pytest.mark.parametrize("command", [("resume", "taught"), ("clone", "taught", "--name", "twin")])
+def test_evaluations_that_could_never_start_are_refused_with_a_resume_and_a_clone(
+    controller: Controller, command: tuple[str, ...]
+) -> None:
+    add_run(controller.server.store, "taught")
+    controller.save(3)
+    section = "evaluation={every: 2, resources: {gpus: 1}}"
+    done = call_muster(*command, "--set", section, home=controller.home)
+    assert done.returncode == 2 and "evaluation: each node needs 1 CPU, 1 GPU" in done.stderr, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
     with controller.server.reconciler.database.session() as session:
         assert not session.scalars(select(Job)).all()
 
