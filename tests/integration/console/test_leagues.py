@@ -39,6 +39,8 @@ def test_leagues_are_listed_with_their_rules_and_their_table(console: Console, s
     assert "cup" in page.text and "user ada" in page.text and page.all("form", action="/leagues") == []
     page = visitor.page("/leagues/cup")
     assert "ada fast@1 0:37.500 0:12.000 3 of 3 0 0 0 ranked" in page.text
+    (drawn,) = page.all("img", alt="Outline of oval")
+    assert visitor.http.get(str(drawn["src"])).headers["content-type"] == "image/svg+xml"
     assert "Ranked by the time of all laps" in page.text and "at most 99 entries of each key or user" in page.text
     assert [each for each in page.all("form", method="post") if each["action"] != "/logout"] == []
     laps = visitor.page("/leagues/cup/entries/1").text
