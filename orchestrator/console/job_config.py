@@ -32,8 +32,7 @@ def code_of(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
     for value in spec.values():
         if isinstance(value, Mapping):
             file, text = value.get("file"), value.get("text")
-            is_file = isinstance(file, str) and isinstance(text, str)
-            found += [(file, text)] if is_file else code_of(value)
+            found += [(file, text)] if isinstance(file, str) and isinstance(text, str) else code_of(value)
     return found
 
 
