@@ -241,7 +241,9 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
     assert controller.evaluations() == []
 
 
-def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(controller: Controller) -> None:
+def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(
+    controller: Controller, caplog: pytest.LogCaptureFixture
+) -> None:
     controller.client.batch(
         "CreateJobQueue",
         jobQueueName="idle",
@@ -256,10 +258,15 @@ def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is
     controller.look()
     problem = "checkpoint 00000010-e1 was not evaluated: Job queue idle is DISABLED and takes no jobs"
     assert controller.newest()["problem"] == problem and controller.evaluations() == []
-    controller.client.batch("UpdateJobQueue", jobQueue="idle", state="ENABLED")
     controller.save(20)
     controller.look()
-    assert controller.evaluations() == [(20, "RUNNABLE")] and controller.newest()["problem"] is None
+    assert "checkpoint 00000020-e1" in controller.newest()["problem"]
+    refused = "run taught: checkpoints are not evaluated: Job queue idle is DISABLED and takes no jobs"
+    assert caplog.messages.count(refused) == 1, "once, however many checkpoints it concerns"
+    controller.client.batch("UpdateJobQueue", jobQueue="idle", state="ENABLED")
+    controller.save(30)
+    controller.look()
+    assert controller.evaluations() == [(30, "RUNNABLE")] and controller.newest()["problem"] is None
 
 
 def test_a_queue_that_does_not_take_the_evaluations_is_refused_with_the_training(controller: Controller) -> None:
