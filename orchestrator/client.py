@@ -18,9 +18,7 @@ from urllib.parse import quote, urlsplit
 
 import httpx
 
-from orchestrator.domain.errors import ApiError as ApiError
-from orchestrator.domain.errors import NotServing, NoUrl
-from orchestrator.domain.errors import Unreachable as Unreachable
+from orchestrator.domain.errors import ApiError, NotServing, NoUrl, Unreachable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.home import local_url, muster_home
 

@@ -16,6 +16,7 @@ from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES, traits_of
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
@@ -309,13 +310,13 @@ def stop(
     """
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
-        if detail["status"] in ("SUCCEEDED", "FAILED"):
+        if detail["status"] in TERMINAL:
             echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
         slow = wait and slow_iteration(detail)
-        while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
+        while wait and detail["status"] not in TERMINAL:
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:

@@ -13,10 +13,10 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client
 from orchestrator.domain.errors import Unreachable
+from orchestrator.domain.job import TERMINAL
 from shared_store.evaluations import in_one_line
 from shared_store.wording import counted
 
-_TERMINAL = ("SUCCEEDED", "FAILED")
 _POLL = 0.3
 _PLAIN_INTERVAL = 2.0
 """Seconds between two plain lines of progress."""
@@ -36,7 +36,7 @@ def follow(client: Client, job_id: str) -> int:
         while True:
             try:
                 job = client.batch("DescribeJobs", jobs=[job_id])["jobs"][0]
-                over = job["status"] in _TERMINAL
+                over = job["status"] in TERMINAL
                 if job.get("statusReason") != reason:  # another attempt may have another number of nodes
                     reason = job.get("statusReason")
                     attempts = client.get(f"/api/jobs/{job_id}")["attempts"]
@@ -149,7 +149,7 @@ class Activity:
             except Unreachable:
                 client.await_return()
                 continue
-            if job["status"] in ("RUNNING", *_TERMINAL):
+            if job["status"] in ("RUNNING", *TERMINAL):
                 return
             text = f"{job['jobName']} ({job_id[:8]}) {job['status']}: {one_line(job.get('statusReason', ''))}"
             if text != shown:
@@ -236,7 +236,7 @@ class _Bar(_Display):
                 f"{values['rate']} steps/s  ETA {self.eta(record)}  {counted(self.nodes, 'node')}"
             )
             self._progress.update(self._task, completed=iteration, text=text)
-        elif task.completed == 0 or job["status"] not in ("RUNNING", *_TERMINAL):
+        elif task.completed == 0 or job["status"] not in ("RUNNING", *TERMINAL):
             self._progress.update(self._task, text=self.state(job))
 
 
@@ -258,7 +258,7 @@ class _Lines(_Display):
 
     def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
         state = f"{job['status']} {job.get('statusReason', '')}"
-        if state != self._state and job["status"] not in _TERMINAL:
+        if state != self._state and job["status"] not in TERMINAL:
             self._flush()
             echo(f"{job['status']}: {one_line(job.get('statusReason', ''))}")
             self._state = state

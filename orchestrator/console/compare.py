@@ -20,6 +20,7 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
 from shared_store.metrics import sampled
+from shared_store.wording import nearest
 
 router = page_router("run")
 
@@ -37,11 +38,14 @@ _recent = Recent(2.0)
 def compare(
     request: Request,
     runs: list[str] = Query(default=[], alias="run", max_length=MOST),
-    metric: str = Query(default="reward", max_length=200),
+    metric: str = Query(default="", max_length=200),
 ) -> Response:
-    """The page; ``run`` is a name, or a pattern such as ``ant-*``."""
+    """The page; ``run`` is a name, or a pattern such as ``ant-*``. ``metric``: of the curve; the reward where it is empty."""
     names = _chosen(request, runs) if runs else []
     groups = _groups(request, names)
+    metrics = _metrics(groups)
+    if metric and metrics and metric not in metrics:
+        raise ClientError(f"no run here has a metric {metric!r}; {nearest(metric, metrics)}", 404)
     first = groups[0] if groups else None
     differences = [versus(group, groups[0]) for group in groups]
     return render(
@@ -54,8 +58,8 @@ def compare(
         differences=[(sentence(told), told["verdict"]) for told in differences if told],
         first=first.label if first else "",
         given=" ".join(runs),
-        metrics=_metrics(groups),
-        metric=metric,
+        metrics=metrics,
+        metric=metric or "reward",
         curves=f"/compare/curves?{urlencode([('run', name) for name in names])}",
     )
 

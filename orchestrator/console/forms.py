@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Refusal
 from orchestrator.console.pages import form_token, render, wants_page
+from shared_store.wording import explain, path_of
 
 TOKEN = "form_token"
 """The field of a form that other web pages can't know."""
@@ -97,7 +98,7 @@ def body_of(kind: type[_Body], given: Mapping[str, Any]) -> _Body:
         return kind.model_validate(given)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        raise ClientError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise ClientError(f"{'.'.join(map(str, path_of(first)))}: {explain(first)}") from None
 
 
 def done(request: Request, path: str, message: str = "") -> Response:

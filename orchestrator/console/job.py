@@ -17,7 +17,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native.routes import job_detail
 from orchestrator.api.permissions import Operation, current_identity
 from orchestrator.console.curves import columns
-from orchestrator.console.job_config import before_it, differences, text_of
+from orchestrator.console.job_config import before_it, code_of, differences
 from orchestrator.console.job_facts import attempts_of, checkpoints_of, facts_of
 from orchestrator.console.job_log import ChosenLog, LiveLog
 from orchestrator.console.job_view import is_near, views
@@ -25,6 +25,7 @@ from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.run_files import File, files_of
+from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
 from shared_store.files import DamagedFile
@@ -75,7 +76,8 @@ def job(request: Request, reference: str) -> Response:
         trains=bool(spec.get("train")),
         container=_container(spec),
         nodes=range(detail["nodes"]),
-        configuration=text_of(spec),
+        configuration=written(spec) if spec else "",
+        code=code_of(spec),
         before=before,
         changed=differences(before[2], spec) if before and spec else [],
         parent=(detail["results"] or {}).get("parent") or {},

@@ -1,8 +1,9 @@
-"""The configuration of a job as YAML, and its differences from the job before it."""
+"""The configuration and the code of a job, and their differences from the job before it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from difflib import SequenceMatcher
 from typing import Any
 
 import yaml
@@ -21,11 +22,18 @@ from shared_store.files import DamagedFile
 _ABSENT = object()
 _LONGEST = 300
 """Characters of a value in the table of differences."""
+_MOST_LINES = 1000
+"""Lines of a text that is compared line by line: the time grows with their square."""
 
 
-def text_of(spec: Mapping[str, Any] | None) -> str:
-    """The spec as YAML; empty for a job that came through the Batch API without one."""
-    return str(yaml.safe_dump(dict(spec), sort_keys=False, allow_unicode=True, width=100)) if spec else ""
+def code_of(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and text of each file that the job holds, such as a racer's reward function."""
+    found: list[tuple[str, str]] = []
+    for value in spec.values():
+        if isinstance(value, Mapping):
+            file, text = value.get("file"), value.get("text")
+            found += [(file, text)] if isinstance(file, str) and isinstance(text, str) else code_of(value)
+    return found
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, str, str]]:
@@ -33,7 +41,21 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[st
     before, after = dict(_flattened(old)), dict(_flattened(new))
     keys = [*after, *(key for key in before if key not in after)]
     pairs = ((key, before.get(key, _ABSENT), after.get(key, _ABSENT)) for key in keys)
-    return [(key, _shown(was), _shown(now)) for key, was, now in pairs if was != now]
+    return [(key, *_told(was, now)) for key, was, now in pairs if was != now]
+
+
+def _told(was: Any, now: Any) -> tuple[str, str]:
+    """Two different values; of texts of several lines those that differ, with their numbers."""
+    if not (isinstance(was, str) and isinstance(now, str) and "\n" in was.strip() + now.strip()):
+        return _shown(was), _shown(now)
+    before, after = was.splitlines(), now.splitlines()
+    if max(len(before), len(after)) > _MOST_LINES:
+        return _shown(was), _shown(now)
+    changes = SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
+    spans = [each[1:] for each in changes if each[0] != "equal"]
+    removed = [f"{i + 1}: {before[i]}" for start, stop, _, _ in spans for i in range(start, stop)]
+    added = [f"{i + 1}: {after[i]}" for _, _, start, stop in spans for i in range(start, stop)]
+    return "\n".join(removed), "\n".join(added)
 
 
 def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -21,7 +21,7 @@ from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.job import Status
+from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.persistence.queries import short_id
 from shared_store.wording import counted
 
@@ -152,7 +152,7 @@ def _read_window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dic
 def _row(job: Mapping[str, Any]) -> dict[str, Any]:
     """The texts of a job's row; all empty for the row that scripts copy."""
     status, progress = job.get("status", ""), job.get("progress") or {}
-    is_over = status in (Status.SUCCEEDED, Status.FAILED)
+    is_over = status in TERMINAL
     done_of = progress.get("iteration"), progress.get("iterations")
     attempt = job.get("attempt", 0)
     size = job.get("arraySize")

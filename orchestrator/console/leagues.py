@@ -33,6 +33,8 @@ router = page_router()
 
 _RACES = 20
 """Number of races under way, or over and not entered, on a league's page."""
+_READ = 100
+"""Jobs among which they are looked for: those of a name like its races', also entered ones and those of leagues with a longer name."""
 _INTERVAL = 2.0
 """Seconds between two looks at them; each reads all entries."""
 _recent = Recent(_INTERVAL * 0.9)
@@ -208,14 +210,14 @@ def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
     """The newest races of a league that the caller may see, by job, without those that are entered."""
     reconciler = reconciler_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
-    jobs = page_of_jobs(reconciler, Wanted(search=begins), 0, _RACES)["jobs"]
+    jobs = page_of_jobs(reconciler, Wanted(search=begins), 0, _READ)["jobs"]
     if not jobs:
         return {}
     described = batch.call(reconciler, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
     entered = api.entered_jobs(request, name)
     ours = [job for job in jobs if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered]
-    return {job["id"]: _race(job, str(tags[job["id"]].get(MODEL_TAG))) for job in ours}
+    return {job["id"]: _race(job, str(tags[job["id"]].get(MODEL_TAG))) for job in ours[:_RACES]}
 
 
 def _race(job: Mapping[str, Any], model: str) -> dict[str, Any]:

@@ -111,8 +111,12 @@ def session(request: Request) -> str:
 
 
 def _navigation(request: Request) -> list[Entry]:
+    """The pages that are there, without those that would be refused."""
+    refused = set() if may_change() else {"/submit"}
+    if current_identity.get().queues is not None:
+        refused.add("/keys")
     there: set[str] = request.app.state.console_paths
-    return [entry for entry in NAVIGATION if entry.path in there]
+    return [entry for entry in NAVIGATION if entry.path in there - refused]
 
 
 def wants_page(request: Request) -> bool:

@@ -18,6 +18,7 @@ from orchestrator.console.forms import Unconfirmed, check_form
 from orchestrator.console.pages import NAVIGATION, failure, wants_page
 from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
+from shared_store.wording import explain
 
 
 class PageRoute(APIRoute):
@@ -36,8 +37,7 @@ class PageRoute(APIRoute):
             except RequestValidationError as error:
                 first = error.errors()[0]
                 name = ".".join(map(str, first["loc"][1:])) or str(first["loc"][0])
-                said = first["msg"].replace("Input should be", "expected a value")
-                return failure(request, f"{name} {str(first['input'])[:100]!r}: {said}", 400)
+                return failure(request, f"{name}: {explain(first)}", 400)
             except DatabaseError as error:
                 return failure(request, str(error), 503, "ServerException")
             except DamagedFile as error:

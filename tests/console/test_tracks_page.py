@@ -22,7 +22,7 @@ def test_a_track_is_made_after_a_mistake_was_told_at_its_field(console: Console,
     person.click("Make")
     seed = page.get_by_label("Seed, of")
     expect(seed).to_be_focused()
-    assert str(seed.evaluate("field => field.validationMessage")).startswith("seed: Input should be less than")
+    assert str(seed.evaluate("field => field.validationMessage")).startswith("seed: expected a value less than")
     seed.fill("7")
     person.leave("Make")
     expect(page.get_by_role("heading", name="Track hills")).to_be_visible()

@@ -105,7 +105,7 @@ class Need:
 def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: Gang) -> Need:
     """Measure the memory of this task's worlds with this algorithm. Takes some seconds; every rank calls it."""
     load_kernels(learner[0], gang)
-    _taken(task_type, config, learner, MORE, gang)  # what torch sets up once for batches of this size is not the worlds'
+    _taken(task_type, config, learner, MORE, gang)  # first, because what torch sets up once is not the worlds'
     few, more = (_taken(task_type, config, learner, worlds, gang) for worlds in (FEW, MORE))
     world = max(more - few, 0) / (MORE - FEW)
     return Need(max(few - FEW * world, 0.0), world)

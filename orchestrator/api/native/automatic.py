@@ -214,10 +214,13 @@ class AutomaticEvaluations:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
             self._note(training, counted, f"checkpoint {chosen.name} was not evaluated: {error}")
-            log.warning("run %s: checkpoint %s is not evaluated: %s", run.name, chosen.name, error)
+            self._backoff.failed(
+                ("evaluations of", run.name), f"run {run.name}: checkpoints are not evaluated: {error}"
+            )
             return
         finally:
             permissions.current_identity.reset(token)
+        self._backoff.worked(("evaluations of", run.name))
         reconciler.wake()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
         log.info("job %s evaluates %s@%d%s", answer["jobId"][:8], run.name, chosen.iteration, passed)

@@ -13,9 +13,9 @@ from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
+from orchestrator.api.native.fitting import fit_of
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.registry import FRESH
@@ -75,8 +75,7 @@ def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
 
 
 def _check_fit(context: Context, spec: Spec, gang: GangSpec, what: str) -> None:
-    queue, engine = context.queue(spec.queue), context.reconciler.engine
-    if problem := fit_in_queue(context.session, engine, queue, gang.shape).problem:
+    if problem := fit_of(context.session, context.reconciler, context.queue(spec.queue), gang).problem:
         raise ClientError(f"{what}: {problem}")
 
 

@@ -36,27 +36,25 @@ from orchestrator.api.native import (
     track_routes,
     webhook_routes,
 )
+from orchestrator.api.native.fitting import fit_of, named_queue
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.control.snapshot import fit_in_queue, new_nodes
-from orchestrator.domain.errors import SpecError
+from orchestrator.control.snapshot import new_nodes
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Limit, Queued, engine_of
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Attempt, Job, JobQueue
+from orchestrator.persistence.models import Attempt, Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, short_id
 from orchestrator.persistence.session import DatabaseError
 from orchestrator.scheduling.placement import needs
-from orchestrator.spec.compile import compile_definition
-from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
 from shared_store.logs import LogFollower, LogLine, timestamp
 
 router = APIRouter(prefix="/api")
@@ -146,15 +144,13 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         if source.key in ("evaluate", "race"):
             check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
     with reconciler.database.session() as session:
-        queue = _queue(session, body.queue)
+        queue = named_queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_in_queue(session, reconciler.engine, queue, wanted.shape, FRESH)
+        found = fit_of(session, reconciler, queue, wanted, FRESH)
         if found.allocation is None:
             raise ClientError(
                 found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
             )
-        if problem := _problem_of_evaluations(session, reconciler, queue, wanted):
-            raise ClientError(problem)
         compute_environment, placements = found.allocation
         job = Job(
             id="job",
@@ -204,26 +200,9 @@ def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     wanted = _gang_of(body)
     check_tracks(reconciler.store, wanted.spec)
     with reconciler.database.session() as session:
-        queue = _queue(session, body.queue)
+        queue = named_queue(session, body.queue)
         permissions.check(Operation.FIT, JobsOf(queue.name))
-        problem = fit_in_queue(session, reconciler.engine, queue, wanted.shape, FRESH).problem
-        return {"problem": problem or _problem_of_evaluations(session, reconciler, queue, wanted)}
-
-
-def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> str | None:
-    """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
-    try:
-        wanted = wanted_of(gang.spec)
-        if wanted is None:
-            return None
-        place = place_of(queue.name, None, wanted)
-        spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
-        definition = compile_definition(spec, gang.options.directory)
-        shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
-        problem = fit_in_queue(session, reconciler.engine, _queue(session, place["queue"]), shape, FRESH).problem
-    except (ClientError, SpecError) as error:
-        problem = str(error)
-    return problem and f"evaluation: {problem}"
+        return {"problem": fit_of(session, reconciler, queue, wanted, FRESH).problem}
 
 
 def _gang_of(body: PlanRequest) -> GangSpec:
@@ -232,15 +211,6 @@ def _gang_of(body: PlanRequest) -> GangSpec:
     if definition["type"] != "multinode" or "nodeProperties" not in definition:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
     return rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
-
-
-def _queue(session: Session, name: str) -> JobQueue:
-    """The queue of this name. Raises ClientError naming those that the caller may see."""
-    queue = session.get(JobQueue, name)
-    if queue is None or queue.deleting:
-        there = ", ".join(queue_names(session)[:10])
-        raise ClientError(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
-    return queue
 
 
 def _planned(reconciler: Reconciler, gang: Gang) -> Plan[Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from orchestrator.console.pages import NAVIGATION
 from orchestrator.keys import KeyStore
 from tests.conftest import Serving
 from tests.support.console.fixtures import Console, secret_of
@@ -165,6 +166,15 @@ def test_every_page_loads_its_own_files_alone_and_has_the_strict_policy(console:
         assert "unsafe" not in "".join(policies) and "frame-ancestors 'none'" in "".join(policies)
         assert answer.headers["cache-control"] == "no-store"
         assert Page(answer.text).is_inert, answer.text
+
+
+@pytest.mark.parametrize(("name", "hidden"), [("admin", set()), ("reader", {"/submit"}), ("lab", {"/keys"})])
+def test_the_navigation_leads_to_every_page_that_is_not_refused(console: Console, name: str, hidden: set[str]) -> None:
+    visitor = console.visitor(name)
+    paths = {entry.path for entry in NAVIGATION}
+    assert paths - {each["href"] for each in visitor.page("/").all("a")} == hidden
+    for path in paths:
+        visitor.page(path, 403 if path in hidden else 200)
 
 
 def test_files_are_kept_for_ever_under_the_address_of_their_content_and_no_other_is_given_out(console: Console) -> None:

@@ -49,7 +49,13 @@ def test_the_newest_jobs_come_first_a_page_at_a_time(console: Console, many: lis
     assert names(second)[0] == "job-69"
     last = visitor.page("/?page=3")
     assert len(names(last)) == 20 and "hidden" in last.all("a", rel="next")[0]
-    assert names(visitor.page("/?page=9")) == []
+    beyond = visitor.page("/?page=9")
+    assert names(beyond) == [] and "This page of the table is empty" in beyond.text
+    for page, words in (
+        ("x", "a whole number, found a text ('x')"),
+        ("0", "a value greater than or equal to 1, found '0'"),
+    ):
+        assert f"page: expected {words}" in visitor.page(f"/?page={page}", 400).text
 
 
 def test_jobs_are_found_by_state_queue_and_part_of_a_name(console: Console, many: list[str]) -> None:

@@ -39,6 +39,8 @@ def test_leagues_are_listed_with_their_rules_and_their_table(console: Console, s
     assert "cup" in page.text and "user ada" in page.text and page.all("form", action="/leagues") == []
     page = visitor.page("/leagues/cup")
     assert "ada fast@1 0:37.500 0:12.000 3 of 3 0 0 0 ranked" in page.text
+    (drawn,) = page.all("img", alt="Outline of oval")
+    assert visitor.http.get(str(drawn["src"])).headers["content-type"] == "image/svg+xml"
     assert "Ranked by the time of all laps" in page.text and "at most 99 entries of each key or user" in page.text
     assert [each for each in page.all("form", method="post") if each["action"] != "/logout"] == []
     laps = visitor.page("/leagues/cup/entries/1").text
@@ -145,3 +147,15 @@ def test_an_entry_is_disqualified_once_the_person_has_said_yes(console: Console,
     page = visitor.page("/leagues/cup?every=yes")
     assert f"disqualified: {HOSTILE}" in page.text and page.is_inert
     assert visitor.page("/leagues/cup/entries/2").all("summary") == []
+
+
+def test_a_race_is_listed_beside_many_newer_jobs_of_a_like_name(console: Console, store: Store) -> None:
+    visitor = console.visitor()
+    add_league(store, "tea")
+    assert visitor.submit("/leagues/tea/races", model="fast@1").status_code == 200
+    definition = console.register("waits")
+    others = [console.submit(definition, f"race-tea-time-{i}") for i in range(21)]
+    page = visitor.page("/leagues/tea")
+    (job,) = [str(each.get("value")) for each in page.all("input", name="job") if each.get("value")]
+    for each in (job, *others):
+        console.client.batch("TerminateJob", jobId=each, reason="seen")

@@ -141,6 +141,14 @@ def test_curves_over_seeds_have_their_spread(console: Console, store: Store) -> 
     assert empty["x"] == [] and empty["lines"][0]["y"] == []
 
 
+def test_an_unknown_metric_is_refused_with_the_nearest_one(console: Console, store: Store) -> None:
+    visitor = console.visitor()
+    assert (
+        "no run here has a metric 'rewrd'; did you mean reward?"
+        in visitor.page("/compare?run=fast&metric=rewrd", 404).text
+    )
+
+
 def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
     visitor = console.visitor("lab")
     assert names(visitor.page("/runs")) == ["labs"]

@@ -78,9 +78,9 @@ def test_a_form_makes_a_track_for_good(console: Console) -> None:
     ("wrong", "told"),
     [
         ({"length": "2"}, "length 2 m: expected 4 to 1000 m"),
-        ({"length": "long"}, "length: Input should be a valid number"),
-        ({"least_radius": "nan"}, "least_radius: Input should be a finite number"),
-        ({"seed": "-1"}, "seed: Input should be greater than or equal to 0"),
+        ({"length": "long"}, "length: expected a number, found a text ('long')"),
+        ({"least_radius": "nan"}, "least_radius: expected a finite number"),
+        ({"seed": "-1"}, "seed: expected a value greater than or equal to 0, found '-1'"),
         ({"seed": ""}, "give one of preset and seed"),
         ({"preset": "oval", "roughness": "0.5"}, "roughness belongs to seed"),
         ({"preset": "ovall"}, "did you mean oval?"),

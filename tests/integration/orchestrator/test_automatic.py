@@ -21,7 +21,7 @@ from orchestrator.server import Server
 from shared_store.checkpoints import list_checkpoints, retain
 from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang
-from tests.support.orchestrator.trained import SPEC, add_checkpoint
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
 
@@ -241,7 +241,9 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
     assert controller.evaluations() == []
 
 
-def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(controller: Controller) -> None:
+def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(
+    controller: Controller, caplog: pytest.LogCaptureFixture
+) -> None:
     controller.client.batch(
         "CreateJobQueue",
         jobQueueName="idle",
@@ -256,10 +258,15 @@ def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is
     controller.look()
     problem = "checkpoint 00000010-e1 was not evaluated: Job queue idle is DISABLED and takes no jobs"
     assert controller.newest()["problem"] == problem and controller.evaluations() == []
-    controller.client.batch("UpdateJobQueue", jobQueue="idle", state="ENABLED")
     controller.save(20)
     controller.look()
-    assert controller.evaluations() == [(20, "RUNNABLE")] and controller.newest()["problem"] is None
+    assert "checkpoint 00000020-e1" in controller.newest()["problem"]
+    refused = "run taught: checkpoints are not evaluated: Job queue idle is DISABLED and takes no jobs"
+    assert caplog.messages.count(refused) == 1, "once, however many checkpoints it concerns"
+    controller.client.batch("UpdateJobQueue", jobQueue="idle", state="ENABLED")
+    controller.save(30)
+    controller.look()
+    assert controller.evaluations() == [(30, "RUNNABLE")] and controller.newest()["problem"] is None
 
 
 def test_a_queue_that_does_not_take_the_evaluations_is_refused_with_the_training(controller: Controller) -> None:
@@ -286,6 +293,20 @@ def test_evaluations_that_could_never_start_are_refused_with_the_training(
         home=controller.home,
     )
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    with controller.server.reconciler.database.session() as session:
+        assert not session.scalars(select(Job)).all()
+
+
+@pytest.mark.parametrize("command", [("resume", "taught"), ("clone", "taught", "--name", "twin")])
+def test_evaluations_that_could_never_start_are_refused_with_a_resume_and_a_clone(
+    controller: Controller, command: tuple[str, ...]
+) -> None:
+    add_run(controller.server.store, "taught")
+    controller.save(3)
+    section = "evaluation={every: 2, resources: {gpus: 1}}"
+    done = call_muster(*command, "--set", section, home=controller.home)
+    assert done.returncode == 2 and "evaluation: each node needs 1 CPU, 1 GPU" in done.stderr, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
     with controller.server.reconciler.database.session() as session:
         assert not session.scalars(select(Job)).all()
 

@@ -1,0 +1,54 @@
+"""Whether a job could ever start, and where: one answer for plans, submissions, resumes and clones."""
+
+from __future__ import annotations
+
+from sqlalchemy.orm import Session
+
+from orchestrator.api.batch import rules
+from orchestrator.api.context import queue_names
+from orchestrator.api.errors import ClientError
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.snapshot import fit_in_queue
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.gang import GangSpec
+from orchestrator.persistence.models import JobQueue
+from orchestrator.scheduling.fit import Fit
+from orchestrator.spec.compile import compile_definition
+from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
+
+
+def fit_of(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec, patience: float = 0.0) -> Fit:
+    """The answer of an idle queue to a job; a training whose automatic evaluations could never start has a problem, too.
+
+    ``patience``: seconds to wait for the engines' newest hosts.
+    """
+    found = fit_in_queue(session, reconciler.engine, queue, gang.shape, patience)
+    if found.problem or not (problem := _problem_of_evaluations(session, reconciler, queue, gang, patience)):
+        return found
+    return Fit(None, f"evaluation: {problem}")
+
+
+def named_queue(session: Session, name: str) -> JobQueue:
+    """The queue of this name. Raises ClientError naming those that the caller may see."""
+    queue = session.get(JobQueue, name)
+    if queue is None or queue.deleting:
+        there = ", ".join(queue_names(session)[:10])
+        raise ClientError(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
+    return queue
+
+
+def _problem_of_evaluations(
+    session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec, patience: float
+) -> str | None:
+    """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
+    try:
+        wanted = wanted_of(gang.spec)
+        if wanted is None:
+            return None
+        place = place_of(queue.name, None, wanted)
+        spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
+        definition = compile_definition(spec, gang.options.directory)
+        shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
+        return fit_in_queue(session, reconciler.engine, named_queue(session, place["queue"]), shape, patience).problem
+    except (ClientError, SpecError) as error:
+        return str(error)
