@@ -126,7 +126,7 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
         return
     task, seed = summary.get("task"), summary.get("seed")
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
-    for place, value in flattened(_mapping(summary, "config")):
+    for place, value in told_changes(summary):
         yield f"  with config.{place}: {value}"
     rewards, metrics = _mapping(summary, "rewards"), _mapping(summary, "metrics")
     largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
@@ -147,6 +147,13 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     yield f"ended by: {ends}"
     if compared := _mapping(summary, "compared"):
         yield _comparison(compared)
+
+
+def told_changes(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """How the worlds of an evaluation differ from the training's, by place, each in one line: a longer text only by its size."""
+    for place, value in flattened(_mapping(summary, "config")):
+        rows = value.splitlines() if isinstance(value, str) else []
+        yield place, counted(len(rows), "line") if len(rows) > 1 else str(value)
 
 
 def flattened(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

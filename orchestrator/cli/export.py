@@ -115,8 +115,9 @@ def _tell(place: Path, output: Path | None) -> None:
         told = ", ".join(f"{name} {value:.1e}" for name, value in differences.items())
         echo(f"  parity:      {told} at most, over {count:,} observations")
     if judged:
-        a, b = judged["trained"]["mean_return"], judged["bundle"]["mean_return"]
-        echo(
-            f"  judged:      return {b:.2f} of the bundle, {a:.2f} of the trained policy, {counted(judged['episodes'], 'episode')}"
-        )
+        a, b = judged["trained"], judged["bundle"]
+        returns = f"return {b['mean_return']:.2f} of the bundle, {a['mean_return']:.2f} of the trained policy"
+        known = b.get("success") is not None and a.get("success") is not None
+        successes = f"; success {b['success']:.0%} and {a['success']:.0%}" if known else ""
+        echo(f"  judged:      {returns}{successes}; {counted(judged['episodes'], 'episode')}")
     echo(f"  bundle:      {output or place} ({len(manifest['files']) + 1} files, {size / 1024:.0f} KiB)")

@@ -20,7 +20,7 @@ from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
 from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
-from shared_store.evaluations import flattened, in_one_line
+from shared_store.evaluations import in_one_line, told_changes
 from shared_store.policy_contract import differences, read
 from shared_store.wording import counted
 
@@ -104,10 +104,10 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
     if parent:
         echo(f"  parent:      run {parent.get('run')}, checkpoint {parent.get('checkpoint')}")
     for evaluation in found.get("evaluations") or []:
-        changed = ", ".join(f"{place} {value}" for place, value in flattened(evaluation.get("config") or {}))
-        echo(
-            f"  evaluation:  {in_one_line(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
-        )
+        changed = ", ".join(f"{place} {value}" for place, value in told_changes(evaluation))
+        seed = evaluation.get("seed")
+        worlds = "at the end of the training" if seed is None else f"seed {seed}"
+        echo(f"  evaluation:  {in_one_line(evaluation)}, {worlds}{f', with {changed}' if changed else ''}")
     if judged := found.get("judged"):
         echo(
             f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {counted(judged['episodes'], 'episode')}"

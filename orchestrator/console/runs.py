@@ -19,7 +19,7 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
-from shared_store.evaluations import flattened
+from shared_store.evaluations import told_changes
 from shared_store.metrics import finite
 
 router = page_router()
@@ -206,15 +206,12 @@ def _evaluation(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     success, when = evaluation.get("success"), evaluation.get("time")
     told = evaluation.get("return")
     interval = {**(told if isinstance(told, Mapping) else {}), "mean": evaluation.get("mean_return")}
-    changes = evaluation.get("config")
     share = finite(success.get("share")) if isinstance(success, Mapping) else None
     return {
         "key": evaluation.get("name", ""),
         "checkpoint": evaluation.get("checkpoint", ""),
         "table": f"/runs/{evaluation['run']}/files/evaluations/{evaluation['name']}.parquet" if evaluation else "/runs",
-        "worlds": ", ".join(f"{place}: {value}" for place, value in flattened(changes))
-        if isinstance(changes, Mapping)
-        else "",
+        "worlds": ", ".join(f"{place}: {value}" for place, value in told_changes(evaluation)),
         "seed": str(evaluation.get("seed") if evaluation.get("seed") is not None else ""),
         "episodes": str(evaluation.get("episodes", "")),
         "return": _interval(interval),

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
 from worker.deploy.parity import Recording
+from worker.distributed import Gang, Placement
 from worker.errors import TrainingError
+from worker.evaluation import episodes
+from worker.evaluation.episodes import Acting, Episodes
+from worker.learning.setup import observed
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
@@ -22,32 +25,7 @@ RECORDED_WORLDS, RECORDED_STEPS = 4, 256
 LARGEST = 128 << 20
 """Bytes of a recording; of large images it has fewer steps."""
 SHARE, ERRORS = 0.01, 2.0
-"""Tolerance between the mean returns of the bundle and of the trained policy: a share of it, or a number of standard errors."""
-
-
-class Acting(Protocol):
-    """A policy, trained or from a file."""
-
-    def act(self, observations: TensorDict) -> torch.Tensor: ...
-
-    def reset(self, worlds: Any = None) -> None: ...
-
-
-@dataclass(frozen=True)
-class Played:
-    """Whole episodes, one entry for each."""
-
-    returns: np.ndarray
-    lengths: np.ndarray
-    """In control steps."""
-
-    def facts(self) -> dict[str, float]:
-        """Figures for the report."""
-        return {
-            "mean_return": float(self.returns.mean()),
-            "std_return": float(self.returns.std()),
-            "mean_length": float(self.lengths.mean()),
-        }
+"""Tolerance between the means of the bundle and of the trained policy: a share of the latter, or a number of standard errors."""
 
 
 class Extremes:
@@ -86,9 +64,18 @@ class Extremes:
         return {name: each.numpy()[np.sort(first)] for name, each in joined.items()}
 
 
-def seen(task: Task) -> TensorDict:
-    """The task's observation groups, live, batch size (worlds,)."""
-    return TensorDict(dict(task.groups), [task.world_count], device=task.device)
+class _Watched:
+    """A policy whose observations are taken in before it acts."""
+
+    def __init__(self, policy: Acting, extremes: Extremes) -> None:
+        self._policy, self._extremes = policy, extremes
+
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        self._extremes.look(observations)
+        return self._policy.act(observations)
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        self._policy.reset(worlds)
 
 
 def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> Recording:
@@ -105,7 +92,7 @@ def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> Recording:
     steps = max(2, min(steps, LARGEST // each))
     kept: dict[str, list[np.ndarray]] = {name: [] for name in groups}
     begins = np.zeros((steps, worlds), dtype=bool)
-    observations = seen(task)
+    observations = observed(task)
     for step in range(steps):
         if step in (0, steps // 2):
             task.reset()
@@ -120,54 +107,48 @@ def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> Recording:
     return Recording({name: np.stack(rows) for name, rows in kept.items()}, begins)
 
 
-def play(task: Task, policy: Acting, rounds: int, extremes: Extremes | None = None) -> Played:
-    """Whole episodes from a fresh reset, ``rounds`` of each world, without noise.
+def play(task: Task, policy: Acting, rounds: int, extremes: Extremes | None = None) -> Episodes:
+    """Whole episodes from a fresh reset, ``rounds`` of each world, without noise, as an evaluation plays them.
 
     Args:
         task: The worlds.
         policy: On the task's device.
         rounds: At least 1.
-        extremes: Is shown every observation of episodes that are still running.
+        extremes: Is shown every observation.
     """
-    results = []
-    observations = seen(task)
-    for _ in range(rounds):
-        task.reset()
-        policy.reset()
-        result = torch.zeros(task.world_count, 2, dtype=torch.float64, device=task.device)
-        running = torch.ones(task.world_count, dtype=torch.bool, device=task.device)
-        for step in range(task.max_episode_length):
-            if extremes is not None:
-                extremes.look(observations)
-            task.step(policy.act(observations))
-            policy.reset(task.dones)
-            result[:, 0] += torch.where(running, task.rewards, 0.0)
-            result[:, 1] += running
-            running &= task.dones == 0
-            if step % 32 == 31 and not bool(running.any()):  # looking waits for the device, so look seldom
-                break
-        results.append(result.cpu())
-    returns, lengths = torch.cat(results).unbind(1)
-    return Played(returns.numpy(), lengths.numpy())
+    alone = Gang(Placement(), task.device, None, ["here"])
+    return episodes.play([task] * rounds, _Watched(policy, extremes) if extremes else policy, alone)
 
 
-def judge(trained: Played, bundle: Played) -> dict[str, Any]:
+def judge(trained: Episodes, bundle: Episodes) -> dict[str, Any]:
     """Both results, and how far they may differ. Raises TrainingError where the bundle's is farther from the trained policy's.
 
-    A difference of a rounding error grows in the course of an episode with contacts, so single episodes may differ; their mean may not.
+    A difference of a rounding error grows in the course of an episode with contacts, so single episodes may differ; their means may not.
     """
-    a, b = trained.returns, bundle.returns
+    found = _compare("mean return", trained.returns, bundle.returns)
+    if trained.successes is not None and bundle.successes is not None:
+        found["success"] = _compare("share of successes", trained.successes, bundle.successes)
+    return {"episodes": len(trained.rows), "trained": _facts(trained), "bundle": _facts(bundle), **found}
+
+
+def _compare(what: str, trained: torch.Tensor, bundle: torch.Tensor) -> dict[str, Any]:
+    """How far the means of two columns, a number for each episode, are apart and may be. Raises TrainingError if they are farther apart."""
+    a, b = trained.double().numpy(), bundle.double().numpy()
     tolerance = max(SHARE * abs(a.mean()), ERRORS * math.sqrt((a.var() + b.var()) / len(a)))
     apart = float(abs(a.mean() - b.mean()))
     if not apart <= tolerance:
         raise TrainingError(
-            f"the bundle does not do what the trained policy does: its mean return over {len(b)} episodes is {b.mean():g}, the trained "
+            f"the bundle does not do what the trained policy does: its {what} over {len(b)} episodes is {b.mean():g}, the trained "
             f"policy's on the same worlds {a.mean():g} (at most {tolerance:g} apart is allowed); not published"
         )
+    return {"difference": apart, "tolerance": float(tolerance)}
+
+
+def _facts(played: Episodes) -> dict[str, float | None]:
+    """Figures for the report; ``success`` is a share, or None where the task does not say what a success is."""
     return {
-        "episodes": len(a),
-        "trained": trained.facts(),
-        "bundle": bundle.facts(),
-        "difference": apart,
-        "tolerance": float(tolerance),
+        "mean_return": float(played.returns.mean()),
+        "std_return": float(played.returns.std(correction=0)),
+        "mean_length": float(played.lengths.mean()),
+        "success": None if played.successes is None else float(played.successes.double().mean()),
     }

@@ -119,7 +119,9 @@ class Evaluation:
         if race is not None:
             summary["race"] = race.summary()
         earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
-        earlier = [each for each in earlier if ("race" in each) == (race is not None)]
+        earlier = [
+            each for each in earlier if ("race" in each) == (race is not None) and _rewards(each) == _rewards(summary)
+        ]
         if earlier:
             summary["compared"] = self._compared(run, earlier[-1], summary)
         summary = _finite(summary)
@@ -194,6 +196,12 @@ def best_words(run: Run) -> str:
     return (
         f"best of {len(evaluated)} checkpoints that are evaluated: {run.name}@{best.iteration}, mean return {mean:.2f}"
     )
+
+
+def _rewards(summary: Mapping[str, Any]) -> list[Any]:
+    """What an evaluation rewarded: returns of other rewards can't be compared."""
+    terms, changes = summary.get("rewards") or {}, summary.get("config") or {}
+    return [{name: term.get("weight") for name, term in terms.items()}, changes.get("reward_function")]
 
 
 def _finite(value: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -225,6 +226,18 @@ def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
     fourth = result_of(task, played, "00000012-e1", 7, 0.0).write(run, "fourth-job", config={"angle_limit": 0.3})
     assert fourth["compared"]["name"] == "00000009-e1-third-jo" and "method" not in fourth["compared"]["return"]
     assert json.loads((run.evaluations / "00000006-e1-second-j.json").read_text()) == json.loads(json.dumps(second))
+
+
+def test_returns_of_other_rewards_are_not_compared(task: Cartpole, played: Episodes, tmp_path: Path) -> None:
+    run, function = Run(tmp_path / "run"), {"reward_function": {"file": "mine.py", "text": "one\ntwo\n"}}
+    result_of(task, played, "00000003-e1", 7, 0.0).write(run, "own-job", config={})
+    heavier = replace(result_of(task, played, "00000003-e1", 7, 0.0), weights={**task.config.rewards, "fall": -4.0})
+    assert "compared" not in heavier.write(run, "heavier", config={"rewards": {"fall": -4.0}})
+    other = result_of(task, played, "00000003-e1", 7, 0.0).write(run, "function", config=function)
+    assert "compared" not in other
+    assert "  with config.reward_function.text: 2 lines" in list(lines(other)), "and not the lines themselves"
+    again = result_of(task, played, "00000006-e1", 7, 0.0).write(run, "again", config={})
+    assert again["compared"]["name"] == "00000003-e1-own-job"
 
 
 def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_its_leftovers(

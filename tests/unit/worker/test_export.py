@@ -24,7 +24,9 @@ from worker.deploy import bundle
 from worker.deploy.bundle import Files, bundle_files
 from worker.deploy.model import OnnxPolicy, metadata_of
 from worker.deploy.parity import Recording
+from worker.deploy.rollouts import judge
 from worker.errors import TrainingError, UserError
+from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
 from worker.tasks.policy_contract import policy_contract
@@ -154,6 +156,7 @@ def test_a_bundle_is_judged_on_the_same_worlds_as_the_policy(tmp_path: Path, rec
     assert judged["bundle"]["mean_return"] == pytest.approx(judged["trained"]["mean_return"], abs=1e-3)
     assert judged["bundle"]["mean_length"] == judged["trained"]["mean_length"]
     assert judged["trained"]["std_return"] > 0.0, "and it is worth comparing"
+    assert judged["trained"]["success"] is None and "success" not in judged, "this task does not say what that is"
 
 
 def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
@@ -176,6 +179,23 @@ def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
         exported(run, recurrent, GroupedPoint(world_count=128))
     assert {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()} == stands
     assert [path.name for path in run.exports.iterdir()] == ["00000004-e1"]
+
+
+def played(returns: list[float], successes: list[int]) -> Episodes:
+    """Episodes of ten steps, as an evaluation records them."""
+    rows = torch.zeros(len(returns), 5, dtype=torch.float64)
+    rows[:, 0], rows[:, 1], rows[:, 4] = torch.tensor(returns), 10.0, torch.tensor(successes)
+    return Episodes(rows, (), ("time_out",), "arrived ended the episode")
+
+
+def test_a_bundle_has_to_succeed_as_often_as_its_policy() -> None:
+    """Of 16 episodes one that fails may be a rounding error, eight are not, though the mean return is the same."""
+    trained, seldom = played([1.0, 2.0] * 8, [1] * 16), played([1.0, 2.0] * 8, [1, 0] * 8)
+    found = judge(trained, played([1.0, 2.0] * 8, [0] + [1] * 15))
+    assert found["success"]["difference"] == 1 / 16 <= found["success"]["tolerance"]
+    assert (found["trained"]["success"], found["bundle"]["success"]) == (1.0, 15 / 16)
+    with pytest.raises(TrainingError, match=r"its share of successes over 16 episodes is 0\.5, the trained policy's"):
+        judge(trained, seldom)
 
 
 def test_a_second_export_replaces_the_first_as_a_whole(tmp_path: Path) -> None:
