@@ -72,6 +72,7 @@ def main() -> None:
             ]
             late = {
                 "state of a job, in the table": states(browser, server),
+                "point of a curve": points(browser, server),
                 "line of a log": lines(browser, server, talking),
             }
             browser.close()
@@ -85,20 +86,7 @@ def main() -> None:
 
 def fill(server: Serving) -> tuple[str, str]:
     """The ids of the training with the long log and of a job that prints; the server has its 1,000 jobs then."""
-    told = server.muster(
-        *(
-            "submit",
-            "job_specs/cartpole.yaml",
-            "--set",
-            "nodes=1",
-            "--set",
-            "train.worlds=2",
-            "--set",
-            "train.iterations=3",
-        ),
-    )
-    assert told.returncode == 0, told.stderr
-    (trained,) = [each["id"] for each in server.client.get("/api/jobs")["jobs"]]
+    trained = train(server, 3)
     server.wait(trained)
     run = Store(server.home / "store").run(server.detail(trained)["run"])
     with MetricsWriter(run, 9, 3) as metrics:
@@ -115,6 +103,15 @@ def fill(server: Serving) -> tuple[str, str]:
     talking = submit_gang(server.client, _TALKS, name="talks")
     server.wait(talking, "RUNNING")
     return trained, talking
+
+
+def train(server: Serving, iterations: int) -> str:
+    """The id of a training with two worlds."""
+    given = (f"--set={key}" for key in ("nodes=1", "train.worlds=2", f"train.iterations={iterations}"))
+    told = server.muster("submit", "job_specs/cartpole.yaml", *given)
+    assert told.returncode == 0, told.stderr
+    newest: str = server.client.get("/api/jobs", max=1)["jobs"][0]["id"]
+    return newest
 
 
 def terms(iteration: int) -> dict[str, float]:
@@ -186,6 +183,28 @@ def states(browser: Browser, server: Serving) -> list[float]:
         found.append(page.wait_for_function(there, arg=job, polling="raf").json_value() / 1000 - stopped)
     page.close()
     return [max(0.0, each) for each in found]
+
+
+def points(browser: Browser, server: Serving) -> list[float]:
+    """Seconds from just before an iteration is written until its reward is beside the curve of a training that runs."""
+    job = train(server, 10**9)
+    server.wait(job, "RUNNING")
+    page, found = browser.new_page(base_url=server.url), []
+    with MetricsWriter(Store(server.home / "store").run(server.detail(job)["run"]), 9, 10**9) as metrics:
+        metrics.write({"iteration": 10**9, "reward": 0})
+        page.goto(f"/jobs/{job}")
+        page.wait_for_selector("[data-charts] svg")
+        there = "told => [...document.querySelectorAll('[data-charts] li b')].some((each) => each.textContent === told) && Date.now()"
+        for number in range(1, EVENTS + 1):
+            time.sleep(0.37)  # in step with nothing
+            written = time.time()
+            metrics.write({"iteration": 10**9 + number, "reward": 5000 + number})
+            shown = page.wait_for_function(there, arg=str(5000 + number), polling="raf").json_value()
+            found.append(shown / 1000 - written)
+    page.close()
+    server.client.batch("TerminateJob", jobId=job, reason="measured")
+    server.wait(job)
+    return found
 
 
 def lines(browser: Browser, server: Serving, job: str) -> list[float]:
@@ -303,7 +322,7 @@ Medians of {VISITS} visits. Goals: first content under 0.5 s, interactive under 
 |---|---|---|---|
 {updates}
 
-From the answer to the stop, or from just before `print` in the rank, until the browser has it.
+From the answer to the stop, from just before an iteration is written, or from just before `print` in the rank, until the browser has it.
 
 | open pages | server, of a core | server's memory | scheduling pass | passes |
 |---|---|---|---|---|

@@ -23,7 +23,7 @@ from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
 from shared_store.evaluations import in_one_line
-from shared_store.wording import counted
+from shared_store.wording import counted, nearest
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 SetOption = Annotated[
@@ -165,7 +165,7 @@ def called(changes: Sequence[str] | None, name: str | None) -> list[str]:
 def check_engine(name: str) -> None:
     """Raises SpecError for a name that no engine has."""
     if name not in ENGINES:
-        raise SpecError(f"--engine {name}: there is no such engine; there are {', '.join(ENGINES)}")
+        raise SpecError(f"--engine {name}: there is no such engine; {nearest(name, ENGINES)}")
 
 
 def _counted(summary: dict[str, int]) -> str:

@@ -16,6 +16,7 @@ from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import routes
+from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.api.native.routes import PlanRequest
 from orchestrator.api.permissions import Operation
 from orchestrator.api.turns import Turns
@@ -177,8 +178,10 @@ def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
         problem = routes.fits(request, body)["problem"]
     except permissions.Refusal:
         raise
+    except UnknownQueue as error:
+        return Problem(str(error), "queue")
     except ClientError as error:
-        return Problem(str(error), "queue" if "queue" in str(error) else "")
+        return Problem(str(error))
     if problem and problem.startswith("evaluation: "):
         return Problem(problem.removeprefix("evaluation: "), "evaluation")
     return Problem(problem, "resources.cpus") if problem else None

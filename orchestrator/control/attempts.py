@@ -242,7 +242,6 @@ class Attempts:
     def gang(self, session: Session, job: Job, attempt: Attempt, spec: GangSpec) -> Gang:
         """The gang that the engine starts for an attempt."""
         nodes, options = spec.nodes[: len(attempt.nodes)], spec.options
-        compute_environment = attempt.compute_environment or "local"
         return Gang(
             job=job.id,
             attempt=attempt.number,
@@ -251,7 +250,7 @@ class Attempts:
             run=job.run,
             store=str(self.store.path),
             queue=job.queue,
-            compute_environment=compute_environment,
+            compute_environment=attempt.environment,
             main=spec.main,
             commands=[node.command for node in nodes],
             environments=[node.environment for node in nodes],
@@ -271,7 +270,7 @@ class Attempts:
             title=job.name,
             timeout=job.timeout,
             priority=job.priority,
-            options=engine_options(session, compute_environment, job.queue),
+            options=engine_options(session, attempt.environment, job.queue),
         )
 
     def _observe(self, job: Job, attempt: Attempt) -> Observed | None:

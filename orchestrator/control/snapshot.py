@@ -168,7 +168,7 @@ def _running(job: Job, attempt: Attempt) -> Running:
         queue=job.queue,
         share=job.share,
         priority=job.priority,
-        compute_environment=attempt.compute_environment or "local",
+        compute_environment=attempt.environment,
         placements=placements_of(attempt),
         started_at=attempt.running_since,
         timeout=job.timeout,

@@ -293,7 +293,7 @@ class Attempt(Base):
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     epoch: Mapped[int]
     compute_environment: Mapped[str | None] = mapped_column(default=None)
-    """Its name."""
+    """Its name, for :attr:`environment`."""
     handle: Mapped[str | None] = mapped_column(default=None)
     """The engine's name for the gang; None until it was launched."""
     ending: Mapped[str | None] = mapped_column(default=None)
@@ -321,6 +321,11 @@ class Attempt(Base):
     @validates("status_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
         return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
+
+    @property
+    def environment(self) -> str:
+        """The name of its compute environment. Attempts of Muster 0.1 have none: they ran on this machine."""
+        return self.compute_environment or "local"
 
     def node(self, index: int) -> Node | None:
         """Its node of this index; None if it has none, because it was started with fewer nodes."""

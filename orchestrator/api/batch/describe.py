@@ -221,14 +221,14 @@ def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
 
 
 def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
-    record, compute_environment = attempt.node(node), attempt.compute_environment or "local"
+    record = attempt.node(node)
     detail = {
         "exitCode": record.exit_code if record else None,
         "reason": record.reason[:255] if record and record.reason else None,
         "logStreamName": stream_name(job, attempt.number, node) if attempt.started_at else None,
-        "containerInstanceArn": ecs_arn("container-instance", compute_environment, record.host) if record else None,
+        "containerInstanceArn": ecs_arn("container-instance", attempt.environment, record.host) if record else None,
         "taskArn": ecs_arn(
-            "task", compute_environment, uuid.uuid5(uuid.NAMESPACE_OID, f"{job.id}/{attempt.number}/{node}").hex
+            "task", attempt.environment, uuid.uuid5(uuid.NAMESPACE_OID, f"{job.id}/{attempt.number}/{node}").hex
         ),
         "networkInterfaces": [{"privateIpv4Address": record.address}] if record and record.address else [],
     }

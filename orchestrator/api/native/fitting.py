@@ -28,12 +28,16 @@ def fit_of(session: Session, reconciler: Reconciler, queue: JobQueue, gang: Gang
     return Fit(None, f"evaluation: {problem}")
 
 
+class UnknownQueue(ClientError):
+    """A request names a queue that does not exist."""
+
+
 def named_queue(session: Session, name: str) -> JobQueue:
-    """The queue of this name. Raises ClientError naming those that the caller may see."""
+    """The queue of this name. Raises UnknownQueue naming those that the caller may see."""
     queue = session.get(JobQueue, name)
     if queue is None or queue.deleting:
         there = ", ".join(queue_names(session)[:10])
-        raise ClientError(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
+        raise UnknownQueue(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
     return queue
 
 

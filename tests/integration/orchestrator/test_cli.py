@@ -156,7 +156,7 @@ def test_an_address_that_is_no_url_is_wrong_use(tmp_path: Path, url: str) -> Non
 
 @pytest.mark.parametrize(
     ("option", "part"),
-    [(["--engine", "rya"], "there is no such engine; there are local"), (["--trust-proxy", "x"], "give the proxy's")],
+    [(["--engine", "rya"], "there is no such engine; did you mean ray?"), (["--trust-proxy", "x"], "give the proxy's")],
 )
 def test_an_option_that_serve_cannot_use_is_wrong_use(tmp_path: Path, option: list[str], part: str) -> None:
     refused(["serve", "--port", "0", *option], tmp_path, 2, option[0], part)
@@ -167,7 +167,7 @@ def test_an_engine_that_does_not_exist_is_not_recommended(shared_server: Serving
         ["submit", "job_specs/cartpole.yaml", "--engine", "rya"],
         shared_server.home,
         2,
-        "--engine rya: there is no such engine; there are local, docker, ray, slurm, aws-batch",
+        "--engine rya: there is no such engine; did you mean ray?",
     )
 
 
