@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.engines.api import EngineError, Setting
-from orchestrator.engines.installed import ENGINES, make_engine
+from orchestrator.engines.installed import make_engine
 from orchestrator.engines.ray.cluster import ray_environment
 from orchestrator.engines.slurm import commands as slurm_commands
 from orchestrator.engines.toolkit.mounts import Mount, with_mounts
@@ -19,7 +19,7 @@ def test_an_unknown_engine_is_refused_with_those_that_there_are(tmp_path: Path) 
     refused = run_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
     assert (
         refused.returncode == 2
-        and refused.stderr == f"muster: --engine dokcer: there is no such engine; did you mean docker?\n"
+        and refused.stderr == "muster: --engine dokcer: there is no such engine; did you mean docker?\n"
     )
     assert not (tmp_path / "muster.db").exists(), "nothing was made"
 
