@@ -87,7 +87,10 @@ def print_cut(table: Table) -> None:
         column.min_width = width
     taken = sum(2 + width for width in widths[:-1])
     if not sys.stdout.isatty():
-        Console(width=taken + 2 + widths[-1]).print(table, soft_wrap=True)
+        printed = Console(width=taken + 2 + widths[-1])
+        with printed.capture() as captured:
+            printed.print(table, soft_wrap=True)
+        echo_raw("\n".join(line.rstrip() for line in captured.get().splitlines()))  # one long row pads no other
         return
     table.columns[-1].max_width = max(len("REASON"), console.width - taken)
     Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)

@@ -129,10 +129,16 @@ def find_task(name: str) -> type[Task]:
     except ModuleNotFoundError as error:
         if error.name is None or not (module_name == error.name or module_name.startswith(error.name + ".")):
             raise
-        raise ValueError(f"task {name!r}: there is no module {module_name!r} on the path") from error
+        raise ValueError(
+            f"task {name!r}: there is no module {module_name!r} on the path, nor in {os.getcwd()}"
+        ) from error
     found = getattr(module, class_name, None)
     from worker.tasks.task import Task
 
     if not (isinstance(found, type) and issubclass(found, Task)):
-        raise ValueError(f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.task.Task")
+        classes = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module_name]
+        there = nearest(class_name, [each.__name__ for each in classes if issubclass(each, Task)])
+        raise ValueError(
+            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.task.Task; {there}"
+        )
     return found

@@ -288,6 +288,7 @@ def test_for_another_program_long_reasons_are_whole_and_no_column_is_lost(capsys
     table.add_row("0123abcd", "a-job", "a long story " * 120)
     print_cut(table)
     header, row = capsys.readouterr().out.splitlines()
+    assert header == header.rstrip(), "a long row pads no other"
     assert header.split() == ["JOB", "NAME", "REASON"] and row.split()[:2] == ["0123abcd", "a-job"]
     assert row.count("story") == 120
 

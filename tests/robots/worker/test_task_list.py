@@ -55,8 +55,9 @@ def test_one_task_is_described_by_name_and_a_wrong_name_is_refused_in_one_line(t
     wrong = run_muster("tasks", "Quadrupet", home=tmp_path)  # which imports nothing
     assert wrong.returncode == 2 and len(wrong.stderr.splitlines()) == 1
     assert "no task is called 'Quadrupet'; did you mean Quadruped?" in wrong.stderr
-    nowhere = run_muster("tasks", "job_specs.my_task:Cat", home=tmp_path)
-    assert nowhere.returncode == 2 and "has no class 'Cat' that is" in nowhere.stderr
+    nowhere = run_muster("tasks", "job_specs.my_task:Pendulun", home=tmp_path)
+    assert nowhere.returncode == 2 and "has no class 'Pendulun' that is" in nowhere.stderr
+    assert nowhere.stderr.endswith("; did you mean Pendulum?\n")
 
 
 def test_the_command_imports_no_simulation() -> None:
