@@ -8,6 +8,7 @@ have run and its stream is open. Both count from the begin of the navigation, in
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import shutil
 import statistics
@@ -108,10 +109,10 @@ def fill(server: Serving) -> tuple[str, str]:
 def train(server: Serving, iterations: int) -> str:
     """The id of a training with two worlds."""
     given = (f"--set={key}" for key in ("nodes=1", "train.worlds=2", f"train.iterations={iterations}"))
-    told = server.muster("submit", "job_specs/cartpole.yaml", *given)
+    told = server.muster("submit", "job_specs/cartpole.yaml", "--json", *given)
     assert told.returncode == 0, told.stderr
-    newest: str = server.client.get("/api/jobs", max=1)["jobs"][0]["id"]
-    return newest
+    job: str = json.loads(told.stdout)["jobId"]
+    return job
 
 
 def terms(iteration: int) -> dict[str, float]:

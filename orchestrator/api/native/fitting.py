@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import rules
@@ -29,15 +31,18 @@ def fit_of(session: Session, reconciler: Reconciler, queue: JobQueue, gang: Gang
 
 
 class UnknownQueue(ClientError):
-    """A request names a queue that does not exist."""
+    """A request names a queue that does not exist; ``known``: those that the caller may see."""
+
+    def __init__(self, name: str, known: Sequence[str], status: int = 400) -> None:
+        there = ", ".join(known[:10]) or "none"
+        super().__init__(f"there is no queue {name[:100]!r}; there is {there}", status)
 
 
 def named_queue(session: Session, name: str) -> JobQueue:
-    """The queue of this name. Raises UnknownQueue naming those that the caller may see."""
+    """The queue of this name. Raises UnknownQueue."""
     queue = session.get(JobQueue, name)
     if queue is None or queue.deleting:
-        there = ", ".join(queue_names(session)[:10])
-        raise UnknownQueue(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
+        raise UnknownQueue(name, queue_names(session))
     return queue
 
 

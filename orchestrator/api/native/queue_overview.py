@@ -12,7 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.api.permissions import JobsOf, is_visible
 from orchestrator.control.compute_environments import own_queues
 from orchestrator.control.reconciler import Reconciler
@@ -48,7 +48,7 @@ def queues(
 
 
 def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
-    """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises ClientError."""
+    """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises UnknownQueue."""
     engine = reconciler.engine
     capacities = engine.capacity()
     with reconciler.database.session() as session:
@@ -56,9 +56,9 @@ def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
         rows = [
             row for row in session.scalars(select(JobQueue).order_by(JobQueue.name)) if is_visible(JobsOf(row.name))
         ]
-        if only and only not in {row.name for row in rows}:
-            there = ", ".join(row.name for row in rows[:10]) or "none"
-            raise ClientError(f"there is no queue {only[:100]!r}; there is {there}", 404)
+        names = [row.name for row in rows]
+        if only and only not in names:
+            raise UnknownQueue(only, names, 404)
         rows = sorted((row for row in rows if only in ("", row.name)), key=lambda row: -row.priority)
         read = {row.name: read_queue(row, policies) for row in rows}
         held = open_attempts(session, reconciler.work_queue.active())

@@ -15,7 +15,7 @@ from tests.conftest import run_muster
 from tests.support.engines.slurm_cluster import need_slurm
 
 
-def test_an_unknown_engine_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+def test_an_unknown_engine_is_refused_with_the_nearest_one(tmp_path: Path) -> None:
     refused = run_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
     assert (
         refused.returncode == 2
