@@ -26,6 +26,18 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "Ant": ("Ant", {}),
     "images": ("CartpolePixels", {}),
     "a car that no physics moves": ("Racer", {}),
+    "a car that slides and chooses": (
+        "Racer",
+        {
+            "config": {
+                "friction": [0.4, 0.9],
+                "action_space": {
+                    "action_space": [{"steering_angle": angle, "speed": 2.0} for angle in (-30, 0, 30)],
+                    "action_space_type": "discrete",
+                },
+            }
+        },
+    ),
     "a camera on a car": ("RacerPixels", {"config": {"front": {"width": 64, "height": 64}}}),
     "a camera on a body": ("tests.support.worker.seeing:SeeingDepth", {}),
     "a critic of its own": (
@@ -162,7 +174,7 @@ def test_copies_of_a_state_that_grows_and_shrinks_are_right() -> None:
         assert torch.equal(copied["replay"], state["replay"].cpu()) and int(copied["place"]) == length
 
 
-@pytest.mark.parametrize("case", ["Cartpole", "a camera on a car"])
+@pytest.mark.parametrize("case", ["Cartpole", "a car that slides and chooses", "a camera on a car"])
 def test_each_control_step_of_a_rollout_is_one_row_however_late_the_device_is(tmp_path: Path, case: str) -> None:
     from benchmarks.training import build
     from worker.telemetry.rollout import Rollout
