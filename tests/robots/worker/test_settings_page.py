@@ -73,7 +73,9 @@ def test_what_it_says_of_mjlab_s_solver_is_in_mjlab_s_files() -> None:
     assert MJLAB["LiftCubes"] == MJLAB["LiftCube"] | {"nconmax": 55 + 3 * 120}
 
 
-@pytest.mark.parametrize("name", ["go1-flat", "go1-rough", "g1-flat", "g1-rough", "g1-walk", "g1-rough-walk", "lift-cube", "lift-cubes"])
+@pytest.mark.parametrize(
+    "name", ["go1-flat", "go1-rough", "g1-flat", "g1-rough", "g1-walk", "g1-rough-walk", "lift-cube", "lift-cubes"]
+)
 def test_a_job_s_file_says_how_many_steps_it_takes_and_how_to_try_it_without_a_gpu(name: str) -> None:
     text = (REPOSITORY / "job_specs" / f"{name}.yaml").read_text()
     train = yaml.safe_load(text)["train"]
