@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import mujoco
 import newton
 import numpy as np
 import warp as wp
@@ -49,6 +50,7 @@ class RobotView:
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none.
         efforts: Greatest force of each joint's actuator [N, N m], infinite where it is not limited.
         gains: Force on each joint per unit of its actuator's input, gear times gain [N, N m]; 1 without an actuator.
+        inputs: What each joint's actuator takes: ``"effort"``, ``"position"`` or ``"velocity"``; empty without one, or of another kind.
         bodies: Column of each body in ``BodyArrays``.
         sites: Index of each site among the shapes of a world.
         site_bodies: Column of the body of each site; -1: the world.
@@ -114,8 +116,8 @@ class RobotView:
         self.efforts = [
             _effort(template, dof, actuator) for dof, actuator in zip(self.dofs, self.actuators, strict=True)
         ]
-
         self.gains = [_gain(template, actuator) for actuator in self.actuators]
+        self.inputs = [_input(template, actuator) for actuator in self.actuators]
 
     def _read_shapes(self, template: newton.ModelBuilder) -> None:
         mine = self._mine(template.shape_label)
@@ -221,7 +223,11 @@ def dof_names(template: newton.ModelBuilder, joint: int) -> list[str]:
 
 def actuator_value(template: newton.ModelBuilder, attribute: str, actuator: int) -> Any:
     """One of the builder's ``mujoco:actuator_...`` values, or its default where the file didn't give it."""
-    attributes = template.custom_attributes[f"mujoco:{attribute}"]
+    return _value(template, f"mujoco:{attribute}", actuator)
+
+
+def _value(template: newton.ModelBuilder, attribute: str, actuator: int) -> Any:
+    attributes = template.custom_attributes[attribute]
     values: Any = attributes.values
     value = values.get(actuator) if isinstance(values, dict) else values[actuator] if values else None
     return attributes.default if value is None else value
@@ -263,6 +269,21 @@ def _gain(template: newton.ModelBuilder, actuator: int) -> float:
         return 1.0
     gear = float(actuator_value(template, "actuator_gear", actuator)[0])
     return gear * float(actuator_value(template, "actuator_gainprm", actuator)[0]) or 1.0
+
+
+def _input(template: newton.ModelBuilder, actuator: int) -> str:
+    """What an actuator takes, by the shortcuts of MuJoCo's file format: motor, position, velocity; empty for any other."""
+    if actuator < 0 or int(actuator_value(template, "actuator_dyntype", actuator)) == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+        return ""
+    if "muster:explicit" in template.custom_attributes and _value(template, "muster:explicit", actuator):
+        return "position"
+    if not int(actuator_value(template, "actuator_biastype", actuator)):
+        return "effort"
+    gain = float(actuator_value(template, "actuator_gainprm", actuator)[0])
+    _, position, velocity, *_ = map(float, actuator_value(template, "actuator_biasprm", actuator))
+    if position:
+        return "position" if math.isclose(position, -gain, rel_tol=1e-5) else ""
+    return "velocity" if math.isclose(velocity, -gain, rel_tol=1e-5) else ""
 
 
 def _is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:

@@ -8,6 +8,8 @@ from typing import Any
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.differential_ik import DifferentialIK
 from worker.tasks.binding import Bound
+from worker.tasks.declaration import Action
+from worker.tasks.term_needs import needs_of
 
 
 def frame_of(bound: Bound, sensors: Mapping[str, Any]) -> DifferentialIK | None:
@@ -24,8 +26,21 @@ def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
     yield from (name for name, sensor in sensors.items() if name in given and isinstance(sensor, DifferentialIK))
 
 
-def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:
-    """Refuse a term that drives neither joints nor a frame, or joints without an actuator; fill in the names of a frame's columns.
+TAKING = {
+    "effort": ("an effort", "terms.effort", "an EffortActuator"),
+    "position": ("a position", "terms.position_target", "a PositionActuator"),
+    "velocity": ("a velocity", "terms.velocity_target", "a VelocityActuator"),
+}
+"""Each kind of input in words, a function that writes it, and an actuator that takes it."""
+
+
+def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> str:
+    """Refuse a term that drives neither joints nor a frame, or joints without an actuator that takes what it writes.
+
+    The names of a frame's columns are filled in.
+
+    Returns:
+        What the term writes to actuators: ``"effort"``, ``"position"`` or ``"velocity"``.
 
     Raises:
         ValueError: In one line with its place.
@@ -44,13 +59,36 @@ def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[
             raise ValueError(
                 f"{place}: size is {len(bound.element_names)}, and an absolute target has {len(columns)} columns; leave size= out"
             )
-        return
+        return "position"
     view = views[term.robot]
     lacking = [joint for joint in bound.elements or [] if view.actuators[joint] < 0]
     if lacking:
         raise ValueError(
             f"{place}: joint {view.joint_names[lacking[0]]} has no actuator; give the robot one, or leave the joint out of joints="
         )
+    return _input_of(bound, view)
+
+
+def _input_of(bound: Bound, view: RobotView) -> str:
+    """What a term of joints writes to their actuators. Raises ValueError if it contradicts itself, or an actuator takes another input."""
+    place, term, joints = bound.place, bound.term, bound.elements or []
+    assert isinstance(term, Action)
+    known = needs_of(term.function).kind
+    if term.kind and known and term.kind != known:
+        raise ValueError(
+            f"{place}: kind is {term.kind!r}, and {term.function_name} writes {TAKING[known][0]}; leave kind= out"
+        )
+    taken = {view.inputs[joint] for joint in joints}
+    kind = term.kind or known or (taken.pop() if len(taken) == 1 else "") or "effort"
+    for joint in joints:
+        takes = view.inputs[joint]
+        if takes and takes != kind:
+            (written, _, actuator), (taking, function, _) = TAKING[kind], TAKING[takes]
+            raise ValueError(
+                f"{place}: {term.function_name} writes {written}, and the actuator of joint {view.joint_names[joint]} takes {taking}; "
+                f"use {function}, or give the joint {actuator}"
+            )
+    return kind
 
 
 def check_driven(acting: Sequence[Bound], views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:

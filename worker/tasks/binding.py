@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any
 
 import warp as wp
@@ -122,7 +123,7 @@ class Binder:
                     f"{place}: {found.name} has a parameter {found.element}, which there is nothing for here"
                 )
             bound.elements, bound.element_names = self._elements(place, term, found, given)
-        self._check_limits(bound)
+        self._check_robot(bound)
         known = [name for name, kind in found.parameters.items() if is_named(name, kind, found)]
         for name in term.parameters:
             if name not in known:
@@ -192,13 +193,17 @@ class Binder:
             )
         return [str(frame) for frame in range(len(rows) // count)]
 
-    def _check_limits(self, bound: Bound) -> None:
-        """Refuse joints without the limits that a function needs."""
+    def _check_robot(self, bound: Bound) -> None:
+        """Refuse a fixed root where a function moves it, and joints without the limits that it needs."""
         needed, view = needs_of(bound.term.function), self.views.get(bound.term.robot)
+        purpose = f"{bound.place}: {bound.term.function_name}"
+        if view is not None and needed.free_root and view.root_coordinate < 0:
+            raise ValueError(f"{purpose} moves a free root, and that of {view.name} is fixed; leave the term out")
         if view is None or bound.elements is None:
             return
-        purpose = f"{bound.place}: {bound.term.function_name}"
         if needed.ranges:
+            view.need_ranges(bound.elements, purpose)
+        if needed.some_ranges and not any(all(map(isfinite, view.ranges[joint])) for joint in bound.elements):
             view.need_ranges(bound.elements, purpose)
         if needed.efforts:
             view.need_efforts(bound.elements, purpose)

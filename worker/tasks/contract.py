@@ -119,9 +119,9 @@ def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) ->
     for index, joint in enumerate(driven.bound.elements or ()):
         actuator = view.actuators[joint]
         gain = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
-        stiffness, damping = gain if term.kind == "position" else 0.0, -float(model.actuator_biasprm[actuator, 2])
+        stiffness, damping = gain if driven.kind == "position" else 0.0, -float(model.actuator_biasprm[actuator, 2])
         effort = view.efforts[joint]
-        is_effort = term.kind == "effort"
+        is_effort = driven.kind == "effort"
         if motors is not None and motors["explicit"][actuator]:
             stiffness, damping, effort = (float(motors[name][actuator]) for name in _GAINS)
             is_effort = False
@@ -130,8 +130,8 @@ def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) ->
         found.append(
             Action(
                 view.joint_names[joint],
-                term.kind,
-                term.unit or UNITS[term.kind][int(model.jnt_type[model.actuator_trnid[actuator, 0]] == slide)],
+                driven.kind,
+                term.unit or UNITS[driven.kind][int(model.jnt_type[model.actuator_trnid[actuator, 0]] == slide)],
                 scale=scale,
                 default_position=view.defaults[joint],
                 offset=offset,

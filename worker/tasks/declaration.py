@@ -287,7 +287,8 @@ class Action(Term):
         scale: Factor: one number, or a mapping from patterns of joints or columns.
         offset: One number, a mapping from patterns of joints, or ``"default"``: each joint's default position.
         clip: Least and greatest action; None: no clipping.
-        kind: The actuator's input: ``"effort"``, ``"position"`` or ``"velocity"``.
+        kind: What the function writes to the actuator: ``"effort"``, ``"position"`` or ``"velocity"``. By default what a function of the
+            library writes, and for any other function what the joints' actuators take.
         unit: Of the actuator's input; by default that of ``kind`` on a revolute or prismatic joint, such as N m or N.
         **options: As for :class:`Term`.
     """
@@ -299,7 +300,7 @@ class Action(Term):
         scale: Any = 1.0,
         offset: Any = 0.0,
         clip: tuple[float, float] | None = (-1.0, 1.0),
-        kind: Literal["effort", "position", "velocity"] = "effort",
+        kind: Literal["effort", "position", "velocity"] | None = None,
         unit: str | None = None,
         **options: Any,
     ) -> None:

@@ -72,7 +72,6 @@ class LiftCube(DeclaredTask):
                     scale=ACTION_SCALE,
                     offset="default",
                     clip=None,
-                    kind="position",
                 )
             },
             observations={

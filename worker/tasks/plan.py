@@ -78,13 +78,14 @@ class Seen:
 
 @dataclass
 class Driven:
-    """An action term: its first action, and the numbers of its joints."""
+    """An action term: its first action, the numbers of its joints, and what it writes to their actuators."""
 
     bound: Bound
     first: int
     scale: Column
     offset: Column
     clip: int | None
+    kind: str
 
 
 @dataclass
@@ -231,13 +232,13 @@ class Plan:
         for name, term in declared.items():
             place, first = f"actions.{name}", len(self.binder.actions)
             bound = self._bind("actions", name, term, own={"value": "value"})
-            check_action(bound, self.views, self.binder.sensors)
+            kind = check_action(bound, self.views, self.binder.sensors)
             self.binder.actions += bound.element_names
             offset = self._default(place, bound) if term.offset == "default" else term.offset
             clip = self.numbers.add(f"{place}.clip", term.clip, 2, in_order) if term.clip is not None else None
             scale = self._columns(f"{place}.scale", term.scale, bound.element_names)
             self.driven.append(
-                Driven(bound, first, scale, self._columns(f"{place}.offset", offset, bound.element_names), clip)
+                Driven(bound, first, scale, self._columns(f"{place}.offset", offset, bound.element_names), clip, kind)
             )
         check_driven([driven.bound for driven in self.driven], self.views, self.binder.sensors)
 

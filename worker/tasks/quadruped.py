@@ -90,11 +90,7 @@ class Quadruped(DeclaredTask):
             return Reward(function, per_second=True, **options)
 
         return Declaration(
-            actions={
-                "target": Action(
-                    terms.position_target, scale=config.action_scale, offset="default", kind="position", unit="rad"
-                )
-            },
+            actions={"target": Action(terms.position_target, scale=config.action_scale, offset="default", unit="rad")},
             observations={
                 "trunk_velocity": Observation(terms.root_com_linear_velocity, unit="m/s"),
                 "trunk_angular_velocity": Observation(terms.root_angular_velocity, unit="rad/s"),

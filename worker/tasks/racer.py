@@ -308,8 +308,8 @@ def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
         return Choice(racing.choose, names=space.names, targets=targets)
     low, high = (math.radians(end) for end in space.steering)
     slow, fast = space.speed
-    steering = {"scale": (high - low) / 2, "offset": (high + low) / 2, "kind": "position", "unit": "rad"}
-    speed = {"scale": (fast - slow) / 2, "offset": (fast + slow) / 2, "kind": "velocity", "unit": "m/s"}
+    steering = {"scale": (high - low) / 2, "offset": (high + low) / 2, "unit": "rad"}
+    speed = {"scale": (fast - slow) / 2, "offset": (fast + slow) / 2, "unit": "m/s"}
     return {
         "steering": Action(terms.position_target, joints="steering", **steering),
         "speed": Action(terms.velocity_target, joints="speed", **speed),

@@ -29,7 +29,10 @@ class Needs:
         points: The number that says how many columns of its height scan belong to one ``index``; empty: one column each.
         numbers: Whether ``index`` counts the numbers of the command.
         ranges: Whether the joints must have limits of their positions.
+        some_ranges: Whether at least one of the joints must have such limits, since the function does nothing for the others.
         efforts: Whether the joints must have actuators with limits of their forces.
+        free_root: Whether the root must be free, since the function moves it.
+        kind: What an action's function writes to an actuator: ``"effort"``, ``"position"`` or ``"velocity"``; empty: unknown.
     """
 
     memory: int = 0
@@ -42,7 +45,10 @@ class Needs:
     points: str = ""
     numbers: bool = False
     ranges: bool = False
+    some_ranges: bool = False
     efforts: bool = False
+    free_root: bool = False
+    kind: str = ""
 
 
 NOTHING = Needs()

@@ -135,7 +135,6 @@ class Velocity(DeclaredTask):
                     scale=self.walker.action_scale,
                     offset="default",
                     clip=None,
-                    kind="position",
                     unit="rad",
                 )
             },

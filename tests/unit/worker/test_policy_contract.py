@@ -23,12 +23,16 @@ from worker.tasks import (
     Action,
     Declaration,
     DeclaredTask,
+    EffortActuator,
     ExplicitPDActuator,
     Observation,
     PositionActuator,
     Reward,
     Robot,
+    RobotArrays,
     TaskConfig,
+    VelocityActuator,
+    WorldArrays,
     reward_weights,
     terms,
 )
@@ -238,3 +242,68 @@ def test_a_rule_beyond_scale_and_offset_is_given_in_words() -> None:
     first, _ = driven_by(terms.smoothed_position_target, servo, kind="position", share=0.25)
     assert first["rule"].startswith("A position target that follows ``value`` slowly: t = share * value")
     assert first["rule"].endswith("(share = 0.25)")
+
+
+@wp.func
+def press(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    worlds.controls[world, robot.actuators[joint]] = 2.0 * value
+
+
+@pytest.mark.parametrize(
+    ("function", "actuator", "kind", "unit"),
+    [
+        (terms.position_target, PositionActuator("*", 20.0, 0.5), "position", "rad"),
+        (terms.position_target, ExplicitPDActuator("*", 20.0, 0.5), "position", "rad"),
+        (terms.velocity_target, VelocityActuator("*", 0.5), "velocity", "rad/s"),
+        (terms.effort, EffortActuator("*"), "effort", "N m"),
+        (press, PositionActuator("*", 20.0, 0.5), "position", "rad"),
+    ],
+)
+def test_an_action_is_what_its_function_writes_or_else_what_its_actuators_take(
+    function: Any, actuator: Any, kind: str, unit: str
+) -> None:
+    first, _ = driven_by(function, actuator)
+    assert (first["kind"], first["unit"]) == (kind, unit)
+
+
+SERVO = PositionActuator("*", 20.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("function", "actuator", "options", "words"),
+    [
+        (
+            terms.effort,
+            SERVO,
+            {},
+            "effort writes an effort, and the actuator of joint first takes a position; use terms.position_target, "
+            "or give the joint an EffortActuator",
+        ),
+        (
+            terms.position_target,
+            EffortActuator("*"),
+            {},
+            "position_target writes a position, and the actuator of joint first takes an effort; use terms.effort, "
+            "or give the joint a PositionActuator",
+        ),
+        (
+            press,
+            SERVO,
+            {"kind": "velocity"},
+            "press writes a velocity, and the actuator of joint first takes a position; use terms.position_target, "
+            "or give the joint a VelocityActuator",
+        ),
+        (
+            terms.position_target,
+            SERVO,
+            {"kind": "effort"},
+            "kind is 'effort', and position_target writes a position; leave kind= out",
+        ),
+    ],
+)
+def test_an_action_that_its_actuators_do_not_take_is_refused(
+    function: Any, actuator: Any, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError) as refused:
+        driven_by(function, actuator, **options)
+    assert str(refused.value).endswith(f"actions.drive: {words}")

@@ -17,7 +17,7 @@ from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.sensors.imu import Imu
-from worker.tasks import Action, Choice, Command, Metric, Observation, Robot, Term, WorldArrays, terms
+from worker.tasks import Action, Choice, Command, Event, Metric, Observation, Robot, Term, WorldArrays, terms
 
 TURN = (-1.0, 1.0)
 VELOCITIES: Mapping[str, Any] = {"names": ("a", "b", "c"), "forward": TURN, "left": TURN, "turn": TURN}
@@ -53,7 +53,7 @@ def held() -> Robot:
 
 
 def test_a_smoothed_target_has_two_numbers_for_each_joint() -> None:
-    action = Action(terms.smoothed_position_target, share=0.3, kind="position", unit="m")
+    action = Action(terms.smoothed_position_target, share=0.3, unit="m")
     task = sliders(held(), actions={"target": action}, randomize={})(SlidersConfig(), 2, seed=1)
     command = task._memory[:, task.plan.commands[0].first].clone()
     # the command and its countdown, two numbers for each of two joints, the countdown of the event
@@ -166,11 +166,22 @@ def test_a_joint_without_limits_is_refused_where_they_are_needed() -> None:
     refused(
         "actions.f: share_of_range_target needs limits of its position, which joint second of robot lacks",
         robot=held(),
-        actions={"f": Action(terms.share_of_range_target, kind="position")},
+        actions={"f": Action(terms.share_of_range_target)},
+    )
+    refused(
+        "metrics.m: joint_limit_excess needs limits of its position, which joint second of robot lacks",
+        metrics={"m": Metric(terms.joint_limit_excess, joints="second")},
     )
     refused(
         "metrics.m: joint_effort_excess needs a limit of its force, which joint first of robot lacks",
         metrics={"m": Metric(terms.joint_effort_excess)},
+    )
+
+
+def test_a_fixed_root_is_refused_where_a_term_moves_it() -> None:
+    refused(
+        "events.e: reset_root moves a free root, and that of robot is fixed; leave the term out",
+        events={"e": Event(terms.reset_root)},
     )
 
 

@@ -24,6 +24,7 @@ def aim(worlds: WorldArrays, robot: RobotArrays, world: int, joint: int, target:
     worlds.controls[world, robot.actuators[joint]] = target - robot.encoder_bias[world, joint]
 
 
+@needs(kind="effort")
 @wp.func
 def effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A force or torque: the input of a <motor> is ``value`` [N, N m, times its gear].
@@ -33,6 +34,7 @@ def effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, valu
     worlds.controls[world, robot.actuators[joint]] = value
 
 
+@needs(kind="effort")
 @wp.func
 def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A share of the greatest force or torque on the joint, ``value`` in [-1, 1]; without a limit, ``value`` itself [N, N m].
@@ -47,6 +49,7 @@ def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
     worlds.controls[world, robot.actuators[joint]] = greatest * wp.clamp(value, -1.0, 1.0) / robot.gains[joint]
 
 
+@needs(kind="position")
 @wp.func
 def position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A position target in the encoder's coordinates: the actuator's target is ``value`` minus the encoder's bias [m, rad].
@@ -56,6 +59,7 @@ def position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: 
     aim(worlds, robot, world, joint, value)
 
 
+@needs(kind="position", some_ranges=True)
 @wp.func
 def limited_position_target(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float, soft_factor: float = 1.0
@@ -71,6 +75,7 @@ def limited_position_target(
     aim(worlds, robot, world, joint, wp.clamp(value, ends[0] + margin, ends[1] - margin))
 
 
+@needs(kind="position")
 @wp.func
 def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A relative position target: the joint's position at the control step's start + ``value`` [m, rad].
@@ -81,7 +86,7 @@ def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays
     worlds.controls[world, robot.actuators[joint]] = worlds.joint_q[world, robot.coordinates[joint]] + value
 
 
-@needs(ranges=True)
+@needs(kind="position", ranges=True)
 @wp.func
 def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A position target between the joint's limits: ``value`` -1 is the lower, 1 the upper; clipped. The joint must have limits.
@@ -93,7 +98,7 @@ def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, j
     aim(worlds, robot, world, joint, 0.5 * (ends[0] + ends[1]) + 0.5 * share * (ends[1] - ends[0]))
 
 
-@needs(memory_each=2)
+@needs(kind="position", memory_each=2)
 @wp.func
 def smoothed_position_target(
     world: int,
@@ -121,6 +126,7 @@ def smoothed_position_target(
     aim(worlds, robot, world, joint, target)
 
 
+@needs(kind="position")
 @wp.func
 def two_positions_target(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float, closed: float, opened: float
@@ -132,6 +138,7 @@ def two_positions_target(
     aim(worlds, robot, world, joint, wp.where(value < 0.0, closed, opened))
 
 
+@needs(kind="velocity")
 @wp.func
 def velocity_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A velocity: the target of a <velocity> actuator is ``value`` [m/s, rad/s].
@@ -141,6 +148,7 @@ def velocity_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: 
     worlds.controls[world, robot.actuators[joint]] = value
 
 
+@needs(kind="velocity")
 @wp.func
 def two_velocities_target(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float, closing: float, opening: float
@@ -152,6 +160,7 @@ def two_velocities_target(
     worlds.controls[world, robot.actuators[joint]] = wp.where(value < 0.0, closing, opening)
 
 
+@needs(kind="position")
 @wp.func
 def move_frame(world: int, ik: IkArrays, index: int, value: float):
     """A displacement of a body or site by ``value`` along or about one axis [m, rad], or one number of its wanted pose.

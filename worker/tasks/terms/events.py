@@ -14,11 +14,13 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.sensors.wrench import LASTING_FROM_NOW, WrenchArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.placing import NONE, between, place_root, set_joint, within_limits
 
 wp.set_module_options({"enable_backward": False})
 
 
+@needs(free_root=True)
 @wp.func
 def reset_root(
     world: int,
@@ -53,6 +55,7 @@ def reset_root(
     place_root(world, worlds, robot, bodies, wp.vec3(0.0, 0.0, 0.0), offset, turn, linear, angular)
 
 
+@needs(free_root=True)
 @wp.func
 def reset_root_any_way_up(
     world: int,
@@ -145,6 +148,7 @@ def reset_joints_in_range(
     set_joint(worlds, robot, world, joint, between(stream, 0, position), between(stream, 1, velocity))
 
 
+@needs(some_ranges=True)
 @wp.func
 def reset_joints_between_limits(
     world: int,
@@ -167,6 +171,7 @@ def reset_joints_between_limits(
     set_joint(worlds, robot, world, joint, place, between(stream, 1, velocity))
 
 
+@needs(free_root=True)
 @wp.func
 def push(
     world: int,

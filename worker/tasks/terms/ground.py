@@ -183,6 +183,7 @@ def terrain_level(world: int, terrain: TerrainArrays) -> float:
     return float(terrain.levels[world])
 
 
+@needs(free_root=True)
 @wp.func
 def reset_root_on_terrain(
     world: int,

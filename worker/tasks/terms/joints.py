@@ -60,6 +60,7 @@ def joint_velocity(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
     return worlds.joint_qd[world, robot.dofs[joint]]
 
 
+@needs(some_ranges=True)
 @wp.func
 def joint_share_of_range(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
     """Position of a joint between its limits: -1 at the lower, 0 in the middle, 1 at the upper; 0 for a joint without limits.
@@ -110,11 +111,12 @@ def joint_power(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int)
     return joint_effort(world, worlds, robot, joint) * joint_velocity(world, worlds, robot, joint)
 
 
+@needs(some_ranges=True)
 @wp.func
 def joint_limit_excess(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, soft_factor: float = 0.95
 ) -> float:
-    """Distance of a joint beyond its soft limits [m, rad], at ``soft_factor`` times the range about its middle.
+    """Distance of a joint beyond its soft limits [m, rad], at ``soft_factor`` times the range about its middle; 0 without limits.
 
     mjlab: joint_pos_limits. Isaac Lab: joint_pos_limits.
     """
