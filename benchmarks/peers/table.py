@@ -61,8 +61,8 @@ def table(records: Sequence[Record], judged: Sequence[Record] = ()) -> str:
     lines = [
         "# Muster and its peers",
         "",
-        "Steps a second by the clock, with logging and checkpoints, after the first iterations; medians of several trainings, each in a "
-        "process of its own, the least and the greatest in brackets. The ratio is Muster's (algorithm `ppo`) to that row. Ready: from "
+        "Steps a second by the clock, with logging and checkpoints, after the first iterations, each training in a process of its own; of "
+        "several *runs* the median, the least and the greatest in brackets. The ratio is Muster's (algorithm `ppo`) to that row. Ready: from "
         "the start of the process to the first iteration (imports, worlds, compiled kernels). How it was measured: "
         f"[README](README.md). {told(records)}",
     ]
