@@ -140,13 +140,36 @@ PORTING = """\
 
 The names in `worker.tasks.terms` of the terms of mjlab 1.6 and Isaac Lab. [terms.md](terms.md) gives their meanings and
 parameters, and [ports.md](ports.md) compares a whole task of each with ours. `python -m worker.tasks.terms porting`
-writes this page from the functions' docstrings. Randomisation of physics, mjlab's `dr.*`, is not a term here but a
-`Randomize`: [randomization.md](randomization.md). Three differences hold everywhere:
+writes this page from the functions' docstrings. Randomisation of physics, mjlab's `dr.*` and Isaac Lab's `randomize_*`, is not a
+term here but a `Randomize`: [their names](randomization.md#names-of-mjlab-and-isaac-lab). What else is no term here is at
+[the end](#names-that-are-no-terms-here). Three differences hold everywhere:
 
 - Quaternions are xyzw here, and wxyz there.
 - A function for one joint, body or foot gives one number, and rewards are summed over them: mjlab's `joint_vel_l2` is
   `joint_velocity_squared` of all joints.
 - Isaac Lab uses velocities of the centre of mass where mjlab uses those of the frame's origin; the table names the exact equivalent.
+"""
+
+ELSEWHERE = """\
+## Names that are no terms here
+
+| theirs | whose | here |
+|---|---|---|
+| `commands_vel` | mjlab | of Go1 and G1: `command_forward`, `command_left`, `command_turn` of the configuration, stages by iteration (mjlab's steps / 24); in a task of your own: [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job) sets the numbers of the command, since a curriculum gives both ends of a range the same value |
+| `reward_curriculum` | mjlab | [`train.config.curriculum`](../tasks.md#curriculum): a weight by the term's name, another number as `rewards.TERM.NUMBER`; by iteration instead of step, and interpolated: for a jump give two points one iteration apart |
+| `modify_reward_weight` | Isaac Lab | the same |
+| `termination_curriculum` | mjlab | the same, `terminations.TERM.NUMBER`; whether it is a `time_out` stays |
+| `modify_env_param`, `modify_term_cfg` | Isaac Lab | the same for a number of the declaration; other rules in [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job) |
+| `camera_rgb` | mjlab | [`Image`](cameras.md) of a `CameraSensor(kind="color")`, an observation group of its own; bytes, which networks take as -0.5 to 0.5 instead of 0 to 1 |
+| `camera_depth` | mjlab | `Image` of a `CameraSensor(kind="depth")`, `near`: min_depth, `far`: cutoff_distance; 0 is at `near`, theirs at the camera |
+| `camera_segmentation` | mjlab | `Image` of a `CameraSensor(kind="segmentation")`: one channel for each robot, object and the ground, instead of numbers of geoms |
+| `dr.geom_rgba` | mjlab | [`train.config.randomize.colors`](../tasks.md#randomisation): of all shapes, around their own colours, once for each world |
+| `TendonLengthAction`, `TendonVelocityAction`, `TendonEffortAction` | mjlab | nothing like it: actions drive joints, or a frame with `move_frame` |
+| `SiteEffortAction` | mjlab | nothing like it as an action; `apply_wrench`, an event, pushes bodies |
+| `reset_root_state_from_flat_patches` | mjlab | nothing like it: no flat places are looked for; `reset_root_on_terrain` places robots around the middle of their patch |
+| `reset_root_state_from_terrain` | Isaac Lab | nothing like it, as above |
+| `reset_nodal_state_uniform` | Isaac Lab | nothing like it: there are no soft bodies |
+| `OperationalSpaceControllerAction`, `NonHolonomicAction`, `SurfaceGripperBinaryAction` | Isaac Lab | nothing like it |
 """
 
 
@@ -174,6 +197,7 @@ def porting() -> str:
         rows.sort(key=lambda row: row[0].lower())
         table = ["| theirs | ours | differences, owner |", "|---|---|---|", *(row for _, row in rows)]
         parts.append(f"## {title}\n\n" + "\n".join(table) + "\n")
+    parts.append(ELSEWHERE)
     return "\n".join(parts)
 
 
