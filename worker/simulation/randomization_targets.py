@@ -89,19 +89,49 @@ def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]
         names = [shapes[shape].rpartition("/")[2] for shape in one_world]
         chosen = find(names, entry.pattern or "*", "geom of the worlds")
         return _geoms(entry, worlds, [names[index] for index in chosen], [one_world[index] for index in chosen])
-    if entry.robot not in views:
-        raise ValueError(f"no robot or object is called {entry.robot!r}; {nearest(entry.robot, views)}")
-    view, parts = views[entry.robot], entry.quantity.parts
-    pattern = entry.pattern or "*"
+    view, chosen = _parts(entry, entry.robot, views)
+    parts = entry.quantity.parts
     if parts == "bodies":
-        return _bodies(entry, worlds, view, view.find_bodies(pattern))
+        return _bodies(entry, worlds, view, chosen)
     if parts == "geoms":
-        chosen = view.find_geoms(pattern)
         names = [view.geom_names[geom] for geom in chosen]
         return _geoms(entry, worlds, names, [view.geoms[geom] for geom in chosen])
     if parts == "joints":
-        return _joints(entry, worlds, view, view.find_joints(pattern))
-    return _actuators(entry, worlds, view, view.find_joints(pattern))
+        return _joints(entry, worlds, view, chosen)
+    return _actuators(entry, worlds, view, chosen)
+
+
+def check_patterns(entries: Mapping[str, Randomize], views: Mapping[str, RobotView]) -> None:
+    """Check the robots and patterns of all entries before any world is built.
+
+    Geoms of any robot (``robot=None``) include the ground's, so only :func:`find_target` looks for them.
+
+    Args:
+        entries: Declarations by name.
+        views: Robots and objects by name.
+
+    Raises:
+        ValueError: A robot is unknown, or a pattern matches nothing.
+    """
+    for name, entry in entries.items():
+        if entry.what == "gravity" or entry.robot is None:
+            continue
+        try:
+            _parts(entry, entry.robot, views)
+        except ValueError as error:
+            raise ValueError(f"randomize.{name}: {error}") from error
+
+
+def _parts(entry: Randomize, robot: str, views: Mapping[str, RobotView]) -> tuple[RobotView, list[int]]:
+    """The robot of an entry, and the indices of its parts that the pattern matches."""
+    if robot not in views:
+        raise ValueError(f"no robot or object is called {robot!r}; {nearest(robot, views)}")
+    view, pattern = views[robot], entry.pattern or "*"
+    if entry.quantity.parts == "bodies":
+        return view, view.find_bodies(pattern)
+    if entry.quantity.parts == "geoms":
+        return view, view.find_geoms(pattern)
+    return view, view.find_joints(pattern)
 
 
 def _shapes_of_a_world(worlds: Worlds) -> list[int]:

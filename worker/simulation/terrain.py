@@ -8,6 +8,7 @@ ground.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -185,25 +186,25 @@ class Terrain:
                 origins[level, column] = (*place, near.max())
         return origins
 
-    def check_memory(self, device: str) -> None:
+    def check_memory(self, device: str | None = None) -> None:
         """Refuse a field that would not fit into free memory, before anything is built.
 
         Args:
-            device: Device of the model; heights are on the host too.
+            device: Device of the model; heights are on the host too. None: refuse only what no machine can hold.
 
         Raises:
             ValueError: It would not fit.
         """
         along_x, along_y = self.cells
         points = (self.levels * along_x + 1) * (self.column_count * along_y + 1)
-        needed = points * BYTES_PER_POINT
-        free = _free_memory(device)
-        if needed > free or points > POINT_LIMIT:
-            side = self.resolution * (points / min(free / BYTES_PER_POINT, POINT_LIMIT)) ** 0.5
+        free = math.inf if device is None else _free_memory(device)
+        most = min(free / BYTES_PER_POINT, POINT_LIMIT)
+        if points > most:
+            there = "" if device is None else f" of {free / 2**30:,.1f} GiB that are free"
             raise ValueError(
                 f"the terrain's {self.levels} x {self.column_count} patches at {self.resolution:g} m have {points:,} heights, which "
-                f"take about {needed / 2**30:,.1f} GiB of {free / 2**30:,.1f} GiB that are free; use a resolution of at least {side:.2g} m, "
-                "or fewer levels and columns"
+                f"take about {points * BYTES_PER_POINT / 2**30:,.1f} GiB{there}; use a resolution of at least "
+                f"{self.resolution * (points / most) ** 0.5:.2g} m, or fewer levels and columns"
             )
 
     def add_to(self, builder: newton.ModelBuilder) -> list[int]:

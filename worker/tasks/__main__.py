@@ -13,6 +13,7 @@ from worker.tasks.mistakes import task_mistakes
 from worker.tasks.tables import numbers, tables
 
 if TYPE_CHECKING:
+    from worker.tasks.plan import Plan
     from worker.tasks.task import Task
 
 
@@ -21,7 +22,8 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
 
     Args:
         name: As :func:`worker.tasks.find_task` takes it.
-        whole: For a declared task, include the tables of its terms and the numbers that a job can change.
+        whole: For a declared task, include the tables of its terms and settings, the numbers that a job can change, and how
+            its configuration changes them during training.
 
     Raises:
         ValueError: The task does not exist, or its own code is wrong.
@@ -41,8 +43,13 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
         "control_hz": config.control_hz,
         "substeps": config.substeps,
         "episode_seconds": config.episode_seconds,
-        **({"tables": tables(plan), "numbers": numbers(plan)} if whole and plan else {}),
+        **(_whole(plan) if whole and plan else {}),
     }
+
+
+def _whole(plan: Plan) -> dict[str, Any]:
+    curriculum = {name: [[*point] for point in points] for name, points in plan.config.curriculum.items()}
+    return {"tables": tables(plan), "numbers": numbers(plan), "curriculum": curriculum}
 
 
 def _observations(task: Task, config: Any) -> list[str]:

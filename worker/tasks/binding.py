@@ -12,6 +12,7 @@ import warp as wp
 from shared_store.wording import nearest, shown
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import HeightScanArrays
+from worker.tasks import terms
 from worker.tasks.declaration import Command, Pattern, Term
 from worker.tasks.functions import STRUCTS, WIDTHS, Signature, is_robot, is_struct, is_warp, shown_type, signature
 from worker.tasks.numbers import EXPRESSIONS, Numbers, stays
@@ -136,9 +137,7 @@ class Binder:
 
     def _bind_torch(self, place: str, term: Term) -> Bound:
         if not callable(term.function):
-            raise ValueError(
-                f"{place}: {term.function!r} is no function; a term is a @wp.func, or a Python function of the task that gives a tensor"
-            )
+            raise ValueError(f"{place}: {shown(term.function)} is no function; {_function_instead(term.function)}")
         bound = Bound(place, term, None, width=term.size or 1, external=self.external)
         self.external += bound.width
         return bound
@@ -382,6 +381,14 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
         return found, [view.site_names[each] for each in found]
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
+
+
+def _function_instead(given: Any) -> str:
+    """What a term takes instead of a value that is no function; for the name of a function, that function."""
+    known = [f"terms.{name}" for name, value in vars(terms).items() if is_warp(value)]
+    meant = f"terms.{given.removeprefix('terms.')}" if isinstance(given, str) else ""
+    anything = "a term is a @wp.func, or a Python function of the task that gives a tensor"
+    return nearest(meant, known, anything, cutoff=0.8)
 
 
 def is_named(name: str, kind: Any, found: Signature) -> bool:

@@ -15,6 +15,7 @@ from shared_store.wording import nearest
 from worker.simulation.camera import paint
 from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import STEP, check_group, check_observations
+from worker.simulation.randomization_targets import check_patterns
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot_view import RobotView, body_arrays
 from worker.simulation.sensors.camera import Camera
@@ -106,6 +107,9 @@ class DeclaredTask(Task):
                     sensor.rows(self.views)
         try:
             self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
+            check_patterns(self.declaration.randomize, self.views)
+            if isinstance(self.ground_terrain, Terrain):
+                self.ground_terrain.check_memory()
         except ValueError as error:
             # an error in a job's setting names its place in the job alone
             where = "" if str(error).startswith("config.") else f"task {type(self).__name__}: "

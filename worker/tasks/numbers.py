@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import warp as wp
@@ -60,11 +61,13 @@ class Numbers:
     Attributes:
         values: One after the other.
         places: First index and count of each place, such as ``rewards.track_linear.std``.
+        others: Places of numbers that are kept elsewhere, those of ``randomize``: for errors about a place that does not exist.
     """
 
     def __init__(self) -> None:
         self.values: list[float] = []
         self.places: dict[str, tuple[int, int]] = {}
+        self.others: list[str] = []
         self._checks: dict[str, Check] = {}
 
     def add(self, place: str, value: Any, count: int, check: Check | None = None) -> int:
@@ -114,10 +117,16 @@ class Numbers:
             ValueError: The place does not exist.
         """
         if place not in self.places:
-            raise ValueError(
-                f"{where}: the task has no number {shown(place)}; {nearest(place, sorted(self.places)) or 'it has none'}"
-            )
+            known = sorted((*self.places, *self.others))
+            raise ValueError(f"{where}: the task has no number {shown(place)}; {_nearest_place(place, known)}")
         return self.places[place]
+
+
+def _nearest_place(place: str, known: Sequence[str]) -> str:
+    """The place that was meant, if all of it is similar, or its last name, such as ``speed`` of ``push_speed``; else all places."""
+    last = {name.rpartition(".")[2]: name for name in reversed(known)}
+    near = get_close_matches(place.rpartition(".")[2], last, n=1, cutoff=0.75)
+    return nearest(place, known, f"did you mean {last[near[0]]}?" if near else "")
 
 
 def flat(place: str, value: Any, count: int) -> list[float]:

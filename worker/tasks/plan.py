@@ -135,6 +135,9 @@ class Plan:
         self.declaration, self.config, self.views = declaration, config, views
         self.binder = binder = Binder(views, sensors, has_terrain)
         self.numbers = binder.numbers
+        self.numbers.others = [
+            f"randomize.{name}.{own}" for name, each in declaration.randomize.items() for own in each.places
+        ]
         self.past = 0
         self.choice: Bound | None = None
         self.driven: list[Driven] = []

@@ -31,8 +31,9 @@ HEAD = """\
 
 Every default number of `Go1Flat`, `Go1Rough`, `G1Flat`, `G1Rough`, `LiftCube` and `LiftCubes`. An empty cell means that the task does not
 have that row. [tasks.md](../tasks.md#go1flat-go1rough-g1flat-g1rough) explains the terms, the differences from mjlab, and the settings
-that a job's YAML can change. `python -m worker.tasks.settings_page` writes this page from the declarations; `muster tasks NAME` prints
-the same for any task.
+that a job's YAML can change. `python -m worker.tasks.settings_page` writes this page from the declarations. For any task, `muster tasks
+NAME` prints its terms with their numbers, its configuration and the curriculum of that; not the settings of its training (networks, PPO),
+and not the solver's options.
 """
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -10,11 +12,14 @@ from worker.tasks.binding import Bound
 from worker.tasks.contract import value_of
 from worker.tasks.declaration import Adaptive, Choice, Event, Reward, Termination
 from worker.tasks.images import shown
+from worker.tasks.overrides import training_sections
 
 if TYPE_CHECKING:
     from worker.tasks.plan import Plan, Seen
 
 Row = dict[str, str]
+_ELSEWHERE = {"rewards", "randomize", "numbers", "curriculum"}
+"""Fields of a configuration that are not in the table of its other settings."""
 
 
 def tables(plan: Plan) -> dict[str, list[Row]]:
@@ -62,6 +67,11 @@ def tables(plan: Plan) -> dict[str, list[Row]]:
         {"name": name, "kind": type(each).__name__, "of": settings(each)}
         for name, each in plan.declaration.randomize.items()
     ]
+    found["curriculum"] = [
+        {"name": name, "value by iteration": ", ".join(f"{iteration:g}: {value:g}" for iteration, value in points)}
+        for name, points in plan.config.curriculum.items()
+    ]
+    found["configuration"] = [{"name": path, "value": _as_json(value)} for path, value in _settings_of(plan.config)]
     return {section: rows for section, rows in found.items() if rows}
 
 
@@ -81,6 +91,32 @@ def numbers(plan: Plan) -> dict[str, list[float]]:
         if entry.when == "interval":
             found[f"{place}.seconds"] = [*(entry.seconds or (0.0, 0.0))]
     return found
+
+
+def _settings_of(config: Any) -> Iterator[tuple[str, Any]]:
+    """Path and value of each setting, such as ``substeps`` or ``camera.width``; without those of training."""
+    for item in dataclasses.fields(config):
+        if item.name in _ELSEWHERE or item.name in training_sections():
+            continue
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from ((f"{item.name}.{path}", each) for path, each in _settings_of(value))
+        else:
+            yield item.name, value
+
+
+def _as_json(value: Any) -> str:
+    """A value as a job's YAML may have it."""
+    return json.dumps(value, default=_plain)
+
+
+def _plain(part: Any) -> Any:
+    """A part of a value that JSON does not know, in types that it knows."""
+    if isinstance(part, Mapping):
+        return dict(part)
+    if dataclasses.is_dataclass(part):
+        return {item.name: getattr(part, item.name) for item in dataclasses.fields(part)}
+    return str(part)
 
 
 def _adaptive(rule: Adaptive) -> str:

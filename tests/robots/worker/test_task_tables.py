@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 from typing import Any
@@ -47,8 +48,11 @@ def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str)
     for group, terms in declared.groups.items():
         assert not isinstance(terms, Image)
         expected["observations" if group == "policy" else f"observations of {group}"] = list(terms)
+    expected["curriculum"] = list(plan.config.curriculum)
     rows_of = {
-        section: [row["name"] for row in rows] for section, rows in found["tables"].items() if section != "success"
+        section: [row["name"] for row in rows]
+        for section, rows in found["tables"].items()
+        if section not in ("success", "configuration")
     }
     assert rows_of == {section: names for section, names in expected.items() if names}
     success = found["tables"].get("success", [])
@@ -73,6 +77,34 @@ def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> Non
     for rows in found["tables"].values():
         assert all(row["name"] in text for row in rows if "name" in row)
     assert all(place in text for place in found["numbers"])
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_every_setting_of_the_configuration_is_told_but_those_of_training(name: str) -> None:
+    config = plan_of(name).config
+    settings = {row["name"]: json.loads(row["value"]) for row in told(name)["tables"]["configuration"]}
+    apart = {"rewards", "randomize", "numbers", "curriculum", "ppo", "sac", "rsl_rl"}
+    fields = {item.name for item in dataclasses.fields(config)} - apart
+    assert {path.partition(".")[0] for path in settings} == fields
+    assert {path: settings[path] for path in settings if "." not in path} == json.loads(
+        json.dumps({field: getattr(config, field) for field in fields & {*settings}})
+    )
+
+
+def test_changes_during_training_are_told_by_iteration() -> None:
+    points = [[0, -0.01], [499, -0.01], [500, -0.1], [999, -0.1], [1000, -1.0]]
+    found = told("LiftCube")
+    assert found["curriculum"] == {"joint_vel_hinge": points}
+    text = "0: -0.01, 499: -0.01, 500: -0.1, 999: -0.1, 1000: -1"
+    assert found["tables"]["curriculum"] == [{"name": "joint_vel_hinge", "value by iteration": text}]
+    walking = {row["name"]: row["value"] for row in told("G1Flat")["tables"]["configuration"]}
+    assert walking["command_turn"] == "[[0, -0.5, 0.5], [5000, -0.7, 0.7]]"
+    assert walking["solver_iterations"] == "10" and told("G1Flat")["curriculum"] == {}
+
+
+def test_a_setting_of_several_parts_has_a_row_for_each() -> None:
+    rows = told("RacerPixels")["tables"]["configuration"]
+    assert {"name": "front.width", "value": "160"} in rows and {"name": "front.kind", "value": '"grey"'} in rows
 
 
 def test_an_unknown_task_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:

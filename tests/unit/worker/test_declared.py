@@ -289,7 +289,14 @@ def refused(section: str, **changes: Any) -> dict[str, Any]:
         (refused("rewards", place=Reward(_vector)), "rewards.place: _vector must give a float (-> float)"),
         (refused("rewards", place=Reward(_nothing)), "rewards.place: _nothing must give a float"),
         (refused("rewards", place=Reward(_untyped)), "rewards.place: _untyped: its parameter joint has no type"),
-        (refused("rewards", place=Reward("joint_position")), "rewards.place: 'joint_position' is no function"),
+        (
+            refused("rewards", place=Reward("nothing_alike")),
+            "rewards.place: 'nothing_alike' is no function; a term is a",
+        ),
+        (
+            refused("rewards", place=Reward("joint_velocity_sqared")),
+            "rewards.place: 'joint_velocity_sqared' is no function; did you mean terms.joint_velocity_squared?",
+        ),
         (
             refused("rewards", place=Reward(terms.joint_position, joints="third")),
             "rewards.place: no joint of robot matches 'third'; there are first, second",

@@ -11,8 +11,10 @@ import pytest
 from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, kick, target
 from tests.support.worker.kernels.cartpole import Cartpole
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
+from worker.simulation.terrain import Terrain
 from worker.tasks import Action, Adaptive, Command, Event, Observation, Robot, terms
 from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.randomize import Randomize
 
 
 def refusal(config: SlidersConfig | None = None, **changed: Any) -> str:
@@ -85,6 +87,47 @@ def test_sections_hold_what_they_are_for() -> None:
     assert refusal(sensors={"m": "mass"}) == "sensors.m: expected a sensor, such as ContactSensor(...), found a str"
 
 
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (
+            Randomize("mass", bodies="nar", range=(0.5, 1.0)),
+            "no body of robot matches 'nar'; did you mean near? there are near, far",
+        ),
+        (Randomize("encoder_bias", joints="third*", range=(0.0, 0.1)), "no joint of robot matches 'third*'; "),
+        (Randomize("stiffness", actuators="frst", range=(0.5, 1.0)), "no joint of robot matches 'frst'; did you mean"),
+        (Randomize("friction", geoms=("*", "foot"), range=(0.5, 1.0)), "no geom of robot matches 'foot'; "),
+        (Randomize("mass", bodies="*", robot="robt", range=(0.5, 1.0)), "no robot or object is called 'robt'; did you"),
+    ],
+)
+def test_what_is_randomized_must_be_there(entry: Randomize, message: str) -> None:
+    assert refusal(randomize={"f": entry}).startswith(f"randomize.f: {message}")
+
+
+def test_what_belongs_to_no_robot_is_looked_for_in_the_worlds() -> None:
+    class Grounded(Sliders):
+        def sections(self) -> dict[str, Any]:
+            ground = Randomize("friction", geoms="ground*", range=(0.5, 1.0), robot=None)
+            return {**super().sections(), "randomize": {"ground": ground, "g": Randomize("gravity", range=(0.9, 1.1))}}
+
+    assert [*Grounded.sketch(SlidersConfig()).declaration.randomize] == ["ground", "g"]
+
+
+def test_a_terrain_that_no_machine_can_hold() -> None:
+    class Fine(Sliders):
+        resolution = 0.0005
+
+        def terrain(self, config: SlidersConfig) -> Terrain:
+            return Terrain(resolution=self.resolution)
+
+    with pytest.raises(
+        ValueError, match=r"^task Fine: the terrain's 10 x 7 patches at 0.0005 m have .* use a resolution"
+    ):
+        Fine.sketch(SlidersConfig())
+    Fine.resolution = 0.1
+    assert isinstance(Fine.sketch(SlidersConfig()).ground_terrain, Terrain)
+
+
 NUMBERS: Mapping[str, tuple[str, Any, str]] = {
     "mass": ("randomize.mass.range", [-3.0, -2.0], "randomize mass: the range (-3.0, -2.0) would make mass negative"),
     "no entry": ("randomize.mas.range", [1.0, 2.0], "the task has no number 'randomize.mas.range'; did you mean"),
@@ -112,6 +155,20 @@ def test_a_curriculum_is_checked_when_the_task_is_built() -> None:
     assert course("randomize.mass.range", 1.0, -1.0).startswith("config.curriculum.randomize.mass.range: randomize")
     adaptive = Adaptive("randomize.mass.range", 1.0, 0.0)
     assert refusal(curricula={"heavy": adaptive}).startswith("curricula.heavy.randomize.mass.range: randomize mass")
+
+
+@pytest.mark.parametrize(
+    ("place", "meant"),
+    [
+        ("events.kik.speed", "did you mean events.kick.speed?"),
+        ("sped", "did you mean events.kick.speed?"),
+        ("randomise.mass.range", "did you mean randomize.mass.range?"),
+        ("alive", "there are actions.force.clip, "),
+    ],
+)
+def test_a_wrong_place_of_a_curriculum_names_the_nearest(place: str, meant: str) -> None:
+    found = refusal(curricula={"kicks": Adaptive(place, 0.0, 1.0)})
+    assert found.startswith(f"curricula.kicks: the task has no number '{place}'; {meant}")
 
 
 def test_the_points_of_a_scan_are_the_declarations_alone() -> None:
