@@ -287,8 +287,7 @@ class Action(Term):
         scale: Factor: one number, or a mapping from patterns of joints or columns.
         offset: One number, a mapping from patterns of joints, or ``"default"``: each joint's default position.
         clip: Least and greatest action; None: no clipping.
-        kind: What the function writes to the actuator: ``"effort"``, ``"position"`` or ``"velocity"``. By default what a function of the
-            library writes, and for any other function what the joints' actuators take.
+        kind: ``"effort"``, ``"position"`` or ``"velocity"``, for a function of your own: by default, what the joints' actuators take.
         unit: Of the actuator's input; by default that of ``kind`` on a revolute or prismatic joint, such as N m or N.
         **options: As for :class:`Term`.
     """

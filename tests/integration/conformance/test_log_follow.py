@@ -59,7 +59,7 @@ for i in range(150): print(os.environ["AWS_BATCH_JOB_NODE_INDEX"], i, sep=":"); 
     ]
     for tail in tails:
         tail.start()
-    job = shared_server.gang(script, 3, "tailed")
+    job = shared_server.gang(script + MAIN_LAST, 3, "tailed")
     shared_server.wait(job)
     for tail in tails:
         own: dict[str, list[str]] = {}

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.client import Client
-from tests.conftest import submit_gang, wait_for
+from tests.conftest import MAIN_LAST, submit_gang, wait_for
 from tests.support.faults.home import Home
 from tests.support.processes import end_all
 
@@ -25,7 +25,7 @@ import time
 for number in range({LINES}):
     print(number, flush=True)
     time.sleep(0.1)
-"""
+{MAIN_LAST}"""
 
 
 class WallClock:
