@@ -78,8 +78,13 @@ def _input_of(bound: Bound, view: RobotView) -> str:
         raise ValueError(
             f"{place}: kind is {term.kind!r}, and {term.function_name} writes {TAKING[known][0]}; leave kind= out"
         )
-    taken = {view.inputs[joint] for joint in joints}
-    kind = term.kind or known or (taken.pop() if len(taken) == 1 else "") or "effort"
+    taken = sorted({view.inputs[joint] for joint in joints} - {""})
+    if len(taken) > 1 and not (term.kind or known):
+        raise ValueError(
+            f"{place}: the actuators of its joints take {' and '.join(TAKING[each][0] for each in taken)}; "
+            "declare an action for each, with joints="
+        )
+    kind = term.kind or known or (taken[0] if taken else "effort")
     for joint in joints:
         takes = view.inputs[joint]
         if takes and takes != kind:

@@ -95,8 +95,9 @@ def numbers(plan: Plan) -> dict[str, list[float]]:
 
 def _settings_of(config: Any) -> Iterator[tuple[str, Any]]:
     """Path and value of each setting, such as ``substeps`` or ``camera.width``; without those of training."""
+    apart = {*_ELSEWHERE, *training_sections()}
     for item in dataclasses.fields(config):
-        if item.name in _ELSEWHERE or item.name in training_sections():
+        if item.name in apart:
             continue
         value = getattr(config, item.name)
         if dataclasses.is_dataclass(value):

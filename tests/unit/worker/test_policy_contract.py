@@ -196,14 +196,14 @@ class DrivenConfig(TaskConfig):
     rewards: Mapping[str, float] = reward_weights(alive=1.0)
 
 
-def driven_by(function: Any, actuator: Any, **options: Any) -> list[dict[str, Any]]:
+def driven_by(function: Any, *actuators: Any, **options: Any) -> list[dict[str, Any]]:
     """The actions of the contract of a task whose robot is driven so."""
 
     class Driven(DeclaredTask):
         config_type = DrivenConfig
 
         def robot(self, config: DrivenConfig) -> Robot:
-            return Robot(LIMITED, actuators=[actuator])
+            return Robot(LIMITED, actuators=actuators)
 
         def declare(self, config: DrivenConfig) -> Declaration:
             return Declaration(
@@ -307,3 +307,10 @@ def test_an_action_that_its_actuators_do_not_take_is_refused(
     with pytest.raises(ValueError) as refused:
         driven_by(function, actuator, **options)
     assert str(refused.value).endswith(f"actions.drive: {words}")
+
+
+def test_an_action_of_ones_own_for_actuators_that_take_different_things_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match="the actuators of its joints take a position and a velocity; declare an action for each"
+    ):
+        driven_by(press, PositionActuator("first", 20.0, 0.5), VelocityActuator("second", 0.5))
