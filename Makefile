@@ -1,11 +1,8 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make race             train a car until it drives laps, evaluate it, film it: minutes on two cores
-# make test   lint and the tests of three tiers, which also run alone: make unit, make integration, make training
-# make long             trainings that are killed, stretched and cut off, and trainings that learn something
-# make robots           robots, sensors, terrain, randomisation, terms and cameras against MuJoCo's own engine
-# make services         W&B, MLflow and LEAPP, whose packages (130 MB) it installs: tracked trainings, a bundle that LEAPP runs
-# make console          the console by clicking, in a real browser (Chromium): stories, hostile texts, no mouse, a phone, axe
-# make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
+# make test   lint, the unit tests, and every command of the README for real: minutes
+# make check            everything: the tiers below, whose tests also run alone, two lanes beside each other
+# make unit integration training long robots services console engines    one tier of tests; docs/contributing.md says what each is
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
@@ -18,7 +15,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test unit integration training long robots services console engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run race test check unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -30,46 +27,54 @@ race: $(READY)
 	$(BIN)/muster render $$run -o race.gif --overwrite --worlds 1 --seconds 12 --size 320x240 && \
 	echo "run $$run; its reward plot is above, its film: $(CURDIR)/race.gif"
 
-# two files at a time, in the order of the tiers in tests/conftest.py
-PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=40
+# two files at a time: tests/support/suite/lanes.py; what each test cost is left in build/tests
+PYTEST = $(BIN)/python -m pytest -q -n 2 --durations=40 --junitxml build/tests/$@.xml
 
-# each of the first two keeps one core busy
-test: $(READY)
-	$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
-	$(PYTEST) -m "not cluster and not robots and not long and not console"
+# kernels are compiled before; lint runs beside the tests
+test: $(READY) kernels
+	$(MAKE) --no-print-directory --jobs 2 lint quick
 
-unit: $(READY)
-	$(PYTEST) tests/unit
+quick: $(READY)
+	$(PYTEST) tests/unit tests/cluster/test_readme.py
 
-integration: $(READY)
-	$(PYTEST) tests/integration
+check: $(READY) tracking kernels robots-kernels
+	$(MAKE) --no-print-directory test
+	$(MAKE) --no-print-directory rest
 
-training: $(READY) kernels
-	$(PYTEST) tests/training
+# clusters and browsers are one lane, all else is the other
+rest: $(READY)
+	$(PYTEST) tests --ignore tests/unit --ignore tests/cluster/test_readme.py
 
-long: $(READY) kernels
-	$(PYTEST) tests/long
+unit integration: $(READY)
+	$(PYTEST) tests/$@
 
-robots: $(READY)
-	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube LiftCubes
+training long: $(READY) kernels
+	$(PYTEST) tests/$@
+
+robots: $(READY) robots-kernels
 	$(PYTEST) tests/robots
 
-# pandas for MLflow's own server, which the extra has without it
-services: $(READY) kernels
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
+services: $(READY) kernels tracking
 	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_bundle_parts.py
 
 # pictures of the pages are left in build/console
-console: $(READY)
-	$(BIN)/python -m tests.support.kernels Cartpole Racer
+console: $(READY) kernels
 	$(PYTEST) tests/console
 
-# one after the other: a cluster has this machine for itself
+# one after the other: no two clusters run at once
 engines: $(READY) kernels
-	$(BIN)/pytest -q --durations=40 tests/cluster
+	$(PYTEST) -n 0 tests/cluster
 
+# kept in the user's cache, for other clones and later runs
 kernels: $(READY)
-	$(BIN)/python -m tests.support.kernels
+	$(BIN)/python -m tests.support.suite.kernels
+
+robots-kernels: $(READY)
+	$(BIN)/python -m tests.support.suite.kernels Go1Flat G1Flat Go1Rough LiftCube LiftCubes
+
+# W&B, MLflow and LEAPP (130 MB); pandas for MLflow's own server, which the extra has without it
+tracking: $(READY)
+	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -129,16 +134,10 @@ fuzz: $(READY)
 
 env: $(READY)
 
-# torch first and alone: an environment that has it installs nothing more for the packages that want it
-# mjlab (Apache-2.0) for the files of real robots that it brings along, which the tests and the jobs of those robots read: none of its code
-# is imported, and so nothing that it depends on is needed
-$(READY): pyproject.toml policy_node/pyproject.toml constraints.txt
+# .ci/environment keeps what it installs in the user's cache
+$(READY): pyproject.toml policy_node/pyproject.toml constraints.txt .ci/environment
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Muster needs Python 3.11 or newer; set PYTHON=python3.11")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[worker,aws,dev]'
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --no-deps mjlab
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable policy_node
+	.ci/environment $(PYTHON) $(VENV)
 	touch $(READY)
 
 # the image, and a cluster of containers of it: containers/compose.yaml

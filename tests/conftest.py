@@ -18,19 +18,17 @@ import pytest
 from orchestrator.cli import main
 from orchestrator.client import Client
 from tests.support.processes import end_all
+from tests.support.suite.caches import kernel_cache
 from tests.support.waiting import PATIENCE, wait_for
 
 REPOSITORY = Path(__file__).parent.parent
-TIERS = ("long", "training", "integration", "unit", "robots", "console", "cluster")
-"""The folders of the tests, and the marker of each one's tests; in the order in which they run: what takes long first, so that no
-process is left with a long one at the end."""
 pytest_plugins = [
-    f"tests.support.{area}.fixtures" for area in ("conformance", "console", "engines", "orchestrator", "worker")
+    *(f"tests.support.{area}.fixtures" for area in ("conformance", "console", "engines", "orchestrator", "worker")),
+    *(f"tests.support.suite.{part}" for part in ("costs", "lanes", "second_try")),
 ]
 MUSTER = str(Path(sys.executable).parent / "muster")
 
-# One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
-os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
+os.environ.setdefault("WARP_CACHE_PATH", str(kernel_cache()))
 
 # A picture at the end of each training would take a second of every one of them; test_picture.py has one made.
 os.environ.setdefault("MUSTER_PICTURE", "0")
@@ -82,16 +80,6 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 def _written_out(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark each test with its tier, and put the tiers in their order."""
-    tests = REPOSITORY / "tests"
-    tiers = {item: next((n for n in TIERS if item.path.is_relative_to(tests / n)), None) for item in items}
-    for item, tier in tiers.items():
-        if tier is not None:
-            item.add_marker(tier)
-    items.sort(key=lambda item: TIERS.index(tier) if (tier := tiers[item]) else len(TIERS))
 
 
 class Serving:

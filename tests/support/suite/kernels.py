@@ -1,17 +1,25 @@
 """Compile the tasks' kernels into the tests' cache: no test then waits a minute for a compiler that another one runs.
 
-``make test`` runs it before pytest. Without it every test passes too, in more time.
+``make`` runs it before pytest. Without it every test passes too, in more time. What was compiled from the same sources before
+costs nothing.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
-import tests.conftest  # noqa: F401  the tests' cache, before Warp is imported
+import worker
+from tests.support.suite.caches import kernel_cache
+
+CACHE = Path(os.environ.setdefault("WARP_CACHE_PATH", str(kernel_cache())))
+TASKS = ("Humanoid", "Ant", "Cartpole", "Quadruped", "CartpolePixels", "Racer", "RacerPixels")
+"""Those of the tests of three tiers; ``make robots`` names its own."""
 
 
 def compile_for(name: str) -> None:
@@ -31,15 +39,28 @@ def compile_for(name: str) -> None:
     warm_marker(task, "cpu").mkdir(parents=True, exist_ok=True)
 
 
-TASKS = ("Humanoid", "Ant", "Cartpole", "Quadruped", "CartpolePixels", "Racer", "RacerPixels")
-"""Those of the tests of three tiers; ``make robots`` names its own."""
+def _sources() -> str:
+    """A digest of all that the kernels of this clone are generated from; the cache's path holds the versions of libraries."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(worker.__file__).parent.rglob("*")):
+        if path.suffix in (".py", ".xml"):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def main(names: Sequence[str]) -> int:
     """One process a task, since Warp compiles on one core, and as many at a time as there are cores; the worst exit code."""
+    sources = _sources()
 
     def build(name: str) -> int:
-        return subprocess.run([sys.executable, "-m", "tests.support.kernels", "--one", name], check=False).returncode
+        marker = CACHE / "built" / f"{name}-{sources}"
+        if marker.exists():
+            return 0
+        code = subprocess.run([sys.executable, "-m", "tests.support.suite.kernels", "--one", name]).returncode
+        if code == 0:
+            marker.parent.mkdir(exist_ok=True)
+            marker.touch()
+        return code
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return max(pool.map(build, names))
