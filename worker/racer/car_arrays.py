@@ -93,42 +93,42 @@ class CarArrays:
     """
 
     road: RoadArrays
-    choices: wp.array(dtype=wp.vec2)
-    obstacle_poses: wp.array2d(dtype=wp.vec3)
-    obstacle_along: wp.array2d(dtype=wp.float32)
+    choices: wp.array[wp.vec2]
+    obstacle_poses: wp.array2d[wp.vec3]
+    obstacle_along: wp.array2d[wp.float32]
     obstacle_half: wp.vec2
-    tracks: wp.array(dtype=wp.int32)
-    backwards: wp.array(dtype=wp.bool)
-    poses: wp.array(dtype=wp.vec3)
-    speeds: wp.array(dtype=wp.float32)
-    steerings: wp.array(dtype=wp.float32)
-    factors: wp.array(dtype=wp.vec4)
-    commands: wp.array(dtype=wp.vec2)
-    fronts: wp.array(dtype=wp.vec2)
-    rows: wp.array(dtype=wp.int32)
-    before: wp.array(dtype=wp.int32)
-    after: wp.array(dtype=wp.int32)
-    distances: wp.array(dtype=wp.float32)
-    left: wp.array(dtype=wp.bool)
-    along: wp.array(dtype=wp.float32)
-    headings: wp.array(dtype=wp.float32)
-    widths: wp.array(dtype=wp.float32)
-    wheels: wp.array(dtype=wp.int32)
-    crashed: wp.array(dtype=wp.bool)
-    travelled: wp.array(dtype=wp.float32)
-    moved: wp.array(dtype=wp.float32)
-    steps: wp.array(dtype=wp.int32)
-    standing: wp.array(dtype=wp.int32)
-    falling: wp.array(dtype=wp.int32)
-    next_obstacle: wp.array(dtype=wp.int32)
-    last_obstacle: wp.array(dtype=wp.int32)
+    tracks: wp.array[wp.int32]
+    backwards: wp.array[wp.bool]
+    poses: wp.array[wp.vec3]
+    speeds: wp.array[wp.float32]
+    steerings: wp.array[wp.float32]
+    factors: wp.array[wp.vec4]
+    commands: wp.array[wp.vec2]
+    fronts: wp.array[wp.vec2]
+    rows: wp.array[wp.int32]
+    before: wp.array[wp.int32]
+    after: wp.array[wp.int32]
+    distances: wp.array[wp.float32]
+    left: wp.array[wp.bool]
+    along: wp.array[wp.float32]
+    headings: wp.array[wp.float32]
+    widths: wp.array[wp.float32]
+    wheels: wp.array[wp.int32]
+    crashed: wp.array[wp.bool]
+    travelled: wp.array[wp.float32]
+    moved: wp.array[wp.float32]
+    steps: wp.array[wp.int32]
+    standing: wp.array[wp.int32]
+    falling: wp.array[wp.int32]
+    next_obstacle: wp.array[wp.int32]
+    last_obstacle: wp.array[wp.int32]
     rules: ResetRules
-    mishaps: wp.array(dtype=wp.int32)
-    put: wp.array(dtype=wp.bool)
-    put_poses: wp.array(dtype=wp.vec3)
-    set_back: wp.array(dtype=wp.float32)
-    counts: wp.array2d(dtype=wp.int32)
-    trace: wp.array2d(dtype=wp.float32)
+    mishaps: wp.array[wp.int32]
+    put: wp.array[wp.bool]
+    put_poses: wp.array[wp.vec3]
+    set_back: wp.array[wp.float32]
+    counts: wp.array2d[wp.int32]
+    trace: wp.array2d[wp.float32]
 
 
 @wp.func

@@ -103,7 +103,7 @@ def told(truth: bool) -> float:
 def _tell(
     car: CarArrays,
     view: CameraView,
-    sides: wp.array2d(dtype=wp.float32),
+    sides: wp.array2d[wp.float32],
     seconds: float,
     race: RaceArrays,
 ):

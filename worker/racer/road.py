@@ -41,18 +41,18 @@ class RoadArrays:
         corner: Where the track's own origin is in a world [m], shape ``(tracks,)``: tracks lie side by side.
     """
 
-    center: wp.array(dtype=wp.vec2)
-    inner: wp.array(dtype=wp.vec2)
-    outer: wp.array(dtype=wp.vec2)
-    along: wp.array(dtype=wp.float32)
-    steps: wp.array(dtype=wp.float32)
-    width: wp.array(dtype=wp.float32)
-    first: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    length: wp.array(dtype=wp.float32)
-    window: wp.array(dtype=wp.int32)
-    clear: wp.array(dtype=wp.float32)
-    corner: wp.array(dtype=wp.vec2)
+    center: wp.array[wp.vec2]
+    inner: wp.array[wp.vec2]
+    outer: wp.array[wp.vec2]
+    along: wp.array[wp.float32]
+    steps: wp.array[wp.float32]
+    width: wp.array[wp.float32]
+    first: wp.array[wp.int32]
+    count: wp.array[wp.int32]
+    length: wp.array[wp.float32]
+    window: wp.array[wp.int32]
+    clear: wp.array[wp.float32]
+    corner: wp.array[wp.vec2]
 
 
 @wp.struct

@@ -42,8 +42,8 @@ def displace(
     position: wp.vec3f,
     angle: wp.vec3f,
     episodes: EpisodeArrays,
-    given: wp.array(dtype=wp.transformf),
-    poses: wp.array(dtype=wp.transformf),
+    given: wp.array[wp.transformf],
+    poses: wp.array[wp.transformf],
 ):
     """Pose of one world's camera: drawn once from stream ``number``, that is from the seed and the world alone."""
     world = wp.tid()
@@ -51,7 +51,7 @@ def displace(
 
 
 @wp.kernel
-def _paint(colors: float, episodes: EpisodeArrays, shape_colors: wp.array2d(dtype=wp.vec3f)):
+def _paint(colors: float, episodes: EpisodeArrays, shape_colors: wp.array2d[wp.vec3f]):
     """The colours of one world's shapes: drawn once, behind the six numbers of its camera's pose."""
     world = wp.tid()
     stream = numbered_stream(episodes, world, _STREAM)
@@ -66,7 +66,7 @@ def _paint(colors: float, episodes: EpisodeArrays, shape_colors: wp.array2d(dtyp
 
 
 @wp.kernel
-def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array(dtype=wp.float32)):
+def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array[wp.float32]):
     """Brightness of one world's image."""
     world = wp.tid()
     light[world] = wp.randf(numbered_stream(episodes, world, _STREAM - 1), ends[0], ends[1])
@@ -74,7 +74,7 @@ def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array(dtype=wp
 
 @wp.func
 def push(
-    images: wp.array4d(dtype=wp.uint8),
+    images: wp.array4d[wp.uint8],
     world: int,
     channel: int,
     channels: int,
@@ -109,10 +109,10 @@ def to_byte(value: float) -> wp.uint8:
 @wp.kernel
 def _stack(
     mode: int,
-    rendered: wp.array3d(dtype=wp.uint32),
-    light: wp.array(dtype=wp.float32),
+    rendered: wp.array3d[wp.uint32],
+    light: wp.array[wp.float32],
     episodes: EpisodeArrays,
-    images: wp.array4d(dtype=wp.uint8),
+    images: wp.array4d[wp.uint8],
 ):
     """Unpack one pixel and push it before the earlier ones; an episode's first image stands for those before it."""
     world, row, column = wp.tid()

@@ -16,14 +16,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def _deliver(
-    controls: wp.array2d(dtype=wp.float32),
-    delays: wp.array(dtype=wp.int32),
-    computed: wp.array(dtype=wp.int32),
-    references: wp.array(dtype=wp.float32),
-    history: wp.array3d(dtype=wp.float32),
-    pushes: wp.array2d(dtype=wp.int32),
-    targets: wp.array2d(dtype=wp.float32),
-    inputs: wp.array2d(dtype=wp.float32),
+    controls: wp.array2d[wp.float32],
+    delays: wp.array[wp.int32],
+    computed: wp.array[wp.int32],
+    references: wp.array[wp.float32],
+    history: wp.array3d[wp.float32],
+    pushes: wp.array2d[wp.int32],
+    targets: wp.array2d[wp.float32],
+    inputs: wp.array2d[wp.float32],
 ):
     """Remember the input, and hand on the one of ``delays`` physics steps ago, or the oldest there is.
 
@@ -49,7 +49,7 @@ def _deliver(
 
 
 @wp.kernel
-def _forget(ages: wp.array(dtype=wp.int32), pushes: wp.array2d(dtype=wp.int32)):
+def _forget(ages: wp.array[wp.int32], pushes: wp.array2d[wp.int32]):
     """Inputs of the episode before are not obeyed in a new one."""
     world, actuator = wp.tid()
     if ages[world] == 0:

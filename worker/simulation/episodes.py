@@ -70,34 +70,34 @@ class EpisodeArrays:
             declared task the ends by each termination and by the clock; shape ``(6 + terms,)`` or more.
     """
 
-    actions: wp.array2d(dtype=wp.float32)
-    observations: wp.array2d(dtype=wp.float32)
-    terminal_observations: wp.array2d(dtype=wp.float32)
-    rewards: wp.array(dtype=wp.float32)
-    dones: wp.array(dtype=wp.bool)
-    time_outs: wp.array(dtype=wp.bool)
-    ages: wp.array(dtype=wp.int32)
-    sums: wp.array2d(dtype=wp.float32)
-    random: wp.array2d(dtype=wp.int32)
-    terms: wp.array2d(dtype=wp.float32)
-    weights: wp.array(dtype=wp.float32)
-    level: wp.array(dtype=wp.float32)
-    memory: wp.array2d(dtype=wp.float32)
-    lasting: wp.array2d(dtype=wp.float32)
-    last_actions: wp.array2d(dtype=wp.float32)
-    earlier_actions: wp.array2d(dtype=wp.float32)
-    warm_start: wp.array2d(dtype=wp.float32)
-    activations: wp.array2d(dtype=wp.float32)
-    broken: wp.array(dtype=wp.int32)
-    mishap: wp.array(dtype=wp.int32)
-    last_sums: wp.array2d(dtype=wp.float32)
-    causes: wp.array(dtype=wp.int32)
-    successes: wp.array(dtype=wp.bool)
-    statistics: wp.array(dtype=wp.float64)
+    actions: wp.array2d[wp.float32]
+    observations: wp.array2d[wp.float32]
+    terminal_observations: wp.array2d[wp.float32]
+    rewards: wp.array[wp.float32]
+    dones: wp.array[wp.bool]
+    time_outs: wp.array[wp.bool]
+    ages: wp.array[wp.int32]
+    sums: wp.array2d[wp.float32]
+    random: wp.array2d[wp.int32]
+    terms: wp.array2d[wp.float32]
+    weights: wp.array[wp.float32]
+    level: wp.array[wp.float32]
+    memory: wp.array2d[wp.float32]
+    lasting: wp.array2d[wp.float32]
+    last_actions: wp.array2d[wp.float32]
+    earlier_actions: wp.array2d[wp.float32]
+    warm_start: wp.array2d[wp.float32]
+    activations: wp.array2d[wp.float32]
+    broken: wp.array[wp.int32]
+    mishap: wp.array[wp.int32]
+    last_sums: wp.array2d[wp.float32]
+    causes: wp.array[wp.int32]
+    successes: wp.array[wp.bool]
+    statistics: wp.array[wp.float64]
 
 
 @wp.func
-def clear_row(rows: wp.array2d(dtype=wp.float32), world: int):
+def clear_row(rows: wp.array2d[wp.float32], world: int):
     """Set a world's row to zero."""
     for column in range(rows.shape[1]):
         rows[world, column] = 0.0
@@ -167,7 +167,7 @@ def read_mishap(code: int, observations: Sequence[str]) -> tuple[int, str]:
 @wp.func
 def end_step(
     episodes: EpisodeArrays,
-    overflow: wp.array(dtype=wp.int32),
+    overflow: wp.array[wp.int32],
     world: int,
     terminated: bool,
     valid: bool,
@@ -242,9 +242,7 @@ def check_observations(episodes: EpisodeArrays):
 
 
 @wp.kernel
-def check_group(
-    dones: wp.array(dtype=wp.bool), rows: wp.array2d(dtype=wp.float32), ended: wp.array2d(dtype=wp.float32)
-):
+def check_group(dones: wp.array[wp.bool], rows: wp.array2d[wp.float32], ended: wp.array2d[wp.float32]):
     """Replace non-finite numbers of a further observation group by 0."""
     world = wp.tid()
     for column in range(rows.shape[1]):

@@ -39,38 +39,38 @@ class Tree:
         group_counts: How many these are, shape ``(dofs,)``.
     """
 
-    parents: wp.array(dtype=wp.int32)
-    first_dofs: wp.array(dtype=wp.int32)
-    dof_counts: wp.array(dtype=wp.int32)
-    welded: wp.array(dtype=wp.bool)
-    positions: wp.array(dtype=wp.vec3)
-    rotations: wp.array(dtype=wp.quat)
-    axes: wp.array(dtype=wp.spatial_vector)
-    group_firsts: wp.array(dtype=wp.int32)
-    group_counts: wp.array(dtype=wp.int32)
+    parents: wp.array[wp.int32]
+    first_dofs: wp.array[wp.int32]
+    dof_counts: wp.array[wp.int32]
+    welded: wp.array[wp.bool]
+    positions: wp.array[wp.vec3]
+    rotations: wp.array[wp.quat]
+    axes: wp.array[wp.spatial_vectorf]
+    group_firsts: wp.array[wp.int32]
+    group_counts: wp.array[wp.int32]
 
 
 @wp.struct
 class Inertials:
     """The inertial fields of mujoco_warp's model and the constants derived from them, each with leading dimension worlds."""
 
-    masses: wp.array2d(dtype=wp.float32)
-    centers: wp.array2d(dtype=wp.vec3)
-    frames: wp.array2d(dtype=wp.quat)
-    moments: wp.array2d(dtype=wp.vec3)
-    armatures: wp.array2d(dtype=wp.float32)
-    subtree_masses: wp.array2d(dtype=wp.float32)
-    body_weights: wp.array2d(dtype=wp.vec2)
-    dof_weights: wp.array2d(dtype=wp.float32)
+    masses: wp.array2d[wp.float32]
+    centers: wp.array2d[wp.vec3]
+    frames: wp.array2d[wp.quat]
+    moments: wp.array2d[wp.vec3]
+    armatures: wp.array2d[wp.float32]
+    subtree_masses: wp.array2d[wp.float32]
+    body_weights: wp.array2d[wp.vec2]
+    dof_weights: wp.array2d[wp.float32]
 
 
 @wp.struct
 class Scratch:
     """Scratch memory for one pass through the tree, leading dimension worlds."""
 
-    matrices: wp.array2d(dtype=wp.spatial_matrix)
-    forces: wp.array2d(dtype=wp.spatial_vector)
-    diagonal: wp.array2d(dtype=wp.float32)
+    matrices: wp.array2d[wp.spatial_matrix]
+    forces: wp.array2d[wp.spatial_vectorf]
+    diagonal: wp.array2d[wp.float32]
 
 
 @wp.func
@@ -120,7 +120,7 @@ def _weight_of_body(tree: Tree, inertials: Inertials, world: int, body: int, ans
 
 
 @wp.kernel
-def _weigh(changed: wp.array(dtype=wp.bool), tree: Tree, scratch: Scratch, inertials: Inertials):
+def _weigh(changed: wp.array[wp.bool], tree: Tree, scratch: Scratch, inertials: Inertials):
     """Masses of subtrees and inverse weights of one world.
 
     From the leaves to the root: inertia of each articulated body and, joint by joint, what is left of it when the joint gives way. From

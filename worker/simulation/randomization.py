@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def _draw_factors(episodes: EpisodeArrays, ends: wp.array(dtype=wp.vec2), factors: wp.array2d(dtype=wp.float32)):
+def _draw_factors(episodes: EpisodeArrays, ends: wp.array[wp.vec2], factors: wp.array2d[wp.float32]):
     """Uniform factors of one world. Each has a stream of its own: what one is does not depend on what else is drawn."""
     world, factor = wp.tid()
     stream = numbered_stream(episodes, world, -1 - factor)
@@ -47,8 +47,8 @@ def _delay(
     latency: int,
     worlds: WorldArrays,
     episodes: EpisodeArrays,
-    delays: wp.array(dtype=wp.int32),
-    history: wp.array2d(dtype=wp.float32),
+    delays: wp.array[wp.int32],
+    history: wp.array2d[wp.float32],
 ):
     """Give the actuators the controls of some steps ago; until there are such, the first ones of the episode."""
     world = wp.tid()
@@ -70,7 +70,7 @@ def _delay(
 
 @wp.func
 def _blur(
-    observations: wp.array2d(dtype=wp.float32), deviations: wp.array(dtype=wp.float32), world: int, stream: wp.uint32
+    observations: wp.array2d[wp.float32], deviations: wp.array[wp.float32], world: int, stream: wp.uint32
 ) -> wp.uint32:
     """Add normal noise to the observations of one world that have any; returns the generator as it is afterwards."""
     for column in range(observations.shape[1]):
@@ -80,7 +80,7 @@ def _blur(
 
 
 @wp.kernel
-def _add_noise(mode: int, deviations: wp.array(dtype=wp.float32), episodes: EpisodeArrays):
+def _add_noise(mode: int, deviations: wp.array[wp.float32], episodes: EpisodeArrays):
     """Normal noise on what the policy sees, and on the last observation of an episode that ended."""
     world = wp.tid()
     stream = _blur(episodes.observations, deviations, world, random_stream(episodes, world))

@@ -44,14 +44,14 @@ class Entries:
         control_hz: Control steps per simulated second [Hz].
     """
 
-    first_columns: wp.array(dtype=wp.int32)
-    counts: wp.array(dtype=wp.int32)
-    axes: wp.array(dtype=wp.int32)
-    first_ranges: wp.array(dtype=wp.int32)
-    distributions: wp.array(dtype=wp.int32)
-    moments: wp.array(dtype=wp.int32)
-    ranges: wp.array(dtype=wp.vec2)
-    seconds: wp.array(dtype=wp.vec2)
+    first_columns: wp.array[wp.int32]
+    counts: wp.array[wp.int32]
+    axes: wp.array[wp.int32]
+    first_ranges: wp.array[wp.int32]
+    distributions: wp.array[wp.int32]
+    moments: wp.array[wp.int32]
+    ranges: wp.array[wp.vec2]
+    seconds: wp.array[wp.vec2]
     control_hz: float
 
 
@@ -72,25 +72,25 @@ class Changes:
         points: Position of a payload in the body's frame [m], shape ``(changes,)``.
     """
 
-    columns: wp.array(dtype=wp.int32)
-    least: wp.array(dtype=wp.float32)
-    greatest: wp.array(dtype=wp.float32)
-    starts: wp.array(dtype=wp.int32)
-    operations: wp.array(dtype=wp.int32)
-    draws: wp.array(dtype=wp.int32)
-    factors: wp.array(dtype=wp.float32)
-    kinds: wp.array(dtype=wp.int32)
-    axes: wp.array(dtype=wp.int32)
-    points: wp.array(dtype=wp.vec3)
+    columns: wp.array[wp.int32]
+    least: wp.array[wp.float32]
+    greatest: wp.array[wp.float32]
+    starts: wp.array[wp.int32]
+    operations: wp.array[wp.int32]
+    draws: wp.array[wp.int32]
+    factors: wp.array[wp.float32]
+    kinds: wp.array[wp.int32]
+    axes: wp.array[wp.int32]
+    points: wp.array[wp.vec3]
 
 
 @wp.struct
 class Bodies:
     """Masses, centres of mass [m] in the bodies' frames, and inertias about these [kg m^2] along the frames' axes."""
 
-    masses: wp.array2d(dtype=wp.float32)
-    centers: wp.array2d(dtype=wp.vec3)
-    inertias: wp.array2d(dtype=wp.mat33)
+    masses: wp.array2d[wp.float32]
+    centers: wp.array2d[wp.vec3]
+    inertias: wp.array2d[wp.mat33]
 
 
 @wp.struct
@@ -98,18 +98,18 @@ class BodyFields:
     """Arrays of the bodies' inertial properties: Newton's, shape ``(worlds, bodies)``, and mujoco_warp's, with the world as body 0 and in
     its own order, shape ``(worlds, 1 + bodies)``."""
 
-    columns: wp.array(dtype=wp.int32)
-    inverse_masses: wp.array2d(dtype=wp.float32)
-    inverse_inertias: wp.array2d(dtype=wp.mat33)
-    masses: wp.array2d(dtype=wp.float32)
-    centers: wp.array2d(dtype=wp.vec3)
-    moments: wp.array2d(dtype=wp.vec3)
-    frames: wp.array2d(dtype=wp.quat)
+    columns: wp.array[wp.int32]
+    inverse_masses: wp.array2d[wp.float32]
+    inverse_inertias: wp.array2d[wp.mat33]
+    masses: wp.array2d[wp.float32]
+    centers: wp.array2d[wp.vec3]
+    moments: wp.array2d[wp.vec3]
+    frames: wp.array2d[wp.quat]
 
 
 @wp.func
 def _draw_entry(
-    entries: Entries, world: int, entry: int, stream: wp.uint32, draws: wp.array2d(dtype=wp.float32)
+    entries: Entries, world: int, entry: int, stream: wp.uint32, draws: wp.array2d[wp.float32]
 ) -> wp.uint32:
     """Draw an entry's numbers of one world; returns the generator as it is afterwards."""
     for index in range(entries.counts[entry]):
@@ -127,7 +127,7 @@ def _draw_entry(
 
 @wp.func
 def _draw_countdown(
-    entries: Entries, world: int, entry: int, stream: wp.uint32, countdowns: wp.array2d(dtype=wp.int32)
+    entries: Entries, world: int, entry: int, stream: wp.uint32, countdowns: wp.array2d[wp.int32]
 ) -> wp.uint32:
     """Draw the control steps until the next draw of an interval, at least one; returns the generator as it is afterwards."""
     seconds = entries.seconds[entry]
@@ -140,8 +140,8 @@ def _draw_countdown(
 def draw_at_start(
     entries: Entries,
     episodes: EpisodeArrays,
-    draws: wp.array2d(dtype=wp.float32),
-    countdowns: wp.array2d(dtype=wp.int32),
+    draws: wp.array2d[wp.float32],
+    countdowns: wp.array2d[wp.int32],
 ):
     """Draw one entry of one world. Each has a stream of its own: what one is does not depend on what else is drawn."""
     world, entry = wp.tid()
@@ -154,9 +154,9 @@ def draw_at_start(
 def draw_due(
     entries: Entries,
     episodes: EpisodeArrays,
-    draws: wp.array2d(dtype=wp.float32),
-    countdowns: wp.array2d(dtype=wp.int32),
-    changed: wp.array(dtype=wp.bool),
+    draws: wp.array2d[wp.float32],
+    countdowns: wp.array2d[wp.int32],
+    changed: wp.array[wp.bool],
 ):
     """Draw what is due in one world: a new episode's entries, and intervals that are over. A new episode begins its intervals afresh."""
     world = wp.tid()
@@ -191,11 +191,11 @@ def _combined(operation: int, value: float, number: float) -> float:
 
 @wp.kernel
 def change_numbers(
-    changed: wp.array(dtype=wp.bool),
+    changed: wp.array[wp.bool],
     changes: Changes,
-    draws: wp.array2d(dtype=wp.float32),
-    defaults: wp.array2d(dtype=wp.float32),
-    values: wp.array2d(dtype=wp.float32),
+    draws: wp.array2d[wp.float32],
+    defaults: wp.array2d[wp.float32],
+    values: wp.array2d[wp.float32],
 ):
     """Write one number of one world, from the model's own and all that was drawn for it."""
     world, index = wp.tid()
@@ -235,9 +235,9 @@ def _principal_frame(axes: wp.mat33) -> wp.quat:
 
 @wp.kernel
 def change_bodies(
-    changed: wp.array(dtype=wp.bool),
+    changed: wp.array[wp.bool],
     changes: Changes,
-    draws: wp.array2d(dtype=wp.float32),
+    draws: wp.array2d[wp.float32],
     defaults: Bodies,
     values: Bodies,
     fields: BodyFields,

@@ -30,14 +30,14 @@ class RobotArrays:
     root_coordinate: int
     root_dof: int
     root_body: int
-    coordinates: wp.array(dtype=wp.int32)
-    dofs: wp.array(dtype=wp.int32)
-    actuators: wp.array(dtype=wp.int32)
-    defaults: wp.array(dtype=wp.float32)
-    ranges: wp.array(dtype=wp.vec2)
-    efforts: wp.array(dtype=wp.float32)
-    gains: wp.array(dtype=wp.float32)
-    encoder_bias: wp.array2d(dtype=wp.float32)
+    coordinates: wp.array[wp.int32]
+    dofs: wp.array[wp.int32]
+    actuators: wp.array[wp.int32]
+    defaults: wp.array[wp.float32]
+    ranges: wp.array[wp.vec2]
+    efforts: wp.array[wp.float32]
+    gains: wp.array[wp.float32]
+    encoder_bias: wp.array2d[wp.float32]
     start: wp.transform
 
 
@@ -51,6 +51,6 @@ class BodyArrays:
         coms: Centre of mass in the body's frame [m], shape ``(worlds, bodies)``.
     """
 
-    poses: wp.array2d(dtype=wp.transform)
-    velocities: wp.array2d(dtype=wp.spatial_vector)
-    coms: wp.array2d(dtype=wp.vec3)
+    poses: wp.array2d[wp.transform]
+    velocities: wp.array2d[wp.spatial_vectorf]
+    coms: wp.array2d[wp.vec3]

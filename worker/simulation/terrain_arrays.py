@@ -32,11 +32,11 @@ class TerrainArrays:
         start_levels: Number of levels on which a world may begin.
     """
 
-    levels: wp.array(dtype=wp.int32)
-    kinds: wp.array(dtype=wp.int32)
-    origins: wp.array2d(dtype=wp.vec3)
-    heights: wp.array2d(dtype=wp.float32)
-    ends: wp.array(dtype=wp.float64)
+    levels: wp.array[wp.int32]
+    kinds: wp.array[wp.int32]
+    origins: wp.array2d[wp.vec3]
+    heights: wp.array2d[wp.float32]
+    ends: wp.array[wp.float64]
     corner: wp.vec2
     size: wp.vec2
     resolution: float

@@ -40,15 +40,15 @@ class WorldArrays:
         fastest: Velocity above which the physics counts as failed [m/s, rad/s].
     """
 
-    joint_q: wp.array2d(dtype=wp.float32)
-    joint_qd: wp.array2d(dtype=wp.float32)
-    controls: wp.array2d(dtype=wp.float32)
-    drives: wp.array2d(dtype=wp.float32)
-    warm_start: wp.array2d(dtype=wp.float32)
-    activations: wp.array2d(dtype=wp.float32)
-    start_q: wp.array2d(dtype=wp.float32)
-    start_qd: wp.array2d(dtype=wp.float32)
-    overflow: wp.array(dtype=wp.int32)
+    joint_q: wp.array2d[wp.float32]
+    joint_qd: wp.array2d[wp.float32]
+    controls: wp.array2d[wp.float32]
+    drives: wp.array2d[wp.float32]
+    warm_start: wp.array2d[wp.float32]
+    activations: wp.array2d[wp.float32]
+    start_q: wp.array2d[wp.float32]
+    start_qd: wp.array2d[wp.float32]
+    overflow: wp.array[wp.int32]
     fastest: float
 
 
@@ -111,7 +111,7 @@ _CAPACITY_BITS = wp.constant(
 
 
 @wp.kernel
-def _gather_overflow(solver_overflow: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
+def _gather_overflow(solver_overflow: wp.array[wp.int32], overflow: wp.array[wp.int32]):
     """The solver clears its bits before each control step: keep them until they are counted."""
     world = wp.tid()
     overflow[world] = overflow[world] | (solver_overflow[world] & _CAPACITY_BITS)

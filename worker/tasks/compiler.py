@@ -21,8 +21,8 @@ from worker.tasks.plan import Plan, Told
 from worker.tasks.source import Source, call_of, calls, loop, parameters_of
 
 COMMON = (
-    "numbers: wp.array(dtype=wp.float32), indices: wp.array(dtype=wp.int32), past: wp.array2d(dtype=wp.float32), "
-    "external: wp.array2d(dtype=wp.float32), seconds: float, worlds: WorldArrays, episodes: EpisodeArrays"
+    "numbers: wp.array[wp.float32], indices: wp.array[wp.int32], past: wp.array2d[wp.float32], "
+    "external: wp.array2d[wp.float32], seconds: float, worlds: WorldArrays, episodes: EpisodeArrays"
 )
 """Parameters of every kernel, after its own."""
 
@@ -154,7 +154,7 @@ def judge(source: Source, apart: bool) -> str:
 def own(plan: Plan) -> str:
     """Parameters of the observing kernels: mode, longest age, the rows of groups besides the policy's, and the common ones."""
     rows = [row for group in further(plan) for row in rows_of(group)]
-    return "".join(["mode: int, max_age: int, ", *[f"{row}: wp.array2d(dtype=wp.float32), " for row in rows], COMMON])
+    return "".join(["mode: int, max_age: int, ", *[f"{row}: wp.array2d[wp.float32], " for row in rows], COMMON])
 
 
 def further(plan: Plan) -> list[str]:

@@ -13,9 +13,9 @@ def group_function(source: Source, group: str, terms: list[Seen]) -> str:
     than the last one of an episode; ``out``, the output; ``now``, the group's row of the step before, with its history.
     """
     own = (
-        "world: int, fresh: bool, commit: bool, out: wp.array2d(dtype=wp.float32), now: wp.array2d(dtype=wp.float32), "
-        "given: wp.uint32, numbers: wp.array(dtype=wp.float32), indices: wp.array(dtype=wp.int32), "
-        "past: wp.array2d(dtype=wp.float32), external: wp.array2d(dtype=wp.float32), seconds: float, "
+        "world: int, fresh: bool, commit: bool, out: wp.array2d[wp.float32], now: wp.array2d[wp.float32], "
+        "given: wp.uint32, numbers: wp.array[wp.float32], indices: wp.array[wp.int32], "
+        "past: wp.array2d[wp.float32], external: wp.array2d[wp.float32], seconds: float, "
         "worlds: WorldArrays, episodes: EpisodeArrays"
     )
     lines = ["stream = given"] if source.group_draws(group) else []

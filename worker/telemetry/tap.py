@@ -35,14 +35,14 @@ LEAST_ROWS = 32
 
 @wp.kernel
 def _fill(
-    ends: wp.array(dtype=wp.int32),
-    states: wp.array2d(dtype=wp.float32),
+    ends: wp.array[wp.int32],
+    states: wp.array2d[wp.float32],
     worlds: WorldArrays,
     episodes: EpisodeArrays,
-    ended: wp.array(dtype=wp.int32),
-    count: wp.array(dtype=wp.int64),
-    values: wp.array3d(dtype=wp.float32),
-    marks: wp.array3d(dtype=wp.int32),
+    ended: wp.array[wp.int32],
+    count: wp.array[wp.int64],
+    values: wp.array3d[wp.float32],
+    marks: wp.array3d[wp.int32],
 ):
     """One column of one world's row."""
     world, column = wp.tid()
@@ -70,7 +70,7 @@ def _fill(
 
 
 @wp.kernel
-def _count(dones: wp.array(dtype=wp.bool), ended: wp.array(dtype=wp.int32), count: wp.array(dtype=wp.int64)):
+def _count(dones: wp.array[wp.bool], ended: wp.array[wp.int32], count: wp.array[wp.int64]):
     """A kernel of its own: the row is whole before it counts."""
     for world in range(ended.shape[0]):
         if dones[world]:
@@ -80,10 +80,10 @@ def _count(dones: wp.array(dtype=wp.bool), ended: wp.array(dtype=wp.int32), coun
 
 @wp.kernel
 def _keep_image(
-    source: wp.array2d(dtype=wp.uint8),
+    source: wp.array2d[wp.uint8],
     start: int,
-    count: wp.array(dtype=wp.int64),
-    images: wp.array3d(dtype=wp.uint8),
+    count: wp.array[wp.int64],
+    images: wp.array3d[wp.uint8],
 ):
     """One byte of one world's present frame, which comes first in its row of ``source``."""
     world, byte = wp.tid()

@@ -98,7 +98,7 @@ def test_contacts_of_a_robot_with_itself() -> None:
 
 
 @wp.kernel
-def ask(contacts: ContactArrays, threshold: float, answers: wp.array2d(dtype=wp.float32)):
+def ask(contacts: ContactArrays, threshold: float, answers: wp.array2d[wp.float32]):
     world = wp.tid()
     answers[world, 0] = float(int(first_contact(contacts, world, 0)))
     answers[world, 1] = float(int(first_air(contacts, world, 0)))

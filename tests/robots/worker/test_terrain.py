@@ -264,7 +264,7 @@ def _walk(
     robot: RobotArrays,
     terrain: TerrainArrays,
     episodes: EpisodeArrays,
-    inside: wp.array(dtype=wp.bool),
+    inside: wp.array[wp.bool],
 ):
     world = wp.tid()
     walked_levels(world, worlds, robot, terrain, episodes, command, episode_seconds, random_stream(episodes, world))

@@ -75,7 +75,7 @@ def balls() -> SensorContext:
 
 
 @wp.kernel
-def _heights(terrain: TerrainArrays, places: wp.array(dtype=wp.vec2), heights: wp.array(dtype=wp.float32)):
+def _heights(terrain: TerrainArrays, places: wp.array[wp.vec2], heights: wp.array[wp.float32]):
     point = wp.tid()
     heights[point] = ground_height(terrain, places[point][0], places[point][1])
 

@@ -142,7 +142,7 @@ class Rig:
         lines.append("wp.set_module_options({'enable_backward': False})")
         typed = [f"{names[kind]}: {kind.cls.__module__}.{kind.cls.__name__}" for kind in kinds]
         robots = [f"{each}: worker.simulation.robot_arrays.RobotArrays" for each in ("robot", "other")]
-        rest = ["element: int", "seed: int", "numbers: wp.array(dtype=float)", "out: wp.array2d(dtype=float)"]
+        rest = ["element: int", "seed: int", "numbers: wp.array[float]", "out: wp.array2d[float]"]
         for term in terms:
             lines += ["", "@wp.kernel", f"def call_{term.key}({', '.join([*typed, *robots, *rest])}):"]
             lines += ["    world = wp.tid()", *(f"    {line}" for line in self._call(term, names))]

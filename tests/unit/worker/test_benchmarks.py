@@ -60,7 +60,7 @@ def test_compile_times_are_read_from_what_warp_says(
     monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)  # a training in this process may have silenced it
 
     @wp.kernel(module="unique")
-    def fill(values: wp.array(dtype=wp.float32)):
+    def fill(values: wp.array[wp.float32]):
         values[wp.tid()] = 2.0
 
     values = wp.zeros(3, dtype=wp.float32, device="cpu")

@@ -16,19 +16,19 @@ _ACTIONS, _ORDER = 0, 1
 
 
 @wp.func
-def _stream(key: wp.array(dtype=wp.int32), what: int, world: int, number: int) -> wp.uint32:
+def _stream(key: wp.array[wp.int32], what: int, world: int, number: int) -> wp.uint32:
     """A generator of its own for each (iteration, purpose, world, number)."""
     return wp.rand_init(int(wp.rand_init(key[what], world)), number)
 
 
 @wp.kernel
 def _draw_normal(
-    key: wp.array(dtype=wp.int32),
+    key: wp.array[wp.int32],
     step: int,
     first: int,
-    mean: wp.array2d(dtype=wp.float32),
-    std: wp.array(dtype=wp.float32),
-    actions: wp.array2d(dtype=wp.float32),
+    mean: wp.array2d[wp.float32],
+    std: wp.array[wp.float32],
+    actions: wp.array2d[wp.float32],
 ):
     world, column = wp.tid()
     stream = _stream(key, 0, first + world, step * mean.shape[1] + column)
@@ -37,11 +37,11 @@ def _draw_normal(
 
 @wp.kernel
 def _draw_choices(
-    key: wp.array(dtype=wp.int32),
+    key: wp.array[wp.int32],
     step: int,
     first: int,
-    logits: wp.array2d(dtype=wp.float32),
-    actions: wp.array2d(dtype=wp.float32),
+    logits: wp.array2d[wp.float32],
+    actions: wp.array2d[wp.float32],
 ):
     """The greatest of logits + Gumbel noise is a draw from their softmax (Gumbel 1954; Maddison et al., arXiv:1411.0030)."""
     world = wp.tid()
@@ -59,12 +59,12 @@ def _draw_choices(
 
 @wp.kernel
 def _draw_order(
-    key: wp.array(dtype=wp.int32),
+    key: wp.array[wp.int32],
     first: int,
     worlds: int,
     minibatches: int,
-    scratch: wp.array3d(dtype=wp.int32),
-    orders: wp.array3d(dtype=wp.int64),
+    scratch: wp.array3d[wp.int32],
+    orders: wp.array3d[wp.int64],
 ):
     """Shuffle the steps of one world in one epoch (Fisher and Yates) and deal them out to the minibatches."""
     epoch, world = wp.tid()

@@ -13,14 +13,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def _explore(
-    keys: wp.array(dtype=wp.int32),
+    keys: wp.array[wp.int32],
     step: int,
     first_world: int,
-    uniform: wp.array(dtype=wp.int32),
+    uniform: wp.array[wp.int32],
     limit: float,
-    mean: wp.array2d(dtype=wp.float32),
-    log_std: wp.array2d(dtype=wp.float32),
-    actions: wp.array2d(dtype=wp.float32),
+    mean: wp.array2d[wp.float32],
+    log_std: wp.array2d[wp.float32],
+    actions: wp.array2d[wp.float32],
 ):
     """The action of one world. Its numbers follow from the step's key and the world's global index alone."""
     world = wp.tid()
@@ -34,13 +34,13 @@ def _explore(
 
 @wp.kernel
 def _look_ahead(
-    rows: wp.array(dtype=wp.int64),
-    outcomes: wp.array2d(dtype=wp.float32),
+    rows: wp.array[wp.int64],
+    outcomes: wp.array2d[wp.float32],
     worlds: int,
-    powers: wp.array(dtype=wp.float32),
-    last: wp.array(dtype=wp.int64),
-    returns: wp.array(dtype=wp.float32),
-    discounts: wp.array(dtype=wp.float32),
+    powers: wp.array[wp.float32],
+    last: wp.array[wp.int64],
+    returns: wp.array[wp.float32],
+    discounts: wp.array[wp.float32],
 ):
     """The steps of one transition, of n or up to the end of its episode."""
     sample = wp.tid()
@@ -58,13 +58,13 @@ def _look_ahead(
 
 @wp.kernel
 def _project(
-    probabilities: wp.array2d(dtype=wp.float32),
-    returns: wp.array(dtype=wp.float32),
-    discounts: wp.array(dtype=wp.float32),
-    bonuses: wp.array(dtype=wp.float32),
+    probabilities: wp.array2d[wp.float32],
+    returns: wp.array[wp.float32],
+    discounts: wp.array[wp.float32],
+    bonuses: wp.array[wp.float32],
     least: float,
     gap: float,
-    projected: wp.array2d(dtype=wp.float32),
+    projected: wp.array2d[wp.float32],
 ):
     """The probability of one atom of one sample: of all that falls within a gap of it, the nearer the more.
 

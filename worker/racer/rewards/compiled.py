@@ -33,11 +33,11 @@ class RaceArrays:
             :data:`~worker.racer.rewards.translation.prelude.ERRORS`) and how many there were, shape ``(worlds, 2)``.
     """
 
-    numbers: wp.array2d(dtype=wp.float32)
-    objects: wp.array3d(dtype=wp.float32)
-    waypoints: wp.array3d(dtype=wp.float32)
-    counts: wp.array(dtype=wp.int32)
-    errors: wp.array2d(dtype=wp.int32)
+    numbers: wp.array2d[wp.float32]
+    objects: wp.array3d[wp.float32]
+    waypoints: wp.array3d[wp.float32]
+    counts: wp.array[wp.int32]
+    errors: wp.array2d[wp.int32]
 
 
 def race_arrays(worlds: int, tracks: Sequence[Sequence[Point]], device: str) -> Any:
@@ -83,7 +83,7 @@ def kernels(functions: Sequence[Any], name: str) -> list[Any]:
     for number, function in enumerate(functions):
         scope[f"function_{number}"] = function
         parts.append(
-            f"def reward_all_{number}(race: RaceArrays, rewards: wp.array(dtype=wp.float32)):\n"
+            f"def reward_all_{number}(race: RaceArrays, rewards: wp.array[wp.float32]):\n"
             f"    world = wp.tid()\n    rewards[world] = function_{number}(world, race)\n"
         )
     _run("\n".join(parts), name, scope)

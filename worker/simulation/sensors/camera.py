@@ -58,9 +58,9 @@ class CameraArrays:
         poses: Of the camera in the world's frame; it looks along its own -z, its +y is up; shape ``(worlds,)``.
     """
 
-    images: wp.array4d(dtype=wp.uint8)
-    depths: wp.array3d(dtype=wp.float32)
-    poses: wp.array(dtype=wp.transform)
+    images: wp.array4d[wp.uint8]
+    depths: wp.array3d[wp.float32]
+    poses: wp.array[wp.transform]
 
 
 @wp.kernel
@@ -68,8 +68,8 @@ def _redraw(
     position: wp.vec3,
     angle: wp.vec3,
     episodes: EpisodeArrays,
-    usual: wp.array(dtype=wp.transform),
-    mounts: wp.array(dtype=wp.transform),
+    usual: wp.array[wp.transform],
+    mounts: wp.array[wp.transform],
 ):
     """Draws the camera's mount for a world that begins an episode."""
     world = wp.tid()
@@ -78,15 +78,15 @@ def _redraw(
 
 
 @wp.kernel
-def _follow(bodies: BodyArrays, body: int, mounts: wp.array(dtype=wp.transform), camera: CameraArrays):
+def _follow(bodies: BodyArrays, body: int, mounts: wp.array[wp.transform], camera: CameraArrays):
     world = wp.tid()
     camera.poses[world] = place_pose(bodies, world, body, mounts[world])
 
 
 @wp.kernel
 def _stack_color(
-    pixels: wp.array3d(dtype=wp.uint32),
-    light: wp.array(dtype=wp.float32),
+    pixels: wp.array3d[wp.uint32],
+    light: wp.array[wp.float32],
     episodes: EpisodeArrays,
     camera: CameraArrays,
 ):
@@ -99,8 +99,8 @@ def _stack_color(
 
 @wp.kernel
 def _stack_grey(
-    pixels: wp.array3d(dtype=wp.uint32),
-    light: wp.array(dtype=wp.float32),
+    pixels: wp.array3d[wp.uint32],
+    light: wp.array[wp.float32],
     episodes: EpisodeArrays,
     camera: CameraArrays,
 ):
@@ -113,7 +113,7 @@ def _stack_grey(
 
 @wp.kernel
 def _stack_depth(
-    near: float, far: float, pixels: wp.array3d(dtype=wp.float32), episodes: EpisodeArrays, camera: CameraArrays
+    near: float, far: float, pixels: wp.array3d[wp.float32], episodes: EpisodeArrays, camera: CameraArrays
 ):
     """Nothing is as far as can be; Newton says 0 there."""
     world, row, column = wp.tid()
@@ -129,8 +129,8 @@ def _stack_depth(
 @wp.kernel
 def _stack_masks(
     channels: int,
-    channel_of: wp.array(dtype=wp.int32),
-    pixels: wp.array3d(dtype=wp.uint32),
+    channel_of: wp.array[wp.int32],
+    pixels: wp.array3d[wp.uint32],
     episodes: EpisodeArrays,
     camera: CameraArrays,
 ):

@@ -40,14 +40,14 @@ class ContactArrays:
         seconds: Length of a control step [s].
     """
 
-    found: wp.array2d(dtype=wp.int32)
-    forces: wp.array2d(dtype=wp.vec3)
-    air_time: wp.array2d(dtype=wp.float32)
-    contact_time: wp.array2d(dtype=wp.float32)
-    last_air_time: wp.array2d(dtype=wp.float32)
-    last_contact_time: wp.array2d(dtype=wp.float32)
-    peaks: wp.array2d(dtype=wp.float32)
-    history: wp.array3d(dtype=wp.float32)
+    found: wp.array2d[wp.int32]
+    forces: wp.array2d[wp.vec3]
+    air_time: wp.array2d[wp.float32]
+    contact_time: wp.array2d[wp.float32]
+    last_air_time: wp.array2d[wp.float32]
+    last_contact_time: wp.array2d[wp.float32]
+    peaks: wp.array2d[wp.float32]
+    history: wp.array3d[wp.float32]
     step: float
     seconds: float
 
@@ -91,24 +91,24 @@ class _Solved:
 
     cone: int
     rows: int
-    count: wp.array(dtype=wp.int32)
-    worlds: wp.array(dtype=wp.int32)
-    geoms: wp.array(dtype=wp.vec2i)
-    dims: wp.array(dtype=wp.int32)
-    frames: wp.array(dtype=wp.mat33)
-    friction: wp.array2d(dtype=wp.float32)
-    adhesion: wp.array(dtype=wp.float32)
-    addresses: wp.array2d(dtype=wp.int32)
-    forces: wp.array2d(dtype=wp.float32)
+    count: wp.array[wp.int32]
+    worlds: wp.array[wp.int32]
+    geoms: wp.array[wp.vec2i]
+    dims: wp.array[wp.int32]
+    frames: wp.array[wp.mat33]
+    friction: wp.array2d[wp.float32]
+    adhesion: wp.array[wp.float32]
+    addresses: wp.array2d[wp.int32]
+    forces: wp.array2d[wp.float32]
 
 
 @wp.struct
 class _Sums:
     """Sums over the contacts of one physics step, shape ``(worlds, columns)``; cleared by the kernel that reads them."""
 
-    found: wp.array2d(dtype=wp.int32)
-    forces: wp.array2d(dtype=wp.vec3)
-    strongest: wp.array2d(dtype=wp.float32)
+    found: wp.array2d[wp.int32]
+    forces: wp.array2d[wp.vec3]
+    strongest: wp.array2d[wp.float32]
 
 
 @wp.func
@@ -151,7 +151,7 @@ def _add(sums: _Sums, world: int, column: int, force: wp.vec3, strength: float):
 
 
 @wp.kernel
-def _gather(solved: _Solved, columns: wp.array(dtype=wp.int32), others: wp.array(dtype=wp.int32), sums: _Sums):
+def _gather(solved: _Solved, columns: wp.array[wp.int32], others: wp.array[wp.int32], sums: _Sums):
     """Sum one contact up for the geoms that have a column, if the other geom is one of ``others``."""
     contact = wp.tid()
     if contact >= solved.count[0] or solved.addresses[contact, 0] < 0:
@@ -180,7 +180,7 @@ def _gather(solved: _Solved, columns: wp.array(dtype=wp.int32), others: wp.array
 
 
 @wp.kernel
-def _measure(sums: _Sums, contacts: ContactArrays, norms: wp.array3d(dtype=wp.float32)):
+def _measure(sums: _Sums, contacts: ContactArrays, norms: wp.array3d[wp.float32]):
     """Reduces the contacts of one physics step to one column; ``norms`` is the past of the net force."""
     world, column = wp.tid()
     found = sums.found[world, column]
@@ -218,7 +218,7 @@ def _measure(sums: _Sums, contacts: ContactArrays, norms: wp.array3d(dtype=wp.fl
 
 
 @wp.kernel
-def _forget(ages: wp.array(dtype=wp.int32), contacts: ContactArrays, norms: wp.array3d(dtype=wp.float32)):
+def _forget(ages: wp.array[wp.int32], contacts: ContactArrays, norms: wp.array3d[wp.float32]):
     """Clear a column of a world that was placed afresh."""
     world, column = wp.tid()
     if ages[world] != 0:

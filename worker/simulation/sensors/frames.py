@@ -28,17 +28,17 @@ class FrameArrays:
         angular: Angular velocities [rad/s], shape ``(worlds, columns)``.
     """
 
-    positions: wp.array2d(dtype=wp.vec3)
-    rotations: wp.array2d(dtype=wp.quat)
-    linear: wp.array2d(dtype=wp.vec3)
-    angular: wp.array2d(dtype=wp.vec3)
+    positions: wp.array2d[wp.vec3]
+    rotations: wp.array2d[wp.quat]
+    linear: wp.array2d[wp.vec3]
+    angular: wp.array2d[wp.vec3]
 
 
 @wp.kernel
 def _measure(
     bodies: BodyArrays,
-    columns: wp.array(dtype=wp.int32),
-    locals: wp.array(dtype=wp.transform),
+    columns: wp.array[wp.int32],
+    locals: wp.array[wp.transform],
     reference: int,
     reference_local: wp.transform,
     frames: FrameArrays,

@@ -37,15 +37,15 @@ class HeightScanArrays:
         points: Of the ground, in the world's frame [m], shape ``(worlds, points)``.
     """
 
-    heights: wp.array2d(dtype=wp.float32)
-    points: wp.array2d(dtype=wp.vec3)
+    heights: wp.array2d[wp.float32]
+    points: wp.array2d[wp.vec3]
 
 
 @wp.struct
 class _Scan:
-    bodies: wp.array(dtype=wp.int32)
-    locals: wp.array(dtype=wp.transform)
-    pattern: wp.array(dtype=wp.vec2)
+    bodies: wp.array[wp.int32]
+    locals: wp.array[wp.transform]
+    pattern: wp.array[wp.vec2]
     alignment: int
     farthest: float
 

@@ -23,7 +23,7 @@ class IkArrays:
             targets are computed from it after all actions are written; then it is reset to 0.
     """
 
-    wanted: wp.array2d(dtype=wp.float32)
+    wanted: wp.array2d[wp.float32]
 
 
 @wp.struct
@@ -59,25 +59,25 @@ class Chain:
     in_world: bool
     absolute: bool
     turn: int
-    rows: wp.array(dtype=wp.int32)
-    columns: wp.array(dtype=wp.int32)
-    weights: wp.array(dtype=wp.float32)
-    children: wp.array(dtype=wp.int32)
-    slides: wp.array(dtype=wp.int32)
-    anchors: wp.array(dtype=wp.vec3)
-    axes: wp.array(dtype=wp.vec3)
-    joints: wp.array(dtype=wp.int32)
-    ranges: wp.array(dtype=wp.vec2)
+    rows: wp.array[wp.int32]
+    columns: wp.array[wp.int32]
+    weights: wp.array[wp.float32]
+    children: wp.array[wp.int32]
+    slides: wp.array[wp.int32]
+    anchors: wp.array[wp.vec3]
+    axes: wp.array[wp.vec3]
+    joints: wp.array[wp.int32]
+    ranges: wp.array[wp.vec2]
     damping: float
     posture: float
     limits: float
     max_step: float
-    errors: wp.array2d(dtype=wp.float32)
-    jacobian: wp.array3d(dtype=wp.float32)
-    matrix: wp.array3d(dtype=wp.float32)
-    steps: wp.array2d(dtype=wp.float32)
+    errors: wp.array2d[wp.float32]
+    jacobian: wp.array3d[wp.float32]
+    matrix: wp.array3d[wp.float32]
+    steps: wp.array2d[wp.float32]
     goes_on: bool
-    targets: wp.array2d(dtype=wp.float32)
+    targets: wp.array2d[wp.float32]
 
 
 @wp.func

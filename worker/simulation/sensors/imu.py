@@ -30,10 +30,10 @@ class ImuArrays:
         rotations: From its frame to the world's [quaternion xyzw], shape ``(worlds,)``.
     """
 
-    gyro: wp.array(dtype=wp.vec3)
-    accelerometer: wp.array(dtype=wp.vec3)
-    velocimeter: wp.array(dtype=wp.vec3)
-    rotations: wp.array(dtype=wp.quat)
+    gyro: wp.array[wp.vec3]
+    accelerometer: wp.array[wp.vec3]
+    velocimeter: wp.array[wp.vec3]
+    rotations: wp.array[wp.quat]
 
 
 @wp.func
@@ -47,20 +47,20 @@ class _Dynamics:
     """The solver's kinematic tree and the motion of one physics step, named as in ``mujoco_warp.Model`` and ``Data``."""
 
     timestep: float
-    gravity: wp.array(dtype=wp.vec3)
-    body_parentid: wp.array(dtype=wp.int32)
-    body_rootid: wp.array(dtype=wp.int32)
-    body_jntnum: wp.array(dtype=wp.int32)
-    body_dofnum: wp.array(dtype=wp.int32)
-    body_dofadr: wp.array(dtype=wp.int32)
-    xpos: wp.array2d(dtype=wp.vec3)
-    xmat: wp.array2d(dtype=wp.mat33)
-    subtree_com: wp.array2d(dtype=wp.vec3)
-    cvel: wp.array2d(dtype=wp.spatial_vector)
-    cdof: wp.array2d(dtype=wp.spatial_vector)
-    cdof_dot: wp.array2d(dtype=wp.spatial_vector)
-    qvel: wp.array2d(dtype=wp.float32)
-    qacc: wp.array2d(dtype=wp.float32)
+    gravity: wp.array[wp.vec3]
+    body_parentid: wp.array[wp.int32]
+    body_rootid: wp.array[wp.int32]
+    body_jntnum: wp.array[wp.int32]
+    body_dofnum: wp.array[wp.int32]
+    body_dofadr: wp.array[wp.int32]
+    xpos: wp.array2d[wp.vec3]
+    xmat: wp.array2d[wp.mat33]
+    subtree_com: wp.array2d[wp.vec3]
+    cvel: wp.array2d[wp.spatial_vectorf]
+    cdof: wp.array2d[wp.spatial_vectorf]
+    cdof_dot: wp.array2d[wp.spatial_vectorf]
+    qvel: wp.array2d[wp.float32]
+    qacc: wp.array2d[wp.float32]
 
 
 @wp.func
@@ -69,7 +69,7 @@ def _gravity(dynamics: _Dynamics, world: int) -> wp.vec3:
 
 
 @wp.func
-def _motion_cross(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.spatial_vector:
+def _motion_cross(velocity: wp.spatial_vectorf, motion: wp.spatial_vectorf) -> wp.spatial_vectorf:
     """Rate of change of ``motion`` in a frame that moves with ``velocity`` (Featherstone's cross product; angular part first)."""
     turn = wp.spatial_top(velocity)
     return wp.spatial_vector(
@@ -79,7 +79,7 @@ def _motion_cross(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.
 
 
 @wp.func
-def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vector:
+def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vectorf:
     """Acceleration of a body beyond its parent's from the joints' rates alone: sum of d/dt(axis) times rate over its joints.
 
     The rates are those before the step, which has overwritten them since: they are taken from the bodies' velocities. Several joints
@@ -104,7 +104,7 @@ def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vector:
 
 
 @wp.kernel
-def _accelerate(dynamics: _Dynamics, chain: wp.array(dtype=wp.int32), local: wp.transform, imu: ImuArrays):
+def _accelerate(dynamics: _Dynamics, chain: wp.array[wp.int32], local: wp.transform, imu: ImuArrays):
     """The accelerometer's reading for the last physics step: as ``mj_rnePostConstraint`` and ``mj_objectAcceleration`` of MuJoCo.
 
     Everything is in the state before that step, about the centre of mass of the whole tree.
@@ -129,7 +129,7 @@ def _accelerate(dynamics: _Dynamics, chain: wp.array(dtype=wp.int32), local: wp.
 
 
 @wp.kernel
-def _rest(ages: wp.array(dtype=wp.int32), dynamics: _Dynamics, imu: ImuArrays):
+def _rest(ages: wp.array[wp.int32], dynamics: _Dynamics, imu: ImuArrays):
     """The accelerometer's reading for a world that was placed afresh."""
     world = wp.tid()
     if ages[world] == 0:

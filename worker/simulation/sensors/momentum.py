@@ -29,18 +29,18 @@ class MomentumArrays:
         masses: Common mass [kg], shape ``(worlds,)``.
     """
 
-    angular: wp.array(dtype=wp.vec3)
-    velocities: wp.array(dtype=wp.vec3)
-    centers: wp.array(dtype=wp.vec3)
-    masses: wp.array(dtype=wp.float32)
+    angular: wp.array[wp.vec3]
+    velocities: wp.array[wp.vec3]
+    centers: wp.array[wp.vec3]
+    masses: wp.array[wp.float32]
 
 
 @wp.kernel
 def _measure(
-    columns: wp.array(dtype=wp.int32),
+    columns: wp.array[wp.int32],
     bodies: BodyArrays,
-    body_masses: wp.array2d(dtype=wp.float32),
-    body_inertias: wp.array2d(dtype=wp.mat33),
+    body_masses: wp.array2d[wp.float32],
+    body_inertias: wp.array2d[wp.mat33],
     momentum: MomentumArrays,
 ):
     """Sum one world's bodies: sum of R I R^T w + m (r - c) x v, which needs no v - v_c since sum of m (r - c) is 0."""

@@ -35,12 +35,12 @@ class RayArrays:
         directions: Unit vectors of the rays, in their frame, shape ``(rays,)``.
     """
 
-    distances: wp.array2d(dtype=wp.float32)
-    directions: wp.array(dtype=wp.vec3)
+    distances: wp.array2d[wp.float32]
+    directions: wp.array[wp.vec3]
 
 
 @wp.kernel
-def _follow(bodies: BodyArrays, body: int, mount: wp.transform, alignment: int, poses: wp.array(dtype=wp.transform)):
+def _follow(bodies: BodyArrays, body: int, mount: wp.transform, alignment: int, poses: wp.array[wp.transform]):
     """The frame of one world's rays."""
     world = wp.tid()
     pose = place_pose(bodies, world, body, mount)
@@ -53,7 +53,7 @@ def _follow(bodies: BodyArrays, body: int, mount: wp.transform, alignment: int, 
 
 
 @wp.kernel
-def _measure(farthest: float, pixels: wp.array3d(dtype=wp.float32), arrays: RayArrays):
+def _measure(farthest: float, pixels: wp.array3d[wp.float32], arrays: RayArrays):
     """One ray of one world; Newton says 0 where nothing is hit."""
     world, ray = wp.tid()
     distance = pixels[world, 0, ray]

@@ -27,9 +27,9 @@ class SelectionArrays:
         dofs: First column of each object's root in ``WorldArrays.joint_qd`` (linear, angular), shape ``(objects,)``.
     """
 
-    chosen: wp.array2d(dtype=wp.float32)
-    coordinates: wp.array(dtype=wp.int32)
-    dofs: wp.array(dtype=wp.int32)
+    chosen: wp.array2d[wp.float32]
+    coordinates: wp.array[wp.int32]
+    dofs: wp.array[wp.int32]
 
 
 @wp.func

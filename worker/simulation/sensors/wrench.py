@@ -33,9 +33,9 @@ class WrenchArrays:
         left: Remaining duration [s], 0 without a wrench, :data:`LASTING` or :data:`LASTING_FROM_NOW`; shape ``(worlds,)``.
     """
 
-    wrenches: wp.array2d(dtype=wp.spatial_vector)
-    bodies: wp.array(dtype=wp.int32)
-    left: wp.array(dtype=wp.float32)
+    wrenches: wp.array2d[wp.spatial_vectorf]
+    bodies: wp.array[wp.int32]
+    left: wp.array[wp.float32]
 
 
 @wp.func

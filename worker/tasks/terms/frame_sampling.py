@@ -30,11 +30,11 @@ class SamplingArrays:
         evenness: Entropy of these probabilities over that of equal ones, shape ``(1,)``.
     """
 
-    frames: wp.array(dtype=wp.float32)
-    failed: wp.array(dtype=wp.int32)
-    failures: wp.array2d(dtype=wp.float32)
-    likely: wp.array(dtype=wp.float32)
-    evenness: wp.array(dtype=wp.float32)
+    frames: wp.array[wp.float32]
+    failed: wp.array[wp.int32]
+    failures: wp.array2d[wp.float32]
+    likely: wp.array[wp.float32]
+    evenness: wp.array[wp.float32]
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def drawn_frame(
 
 
 @wp.kernel
-def _count(rate: float, sampling: SamplingArrays, sums: wp.array(dtype=wp.int64)):
+def _count(rate: float, sampling: SamplingArrays, sums: wp.array[wp.int64]):
     """One part of one world: a step is over."""
     world, part = wp.tid()
     new = wp.where(sampling.failed[world] == part, rate, 0.0)
@@ -118,7 +118,7 @@ def _count(rate: float, sampling: SamplingArrays, sums: wp.array(dtype=wp.int64)
 
 
 @wp.kernel
-def _share(even: float, reach: int, decay: float, sampling: SamplingArrays, sums: wp.array(dtype=wp.int64)):
+def _share(even: float, reach: int, decay: float, sampling: SamplingArrays, sums: wp.array[wp.int64]):
     """Probabilities of all parts; one thread."""
     parts = sampling.likely.shape[0]
     total = float(0.0)

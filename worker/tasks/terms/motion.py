@@ -51,16 +51,16 @@ class MotionArrays:
         sampling: Sampling of the start frames of episodes.
     """
 
-    joint_positions: wp.array2d(dtype=wp.float32)
-    joint_velocities: wp.array2d(dtype=wp.float32)
-    positions: wp.array2d(dtype=wp.vec3)
-    rotations: wp.array2d(dtype=wp.quat)
-    linear: wp.array2d(dtype=wp.vec3)
-    angular: wp.array2d(dtype=wp.vec3)
-    roots: wp.array(dtype=wp.transform)
-    root_linear: wp.array(dtype=wp.vec3)
-    root_angular: wp.array(dtype=wp.vec3)
-    bodies: wp.array(dtype=wp.int32)
+    joint_positions: wp.array2d[wp.float32]
+    joint_velocities: wp.array2d[wp.float32]
+    positions: wp.array2d[wp.vec3]
+    rotations: wp.array2d[wp.quat]
+    linear: wp.array2d[wp.vec3]
+    angular: wp.array2d[wp.vec3]
+    roots: wp.array[wp.transform]
+    root_linear: wp.array[wp.vec3]
+    root_angular: wp.array[wp.vec3]
+    bodies: wp.array[wp.int32]
     anchor: int
     rate: float
     sampling: SamplingArrays

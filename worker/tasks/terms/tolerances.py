@@ -40,18 +40,18 @@ class ToleranceArrays:
         running: For commands to run.
     """
 
-    columns: wp.array(dtype=wp.int32)
-    standing: wp.array(dtype=wp.float32)
-    walking: wp.array(dtype=wp.float32)
-    running: wp.array(dtype=wp.float32)
+    columns: wp.array[wp.int32]
+    standing: wp.array[wp.float32]
+    walking: wp.array[wp.float32]
+    running: wp.array[wp.float32]
 
 
 @wp.func
 def posture_within(
     worlds: WorldArrays,
     robot: RobotArrays,
-    columns: wp.array(dtype=wp.int32),
-    deviations: wp.array(dtype=wp.float32),
+    columns: wp.array[wp.int32],
+    deviations: wp.array[wp.float32],
     world: int,
 ) -> float:
     """exp(-mean of e^2 / s^2) over joints, e the distance of each from its default and s its tolerance."""

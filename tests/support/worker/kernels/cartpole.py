@@ -46,7 +46,7 @@ def act(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeAr
 
 
 @wp.func
-def write_observation(observations: wp.array2d(dtype=wp.float32), worlds: WorldArrays, world: int):
+def write_observation(observations: wp.array2d[wp.float32], worlds: WorldArrays, world: int):
     """Cart position [m], pole angle [rad], their velocities [m/s, rad/s]."""
     observations[world, 0] = worlds.joint_q[world, 0]
     observations[world, 1] = worlds.joint_q[world, 1]

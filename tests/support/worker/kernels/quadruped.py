@@ -63,7 +63,7 @@ class QuadrupedParameters:
     command_stand: float
     command_seconds: float
     velocity_scale: float
-    ranges: wp.array(dtype=wp.vec2)
+    ranges: wp.array[wp.vec2]
     """Lower and upper end of each joint's range [rad], shape ``(joints,)``."""
     trunk: wp.vec3
     """Half the trunk's length, width and height [m]."""
@@ -105,7 +105,7 @@ def act(parameters: QuadrupedParameters, worlds: WorldArrays, episodes: EpisodeA
 
 @wp.func
 def write_observation(
-    observations: wp.array2d(dtype=wp.float32),
+    observations: wp.array2d[wp.float32],
     parameters: QuadrupedParameters,
     worlds: WorldArrays,
     episodes: EpisodeArrays,

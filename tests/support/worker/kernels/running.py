@@ -40,13 +40,13 @@ class RunnerParameters:
     start_velocity_noise: float
     velocity_scale: float
     angular_velocity_scale: float
-    ranges: wp.array(dtype=wp.vec2)
+    ranges: wp.array[wp.vec2]
     """Lower and upper end of each joint's range [rad], shape ``(joints,)``."""
-    strengths: wp.array(dtype=wp.float32)
+    strengths: wp.array[wp.float32]
     """Full torque of each joint's motor over that of the strongest, shape ``(joints,)``."""
-    actuators: wp.array(dtype=wp.int32)
+    actuators: wp.array[wp.int32]
     """Index of each joint's motor, shape ``(joints,)``."""
-    pose: wp.array(dtype=wp.float32)
+    pose: wp.array[wp.float32]
     """Angle of each joint at the start, before noise [rad], shape ``(joints,)``."""
 
 
@@ -67,7 +67,7 @@ def act(parameters: RunnerParameters, worlds: WorldArrays, episodes: EpisodeArra
 
 @wp.func
 def write_observation(
-    observations: wp.array2d(dtype=wp.float32),
+    observations: wp.array2d[wp.float32],
     parameters: RunnerParameters,
     worlds: WorldArrays,
     episodes: EpisodeArrays,

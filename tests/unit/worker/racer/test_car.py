@@ -30,11 +30,11 @@ class Found:
 @wp.kernel
 def _find(
     roads: road.RoadArrays,
-    tracks: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec2),
-    backwards: wp.array(dtype=wp.bool),
-    begins: wp.array(dtype=wp.int32),
-    found: wp.array(dtype=Found),
+    tracks: wp.array[wp.int32],
+    points: wp.array[wp.vec2],
+    backwards: wp.array[wp.bool],
+    begins: wp.array[wp.int32],
+    found: wp.array[Found],
 ):
     point = wp.tid()
     track = tracks[point]
@@ -50,12 +50,12 @@ def _find(
 @wp.kernel
 def _place(
     roads: road.RoadArrays,
-    tracks: wp.array(dtype=wp.int32),
-    along: wp.array(dtype=wp.float32),
-    other: wp.array(dtype=wp.float32),
-    backwards: wp.array(dtype=wp.bool),
-    places: wp.array(dtype=wp.vec3),
-    moved: wp.array(dtype=wp.float32),
+    tracks: wp.array[wp.int32],
+    along: wp.array[wp.float32],
+    other: wp.array[wp.float32],
+    backwards: wp.array[wp.bool],
+    places: wp.array[wp.vec3],
+    moved: wp.array[wp.float32],
 ):
     point = wp.tid()
     places[point] = road.place_at(roads, tracks[point], along[point], backwards[point])
@@ -63,7 +63,7 @@ def _place(
 
 
 @wp.kernel
-def _drive(starts: wp.array(dtype=Motion), asked: wp.array(dtype=wp.vec2), lags: wp.vec2, ends: wp.array(dtype=Motion)):
+def _drive(starts: wp.array[Motion], asked: wp.array[wp.vec2], lags: wp.vec2, ends: wp.array[Motion]):
     car = wp.tid()
     motion = starts[car]
     for _ in range(15):
@@ -72,7 +72,7 @@ def _drive(starts: wp.array(dtype=Motion), asked: wp.array(dtype=wp.vec2), lags:
 
 
 @wp.kernel
-def _overlap(first: wp.array(dtype=wp.vec3), second: wp.array(dtype=wp.vec3), found: wp.array(dtype=wp.bool)):
+def _overlap(first: wp.array[wp.vec3], second: wp.array[wp.vec3], found: wp.array[wp.bool]):
     pair = wp.tid()
     found[pair] = overlap(first[pair], wp.vec2(0.14, 0.1), second[pair], wp.vec2(0.2, 0.12))
 
