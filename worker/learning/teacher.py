@@ -37,7 +37,7 @@ def _learnt(job: Job, gang: Gang, reference: str) -> dict[str, Any]:
     """The algorithm's state in the checkpoint ``RUN`` or ``RUN@ITERATION``."""
     name, _, iteration = reference.partition("@")
     copy = job.run.teacher(name)  # chosen when the job was submitted, unless the teacher's run did not exist yet
-    held = gang.tell(copy.checkpoints.is_dir())
+    held = gang.tell("held" if copy.checkpoints.is_dir() else None)
     checkpoint = choose_checkpoint(gang, copy if held else job.store.run(name), iteration or None)
     if "algorithm" not in checkpoint.manifest:
         raise UserError(

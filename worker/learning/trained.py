@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, newest_checkpoint
+from shared_store.checkpoints import (
+    Checkpoint,
+    DamagedCheckpoint,
+    best_checkpoint,
+    checkpoint_called,
+    list_checkpoints,
+    newest_checkpoint,
+)
 from shared_store.layout import Run
 from worker.errors import UserError
 
@@ -26,8 +33,10 @@ def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpo
             problem = str(error)
     if problem := gang.tell(problem) or "":
         raise UserError(problem)
-    name = gang.tell(name)
-    return next(checkpoint for checkpoint in list_checkpoints(run) if checkpoint.name == name)
+    # the other ranks list nothing: on a network volume they may not see the newest checkpoint in the directory yet
+    chosen = checkpoint_called(run.checkpoints, gang.tell(name) or "")
+    assert chosen is not None
+    return chosen
 
 
 def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
