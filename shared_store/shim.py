@@ -53,6 +53,7 @@ def main(parent: str, group: str, files: str, *command: str) -> None:
 
     libc = ctypes.CDLL(None)
     libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where it is ignored, the kernel keeps no exit code
     watched = {signal.SIGCHLD, _ORPHANED, *_PASSED_ON}
     signal.pthread_sigmask(signal.SIG_BLOCK, watched)
     if int(parent):

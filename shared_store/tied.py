@@ -60,10 +60,9 @@ def follow(parent: int) -> None:
 def main(parent: str, ignored: str, *command: str) -> None:
     """Become ``command``; if that fails, exit with 127 and one line on standard error."""
     follow(int(parent))
-    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE, signal.SIGXFSZ):  # Python and others change these
-        signal.signal(number, signal.SIG_DFL)
-    for each in filter(None, ignored.split(",")):
-        signal.signal(int(each), signal.SIG_IGN)
+    # Python ignores some, and a parent may: nohup SIGHUP, a shell SIGINT of what it runs in the background
+    for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
+        signal.signal(number, signal.SIG_IGN if str(int(number)) in ignored.split(",") else signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [])
     try:
         os.execvp(command[0], command)

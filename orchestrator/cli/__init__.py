@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 failure, 2 wrong use.
 
 from __future__ import annotations
 
+import signal
 import sys
 
 import typer
@@ -46,6 +47,7 @@ def _options(
 
 def main() -> None:
     """Entry point of the command."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where it is ignored, the exit codes of processes are lost
     log_visibly()
     try:
         sys.exit(app(standalone_mode=False) or 0)

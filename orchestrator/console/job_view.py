@@ -6,6 +6,7 @@ on another machine does not reach it; its page says so and names the command.
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import threading
@@ -65,7 +66,11 @@ class _View:
         """Run the viewer until it ends; it dies with this thread, however the server ends."""
         said: deque[str] = deque(maxlen=5)
         self.process = process = start_tied(
-            self.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+            self.command,
+            [signal.SIGHUP],  # the server's terminal is closed, and `nohup` keeps the server
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
         )
         if not self.is_wanted:
             process.terminate()

@@ -89,7 +89,7 @@ class Page:
         ]
         self._log = (self._home / "log").open("w+")
         self._process = subprocess.Popen(
-            tied([*command, str(file)] if file else command, [signal.SIGINT]),
+            tied([*command, str(file)] if file else command, [signal.SIGINT, signal.SIGHUP]),
             env=_quiet(self._home),
             stdin=subprocess.DEVNULL,
             stdout=self._log,

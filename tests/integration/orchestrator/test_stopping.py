@@ -1,4 +1,5 @@
-"""Stopping through the controller: what the nodes' records say of a gang that had to be killed, and what is never the cause."""
+"""Stopping through the controller: what the nodes' records say of a gang that had to be killed, what is never the cause, and that a
+job can be asked to stop whatever the controller ignores."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import pytest
 
 from orchestrator.client import Client
 from orchestrator.server import Server
-from tests.conftest import submit_gang, wait_for
+from tests.conftest import Serving, submit_gang, wait_for
 from tests.support.processes import processes_of
 
 STUBBORN = (
@@ -54,5 +55,34 @@ def test_how_a_gang_ended_is_recorded_for_each_node(tmp_path: Path, monkeypatch:
             assert client.get(f"/api/jobs/{asleep}")["status"] == "RUNNING"
             os.kill(int(found[0].split()[1]), signal.SIGKILL)
             assert over(asleep)["statusReason"].startswith("main node: rank 0 was killed by SIGKILL")
+    finally:
+        server.close()
+
+
+IGNORED = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGCHLD, signal.SIGALRM)
+SHOWS_IGNORED = """
+import os, re
+for pid in os.getpid(), os.getppid():
+    print(int(re.search("SigIgn:\\s+(\\w+)", open(f"/proc/{pid}/status").read())[1], 16), flush=True)
+raise SystemExit(7)
+"""
+"""Of the rank and of its supervisor, as bits."""
+
+
+def test_a_job_has_the_default_signals_whatever_its_server_was_started_to_ignore(tmp_path: Path) -> None:
+    """``nohup`` ignores SIGHUP, and a shell SIGINT and SIGQUIT for what it runs in the background; children inherit that."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in IGNORED}
+    try:
+        server = Serving(tmp_path / "home", "--cpus", "2")
+    finally:
+        for number, action in before.items():
+            signal.signal(number, action)
+    try:
+        server.process.send_signal(signal.SIGHUP)
+        job = server.gang(SHOWS_IGNORED)
+        assert server.wait(job)["attempts"][0]["nodes"][0]["exitCode"] == 7
+        by_python = 1 << signal.SIGPIPE - 1 | 1 << signal.SIGXFSZ - 1
+        assert [text for text in server.log(job) if text.isdecimal()] == [str(by_python)] * 2
+        assert server.process.poll() is None
     finally:
         server.close()

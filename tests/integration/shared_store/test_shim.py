@@ -137,6 +137,14 @@ def test_requests_reach_the_supervisor_also_where_a_job_stopped_it(number: int, 
     assert shim.wait(20 * PATIENCE) == 75
 
 
+def test_what_the_shim_was_started_to_ignore_is_not_ignored_below_it() -> None:
+    script = "grep SigIgn /proc/$$/status >&2; exit 3"
+    shell = ["sh", "-c", 'trap "" HUP INT QUIT PIPE CHLD USR1 ALRM; exec "$@"', "sh"]
+    shim = subprocess.run([*shell, *shimmed(["sh", "-c", script])], stderr=subprocess.PIPE, text=True)
+    assert shim.returncode == 3, "known although SIGCHLD was ignored"
+    assert int(shim.stderr.split()[1], 16) == 0
+
+
 def test_a_shim_stopped_by_a_job_still_ends(group: str, pids: Path) -> None:
     shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", group)
     wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
