@@ -26,22 +26,22 @@ from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
-from tests.conftest import Serving, run_muster
+from tests.conftest import Serving, call_muster, run_muster
 from tests.support.conformance.keys import client, refused
 
 
 def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -> None:
-    created = json.loads(run_muster("keys", "create", "a", "--read-only", "--json", home=tmp_path).stdout)
+    created = json.loads(call_muster("keys", "create", "a", "--read-only", "--json", home=tmp_path).stdout)
     assert len(created["accessKeyId"]) == 20 and len(created["secretAccessKey"]) == 40
     path = tmp_path / "keys.json"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    listed = run_muster("keys", "list", "--json", home=tmp_path).stdout
+    listed = call_muster("keys", "list", "--json", home=tmp_path).stdout
     assert json.loads(listed)[0] == {key: value for key, value in created.items() if key != "secretAccessKey"}
-    for text in (listed, run_muster("keys", "list", home=tmp_path).stdout, repr(KeyStore(tmp_path).load())):
+    for text in (listed, call_muster("keys", "list", home=tmp_path).stdout, repr(KeyStore(tmp_path).load())):
         assert created["accessKeyId"] in text and created["secretAccessKey"] not in text
     path.chmod(0o640)
     for command in (["serve", "--port", "0"], ["keys", "list"], ["keys", "create", "b"]):
-        done = run_muster(*command, home=tmp_path)
+        done = call_muster(*command, home=tmp_path)
         assert done.returncode == 1 and done.stderr.count("\n") == 1 and "chmod 600" in done.stderr, done.stderr
 
 
@@ -57,7 +57,7 @@ def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -
 )
 def test_wrong_uses_of_the_command_end_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
     KeyStore(tmp_path).create("a")
-    done = run_muster("keys", *arguments, home=tmp_path)
+    done = call_muster("keys", *arguments, home=tmp_path)
     assert done.returncode == 2 and done.stderr.startswith("muster: ") and done.stderr.count("\n") == 1, done.stderr
     assert [each.name for each in KeyStore(tmp_path).load().values()] == ["a"]
 
@@ -75,7 +75,7 @@ def test_wrong_uses_of_the_command_end_with_one_line(tmp_path: Path, arguments: 
 def test_a_damaged_keys_file_is_one_line_at_the_start(tmp_path: Path, text: bytes, part: str) -> None:
     (tmp_path / "keys.json").write_bytes(text)
     (tmp_path / "keys.json").chmod(0o600)
-    done = run_muster("serve", "--port", "0", home=tmp_path)
+    done = call_muster("serve", "--port", "0", home=tmp_path)
     assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
     assert f"{tmp_path}/keys.json: " in done.stderr and part in done.stderr, done.stderr
 
@@ -109,7 +109,7 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
         key = store.create("a")
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
-        done = run_muster("keys", "delete", "a", home=tmp_path)
+        done = call_muster("keys", "delete", "a", home=tmp_path)
         assert "deleted key a\nthis was the last key" in done.stdout, done.stdout
         assert "its own user's requests on loopback" in done.stdout and "does not start without a key" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
@@ -118,7 +118,7 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
 
 
 def test_off_loopback_a_key_is_demanded_and_other_web_pages_are_refused(tmp_path: Path) -> None:
-    done = run_muster("serve", "--host", "0.0.0.0", "--port", "0", home=tmp_path)
+    done = call_muster("serve", "--host", "0.0.0.0", "--port", "0", home=tmp_path)
     assert done.returncode == 1 and "muster keys create" in done.stderr and done.stderr.count("\n") == 1, done.stderr
     key = KeyStore(tmp_path).create("a")
     server = Serving(tmp_path, "--host", "0.0.0.0", "--cpus", "1")

@@ -20,7 +20,7 @@ from botocore.httpsession import URLLib3Session
 
 from orchestrator.client import Client
 from orchestrator.keys import Key, KeyStore
-from tests.conftest import Serving, run_muster, wait_for
+from tests.conftest import Serving, call_muster, wait_for
 from tests.support.conformance.keys import client, refused
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job/6c4a7d0e-0000-4000-8000-000000000000"
@@ -199,8 +199,8 @@ def test_the_bearer_form_of_a_key_and_the_command_work(served: Serving, key: Key
     assert served.client.batch("DescribeJobs", jobs=["x"]) == {"jobs": []}
     assert served.client.get("/api/capacity")["hosts"]
     right = f"{key.access_key_id}:{key.secret}"
-    assert run_muster("list", home=home, MUSTER_TOKEN=right).returncode == 0
-    without = run_muster("list", home=home)
+    assert call_muster("list", home=home, MUSTER_TOKEN=right).returncode == 0
+    without = call_muster("list", home=home)
     assert without.returncode == 1 and without.stderr.startswith("muster: a token is needed"), without.stderr
     for wrong in (f"{right}x", right[:-1], key.secret, f"{key.access_key_id}:", ":", key.access_key_id):
         answer = httpx.get(f"{served.url}/api/runs", headers={"Authorization": f"Bearer {wrong}"})
@@ -229,14 +229,14 @@ def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
 
 
 def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None:
-    done = run_muster("keys", "create", "passing", "--queue", "robots", "--queue", "default", home=home)
+    done = call_muster("keys", "create", "passing", "--queue", "robots", "--queue", "default", home=home)
     assert done.returncode == 0, done.stderr
     passing = next(each for each in KeyStore(home).load().values() if each.name == "passing")
     assert passing.queues == ("robots", "default")
     assert f"export MUSTER_TOKEN={passing.access_key_id}:{passing.secret}" in done.stdout
     batch = client(served.url, passing.access_key_id, passing.secret)
     batch.list_jobs(jobQueue="default")
-    assert run_muster("keys", "delete", "passing", home=home).returncode == 0
+    assert call_muster("keys", "delete", "passing", home=home).returncode == 0
     with pytest.raises(ClientError) as caught:
         batch.list_jobs(jobQueue="default")
     assert code(caught)[0] == "UnrecognizedClientException"

@@ -65,9 +65,8 @@ def test_jobs_are_found_by_state_queue_and_part_of_a_name(console: Console, many
     ]
     assert names(visitor.page(f"/?search={many[7][:8]}")) == ["job-7"]
     assert names(visitor.page("/?queue=lab")) == ["job-60"]
-    assert (
-        names(visitor.page("/?state=succeeded")) == [] and "No job is like this" in visitor.page("/?state=failed").text
-    )
+    assert names(visitor.page("/?state=succeeded")) == []
+    assert "No job is like this" in visitor.page("/?state=failed").text
     assert len(names(visitor.page("/?state=waiting&search=job-1"))) == 31
     assert "it is one of waiting" in visitor.page("/?state=x", 400).text
 
@@ -96,10 +95,8 @@ def test_a_read_only_key_sees_no_buttons_and_changes_nothing(console: Console, m
     visitor = console.visitor("reader")
     page = visitor.page("/")
     assert "job-119" in page.text and "(read-only)" in page.text
-    assert (
-        page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
-        and page.all("input", name="job") == []
-    )
+    assert page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
+    assert page.all("input", name="job") == []
     answer = visitor.submit("/jobs/stop", job=many[0], confirmed="yes")
     assert answer.status_code == 403 and "is read-only" in answer.json()["message"]
 

@@ -6,14 +6,14 @@ import xml.etree.ElementTree as xml
 
 import pytest
 
-from tests.conftest import run_muster
+from tests.conftest import call_muster
 from tests.support.console.fixtures import Console
 
 
 def test_tracks_are_shown_with_their_outlines_and_measures(console: Console) -> None:
     visitor = console.visitor("reader")
     order = ("tracks", "make", "hills", "--seed", "7", "--length", "45")
-    made = run_muster(*order, home=console.server.home, MUSTER_TOKEN=console.secrets["admin"])
+    made = call_muster(*order, home=console.server.home, MUSTER_TOKEN=console.secrets["admin"])
     assert made.returncode == 0, made.stderr
     page = visitor.page("/tracks")
     pictures = [str(each["src"]) for each in page.all("img")]
@@ -52,9 +52,8 @@ def test_an_unknown_track_is_told_with_the_nearest_name(console: Console, name: 
 
 def test_the_api_lists_tracks_and_draws_them(console: Console) -> None:
     listed = console.client.get("/api/tracks")
-    assert [each["name"] for each in listed][:3] == ["oval", "rounded-rectangle", "chicane"] and "rings" not in listed[
-        0
-    ]
+    assert [each["name"] for each in listed][:3] == ["oval", "rounded-rectangle", "chicane"]
+    assert "rings" not in listed[0]
     (drawn,) = console.client.get("/api/tracks", name="oval", rings="true")
     assert len(drawn["rings"]["inner"]) == len(drawn["rings"]["outer"]) == drawn["waypoints"]
 

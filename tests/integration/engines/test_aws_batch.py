@@ -23,7 +23,7 @@ from orchestrator.engines.aws_batch.config import is_mounted_from
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
-from tests.conftest import Serving, run_muster, wait_for
+from tests.conftest import Serving, call_muster, wait_for
 from tests.support.engines.aws_bench import AwsBench
 from tests.support.engines.sites import POLITE, WAIT
 from tests.support.processes import command, parent, processes_of
@@ -367,7 +367,7 @@ def test_an_unusable_endpoint_queue_or_key_is_reported_at_the_start(aws: Serving
         AwsBench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
     with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):
         AwsBench(aws, tmp_path / "queue", job_queue="robots")
-    assert run_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
+    assert call_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
     keyed = Serving(tmp_path / "keyed")
     try:
         with pytest.raises(EngineError, match=r"refuses: .*; see `aws configure`"):
@@ -377,7 +377,7 @@ def test_an_unusable_endpoint_queue_or_key_is_reported_at_the_start(aws: Serving
 
 
 def test_the_doctor_looks_at_the_configuration_that_the_controller_has(bench: AwsBench) -> None:
-    examined = run_muster("doctor", "--engine", "aws-batch", home=bench.home)
+    examined = call_muster("doctor", "--engine", "aws-batch", home=bench.home)
     assert examined.returncode == 0, examined.stdout
     assert re.search(r"ok  engine aws-batch queue aws-batch/default, at most \d+ CPUs for a gang\n", examined.stdout)
 

@@ -25,7 +25,7 @@ from orchestrator.domain.resources import Resources
 from orchestrator.engines.aws_batch.config import load_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from orchestrator.engines.aws_batch.stack import Event, first_failure
-from tests.conftest import REPOSITORY, run_muster
+from tests.conftest import REPOSITORY, call_muster
 from tests.support.engines.bench import make_gang
 from tests.support.engines.moto_aws import moto_server
 
@@ -90,7 +90,7 @@ def account(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Account]:
     """With the whole stack in it: workstation, endpoints and EFA too."""
     with moto_server() as url:
         account = Account(url, tmp_path_factory.mktemp("home"))
-        made = run_muster("aws", "up", "--yes", *PARAMETERS, *WHOLE, home=account.home, **account.env)
+        made = call_muster("aws", "up", "--yes", *PARAMETERS, *WHOLE, home=account.home, **account.env)
         assert made.returncode == 0, made.stdout + made.stderr
         yield account
 
@@ -169,9 +169,8 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
     ]
     resources = described["computeResources"]
     assert (described["type"], resources["type"], int(resources["maxvCpus"])) == ("MANAGED", "EC2", 256)
-    assert resources["subnets"] == [account.physical("PrivateSubnet1")] and resources["instanceTypes"] == [
-        "g6.12xlarge"
-    ]
+    assert resources["subnets"] == [account.physical("PrivateSubnet1")]
+    assert resources["instanceTypes"] == ["g6.12xlarge"]
     assert resources["securityGroupIds"] == [account.physical("GangSecurityGroup")]
     assert resources["instanceRole"].endswith(account.physical("InstanceProfile"))
     [definition] = batch.describe_job_definitions(jobDefinitionName="muster-check")["jobDefinitions"]

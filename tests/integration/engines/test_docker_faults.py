@@ -106,9 +106,8 @@ def test_a_docker_engine_that_goes_away_is_waited_for(
         wait_for(lambda: says(first, "RUNNING", away) and says(third, "STARTING", away), 20, "the reason")
         served.client.batch("TerminateJob", jobId=first, reason="enough")
         time.sleep(3)  # the stop is tried again every two seconds
-        assert says(first, "RUNNING", f"attempt 1 can't be stopped: {away}; trying again") and says(
-            second, "RUNNING", away
-        )
+        assert says(first, "RUNNING", f"attempt 1 can't be stopped: {away}; trying again")
+        assert says(second, "RUNNING", away)
         relay.open()
         assert served.wait(first)["statusReason"] == "enough"
         assert served.wait(third)["status"] == "SUCCEEDED" and served.log(third) == ["here"]

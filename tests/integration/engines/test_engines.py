@@ -11,21 +11,19 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.ray.cluster import ray_environment
 from orchestrator.engines.slurm import commands as slurm_commands
 from orchestrator.engines.toolkit.mounts import Mount, with_mounts
-from tests.conftest import run_muster
+from tests.conftest import call_muster
 from tests.support.engines.slurm_cluster import need_slurm
 
 
 def test_an_unknown_engine_is_refused_with_the_nearest_one(tmp_path: Path) -> None:
-    refused = run_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
-    assert (
-        refused.returncode == 2
-        and refused.stderr == "muster: --engine dokcer: there is no such engine; did you mean docker?\n"
-    )
+    refused = call_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr == "muster: --engine dokcer: there is no such engine; did you mean docker?\n"
     assert not (tmp_path / "muster.db").exists(), "nothing was made"
 
 
 def test_without_a_docker_engine_nothing_starts(tmp_path: Path) -> None:
-    refused = run_muster(
+    refused = call_muster(
         "serve", "--port", "0", "--engine", "docker", home=tmp_path, DOCKER_HOST="unix:///nowhere.sock"
     )
     assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
@@ -35,7 +33,7 @@ def test_without_a_docker_engine_nothing_starts(tmp_path: Path) -> None:
 
 
 def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Path) -> None:
-    refused = run_muster("serve", "--port", "0", "--engine", "slurm", home=tmp_path, PATH="/nowhere")
+    refused = call_muster("serve", "--port", "0", "--engine", "slurm", home=tmp_path, PATH="/nowhere")
     assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
     assert refused.stderr.startswith("muster: scontrol is not installed here: the slurm engine uses the cluster's own")
     need_slurm()
@@ -44,7 +42,7 @@ def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Pat
         "ClusterName=away\nSlurmctldHost=localhost\nSlurmctldPort=1\nAuthType=auth/none\nCredType=cred/none\n"
         "NodeName=n1\nPartitionName=p Nodes=n1\nMessageTimeout=2\n"
     )
-    refused = run_muster("serve", "--port", "0", "--engine", "slurm", home=tmp_path, SLURM_CONF=str(configuration))
+    refused = call_muster("serve", "--port", "0", "--engine", "slurm", home=tmp_path, SLURM_CONF=str(configuration))
     assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
     assert refused.stderr.startswith("muster: slurmctld does not answer (")
     assert refused.stderr.endswith("see `scontrol ping`\n")
@@ -55,10 +53,10 @@ def test_a_missing_configuration_of_slurm_is_reported_as_such(tmp_path: Path, mo
     if Path("/etc/slurm/slurm.conf").exists():
         pytest.skip("this machine belongs to a cluster")
     monkeypatch.delenv("SLURM_CONF", raising=False)
-    bad = run_muster("doctor", "--engine", "slurm", home=tmp_path)
+    bad = call_muster("doctor", "--engine", "slurm", home=tmp_path)
     assert bad.returncode == 1
     assert "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/" in bad.stdout
-    bad = run_muster("doctor", "--engine", "slurm", home=tmp_path, SLURM_CONF="/no/slurm.conf", timeout=20)
+    bad = call_muster("doctor", "--engine", "slurm", home=tmp_path, SLURM_CONF="/no/slurm.conf")
     assert "SLURM_CONF is /no/slurm.conf, which is not there; set it to the cluster's slurm.conf" in bad.stdout
 
 

@@ -99,7 +99,8 @@ def test_a_job_goes_to_the_engine_that_it_names_and_else_to_the_first(tmp_path: 
         assert "on the docker engine, queue docker" in shown[0] and docker in shown[2]
 
         lines(served, "submit", str(spec))
-        assert served.wait("where")["queue"] == "default" and served.log("where") == [
+        assert served.wait("where")["queue"] == "default"
+        assert served.log("where") == [
             f"on {socket.gethostname()}",
             "node 0 ended: done",
         ]

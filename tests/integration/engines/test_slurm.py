@@ -327,10 +327,8 @@ def test_a_first_node_that_lacks_this_python_or_the_store_is_reported_in_one_lin
         slurm_script, "render", lambda gang: render(gang).replace(slurm_script.output_path(gang), elsewhere)
     )
     [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
-    assert (
-        node.words.startswith("Slurm could not start it on n1: is ")
-        and "file system that all nodes share" in node.words
-    )
+    assert node.words.startswith("Slurm could not start it on n1: is ")
+    assert "file system that all nodes share" in node.words
 
 
 @pytest.mark.parametrize(

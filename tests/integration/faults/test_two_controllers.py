@@ -32,9 +32,8 @@ def test_controllers_of_a_store_see_each_other_until_one_is_gone(
     second.start()
     wait_for(lambda: len(caplog.messages) == 2, 10, "a warning of each")
     for home, message in (("a", caplog.messages[0]), ("b", caplog.messages[1])):
-        assert (
-            f"the controller of {tmp_path}/{home} on " in message and f"(pid {os.getpid()}) uses the store" in message
-        )
+        assert f"the controller of {tmp_path}/{home} on " in message
+        assert f"(pid {os.getpid()}) uses the store" in message
     assert first.writer(run) is None, "its own attempt"
     said = second.writer(run) or ""
     assert said.startswith(f"job 01234567 (attempt 2) of the controller of {tmp_path}/a on ")

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import _gpus
 from orchestrator.cli.terminal import print_cut
-from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, run_muster, wait_for
+from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 
 REQUIREMENTS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
 
@@ -131,7 +131,7 @@ def test_off_loopback_a_token_is_demanded_and_then_checked(tmp_path: Path) -> No
     try:
         refused(["list"], server.home, 1, "this token is not known here", MUSTER_TOKEN="wrong")
         refused(["list"], server.home, 1, "a token is needed")
-        assert run_muster("list", home=server.home, MUSTER_TOKEN="a-secret-of-this-test").returncode == 0
+        assert call_muster("list", home=server.home, MUSTER_TOKEN="a-secret-of-this-test").returncode == 0
     finally:
         server.close()
 
@@ -174,10 +174,8 @@ def test_an_engine_that_does_not_exist_is_not_recommended(shared_server: Serving
 def test_the_api_s_page_lists_its_operations_and_their_inputs(shared_server: Serving) -> None:
     answer = httpx.get(f"{shared_server.url}/api/docs", trust_env=False)
     assert answer.status_code == 200
-    assert (
-        "<h2>POST /api/runs/{name}/resume</h2>" in answer.text
-        and "<code>checkpoint</code></td><td>integer or null" in answer.text
-    )
+    assert "<h2>POST /api/runs/{name}/resume</h2>" in answer.text
+    assert "<code>checkpoint</code></td><td>integer or null" in answer.text
 
 
 def test_the_api_s_page_needs_no_script_and_nothing_from_elsewhere(shared_server: Serving) -> None:

@@ -237,9 +237,8 @@ def test_a_run_that_a_crash_left_without_its_job_says_what_to_do(full: Serving, 
     making.publish("orphan", {"run": "orphan", "created": 1, "spec": {**SPEC, "name": "orphan"}, "queue": "default"})
     making.close()
     said = refused(full, 1, "taught", "orphan")
-    assert (
-        "run orphan exists already" in said and "no job has begun it: `muster resume orphan` does, or delete " in said
-    )
+    assert "run orphan exists already" in said
+    assert "no job has begun it: `muster resume orphan` does, or delete " in said
     assert full.client.post("/api/runs/orphan/resume", {})["iteration"] == 0
     assert "no job has begun it" not in refused(full, 1, "taught", "orphan")
 

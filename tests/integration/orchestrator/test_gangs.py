@@ -83,10 +83,8 @@ def test_a_native_jobs_child_failure_restarts_the_whole_gang(shared_server: Serv
     detail = shared_server.wait(job)
     assert detail["status"] == "SUCCEEDED"
     first, second = detail["attempts"]
-    assert (
-        first["ending"] == "failed"
-        and "node 1: rank 1 exited with code 1: RuntimeError: child trouble" in first["statusReason"]
-    )
+    assert first["ending"] == "failed"
+    assert "node 1: rank 1 exited with code 1: RuntimeError: child trouble" in first["statusReason"]
     assert second["epoch"] > first["epoch"] and second["number"] == 2
     assert "attempt 2 done" in shared_server.log(job, attempt=2)
 

@@ -299,31 +299,23 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     rows = cups.rows("honest")
     assert [(row["rank"], row["entry"], row["status"]) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
     verified = cups.muster("verify", "honest")
-    assert (
-        verified.returncode == 1
-        and "entry 1: the content of entry.json was altered (SHA-256 differs)\n" in verified.stdout
-    )
+    assert verified.returncode == 1
+    assert "entry 1: the content of entry.json was altered (SHA-256 differs)\n" in verified.stdout
     shown = cups.muster("show", "honest", "1")
-    assert (
-        shown.returncode == 1 and shown.stdout == "entry 1: the content of entry.json was altered (SHA-256 differs)\n"
-    )
+    assert shown.returncode == 1
+    assert shown.stdout == "entry 1: the content of entry.json was altered (SHA-256 differs)\n"
     assert cups.muster("show", "honest", "2").returncode == 0
     listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert (
-        "entry 2: the entry and its model are unchanged" in verified.stdout
-        and cups.muster("verify", "honest", "2").returncode == 0
-    )
+    assert "entry 2: the entry and its model are unchanged" in verified.stdout
+    assert cups.muster("verify", "honest", "2").returncode == 0
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
     onnx.write_bytes(b"Weights")
     verified = cups.muster("verify", "honest", "2", "--rerun")
-    assert (
-        verified.returncode == 1
-        and "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
-        in verified.stdout
-    )
+    assert verified.returncode == 1
+    assert "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n" in verified.stdout
     before = cups.races()
     assert "model fast@2: the content of bundle/policy.onnx was altered" in cups.refused("submit", "honest", "fast@2")
     onnx.write_bytes(b"weights")
@@ -345,6 +337,5 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     for ask in (("table", "honest"), ("show", "honest"), ("submit", "honest", "fast@1")):
         assert "league honest: the content of league.json was altered" in cups.refused(*ask)
     (told,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
-    assert "league honest: the content of league.json was altered" in told[
-        "problem"
-    ] and "league honest: the content of league.json was altered" in cups.done("list")
+    assert "league honest: the content of league.json was altered" in told["problem"]
+    assert "league honest: the content of league.json was altered" in cups.done("list")

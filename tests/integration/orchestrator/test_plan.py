@@ -18,7 +18,7 @@ from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
 from shared_store.files import write_json
-from tests.conftest import Serving, run_muster, wait_for
+from tests.conftest import Serving, call_muster, wait_for
 
 SPEC = "job_specs/cartpole.yaml"
 
@@ -44,7 +44,7 @@ def test_the_whole_command_is_printed_on_any_width_of_terminal(server: Serving) 
     (server.home / "job.yaml").write_text(
         f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n"
     )
-    narrow = run_muster("submit", str(server.home / "job.yaml"), "--dry-run", home=server.home, COLUMNS="80")
+    narrow = call_muster("submit", str(server.home / "job.yaml"), "--dry-run", home=server.home, COLUMNS="80")
     assert narrow.stdout.splitlines()[2].rstrip().endswith(whole), narrow.stdout
 
 
