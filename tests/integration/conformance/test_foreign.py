@@ -63,7 +63,7 @@ def batch(server: Serving) -> Batch:
         ("route53", lambda route53: route53.list_hosted_zones(), "InvalidAction"),
     ],
 )
-def test_an_unsupported_service_is_refused_in_its_own_protocol(
+def test_another_service_is_refused_as_it_would_say(
     server: Serving, service: str, call: Callable[[Any], Any], code: str
 ) -> None:
     with pytest.raises(ClientError) as caught:
@@ -256,9 +256,7 @@ def test_ecs_properties_of_one_container_run_and_are_shown_as_they_came(batch: B
         ("MEMORY", "Memory is not provided."),
     ],
 )
-def test_a_definition_without_image_or_resources_is_refused_when_it_is_registered(
-    batch: Batch, lacking: str, message: str
-) -> None:
+def test_a_definition_without_image_or_resources_is_refused_at_once(batch: Batch, lacking: str, message: str) -> None:
     given = container("true", {})
     given.pop(lacking, None)
     given["resourceRequirements"] = [each for each in given["resourceRequirements"] if each["type"] != lacking]

@@ -47,9 +47,7 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Fuzzed, T
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_others_are_served_while_a_client_means_harm(
-    target: tuple[Fuzzed, Target], name: str, fuzz_report: Counter[str]
-) -> None:
+def test_others_are_served_during_attacks(target: tuple[Fuzzed, Target], name: str, fuzz_report: Counter[str]) -> None:
     server, victim = target
     before = (server.home.parent / "stderr").stat().st_size
     jobs: list[str] = []

@@ -80,7 +80,7 @@ def test_a_damaged_keys_file_is_one_line_at_the_start(tmp_path: Path, text: byte
     assert f"{tmp_path}/keys.json: " in done.stderr and part in done.stderr, done.stderr
 
 
-def test_a_keys_file_damaged_later_leaves_the_last_good_keys_and_is_logged_once(
+def test_a_keys_file_damaged_later_is_logged_once_and_its_keys_stay(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = KeyStore(tmp_path)
@@ -176,9 +176,7 @@ def test_a_proxy_is_trusted_by_its_address_and_only_where_keys_are_demanded(tmp_
         Server(tmp_path, trusted_proxies=["127.0.0.1"])
 
 
-def test_a_home_directory_is_its_users_alone_and_an_open_one_is_closed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     before = os.umask(0o022)
     try:
         HomeLock(tmp_path / "new").release()

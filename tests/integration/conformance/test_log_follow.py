@@ -216,7 +216,7 @@ def test_a_live_tail_takes_up_jobs_that_begin_and_end_later_and_filters(shared_s
     assert named.texts == []  # all was written before that session began
 
 
-def test_a_burst_comes_in_updates_of_500_and_above_5000_is_sampled(
+def test_a_burst_comes_500_at_a_time_and_above_5000_is_sampled(
     shared_server: Serving, watch: Any, running: str
 ) -> None:
     tail = watch(logStreamNames=[stream_of(shared_server, running)])

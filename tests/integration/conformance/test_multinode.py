@@ -239,9 +239,7 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
 
 
 @pytest.mark.parametrize("code", [1, 75])
-def test_without_attempts_left_any_exit_code_of_the_main_node_is_a_failure(
-    batch: Batch, code: int, tmp_path: Path
-) -> None:
+def test_without_attempts_left_any_code_of_the_main_node_is_a_failure(batch: Batch, code: int, tmp_path: Path) -> None:
     """75 means "requeue me" in our own jobs only (there after 10 s at the soonest, and this one is older)."""
     script = f"{UNTIL.format('go')}; exit {code}"
     job = batch.submit(batch.multinode(f"mnp-exits-{code}", script, 1, env={"GATE": str(tmp_path)}))

@@ -220,9 +220,7 @@ def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
         ({"nodeOverrides": {"numNodes": 2}}, "use containerOverrides"),
     ],
 )
-def test_impossible_arrays_and_dependencies_are_refused(
-    batch: Batch, parked: str, change: dict[str, Any], message: str
-) -> None:
+def test_impossible_arrays_are_refused(batch: Batch, parked: str, change: dict[str, Any], message: str) -> None:
     definition = batch.single("one-refused", "true")
     known = {
         "ARRAY": batch.submit(definition, queue=parked, arrayProperties={"size": 2}),

@@ -139,7 +139,7 @@ def test_a_change_needs_the_token_of_a_form_of_the_same_session(console: Console
         {"Host": "evil.example"},
     ],
 )
-def test_on_loopback_without_keys_another_web_page_can_neither_read_nor_change(
+def test_another_web_page_neither_reads_nor_changes_an_open_server(
     shared_server: Serving, headers: dict[str, str]
 ) -> None:
     visitor = Visitor(shared_server.url)

@@ -95,9 +95,7 @@ def test_a_function_that_fails_on_a_sample_is_told_when_its_editor_is_left(brows
     expect(numbers(code).nth(1)).to_have_class(BAD)
 
 
-def test_the_wizard_leads_by_review_and_yaml_to_a_job(
-    browser_page: Page, code: Locator, shared_server: Serving
-) -> None:
+def test_the_wizard_leads_by_review_and_yaml_to_jobs(browser_page: Page, code: Locator, shared_server: Serving) -> None:
     code.fill("# </script><script>alert(1)</script>\ndef reward_function(params):\n    return 1.0\n")
     browser_page.locator('[name="name"]').fill("clicked")
     browser_page.locator('select[name="train.algorithm"]').select_option("sac")

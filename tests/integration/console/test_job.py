@@ -135,9 +135,7 @@ def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(console: C
         assert visitor.http.get(f"/jobs/{talking}/log", params=wrong).status_code == 400
 
 
-def test_the_log_is_searched_and_the_first_error_is_found_with_the_lines_around_it(
-    console: Console, talking: str
-) -> None:
+def test_the_log_is_searched_and_the_first_error_found_with_lines_around_it(console: Console, talking: str) -> None:
     visitor = console.visitor()
     found = log_of(visitor, talking, "/search", text="LINE 77 OF")
     assert sorted(said(found)) == ["line 77 of 0", "line 77 of 1"] and found["over"]
@@ -169,7 +167,7 @@ def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(console: Co
         assert lines == expected
 
 
-def test_a_page_that_missed_too_much_gets_the_last_lines_and_how_much_it_missed(
+def test_a_page_that_missed_too_much_gets_the_last_lines_and_a_count(
     console: Console, talking: str, store: Store
 ) -> None:
     run = store.run(console.client.get(f"/api/jobs/{talking}")["run"])
@@ -212,7 +210,7 @@ def read_until(visitor: Visitor, job: str, last: str, text: str) -> tuple[list[s
     raise AssertionError(f"{text} never came; there is {found[-5:]}")
 
 
-def test_new_iterations_come_over_the_stream_and_a_run_that_went_back_is_read_again(
+def test_the_stream_has_new_iterations_and_tells_of_a_run_that_went_back(
     console: Console, training: str, store: Store
 ) -> None:
     visitor = console.visitor()
@@ -249,9 +247,7 @@ def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(co
     assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
 
 
-def test_a_run_goes_on_from_an_older_checkpoint_only_once_the_person_has_said_yes(
-    console: Console, store: Store
-) -> None:
+def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console: Console, store: Store) -> None:
     add_run(store, "again", {**SPEC, "name": "again"})
     for iteration in (3, 6):
         add_checkpoint(store, "again", iteration)
@@ -300,9 +296,7 @@ def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, store: 
     assert ended["statusReason"] == "stopped in the console by key admin"
 
 
-def test_a_read_only_key_sees_no_buttons_and_no_values_and_is_refused_each_action(
-    console: Console, training: str
-) -> None:
+def test_a_read_only_key_sees_no_buttons_nor_values_and_is_refused_actions(console: Console, training: str) -> None:
     visitor = console.visitor("reader")
     page = visitor.page(f"/jobs/{training}")
     assert "taught" in page.text and page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
@@ -325,7 +319,7 @@ def test_a_key_of_another_queue_sees_nothing_of_the_job_and_changes_nothing(cons
         assert visitor.submit(f"/jobs/{training}/{action}", name="x", confirmed="yes").status_code == 403, action
 
 
-def test_files_of_a_run_are_downloads_pictures_are_shown_and_nothing_leads_out_of_the_run(
+def test_files_of_a_run_are_downloads_and_nothing_leads_out_of_it(
     console: Console, training: str, store: Store
 ) -> None:
     run, visitor = store.run("taught"), console.visitor()

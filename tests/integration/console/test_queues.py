@@ -82,9 +82,7 @@ def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str])
     stream.close()
 
 
-def test_a_share_that_uses_something_is_told_with_its_weight_and_the_host_as_full(
-    console: Console, waiting: dict[str, str]
-) -> None:
+def test_a_share_in_use_is_told_with_its_weight_and_the_host_as_full(console: Console, waiting: dict[str, str]) -> None:
     definition = console.register("runs", cpus="1", command=["sleep", "600"])
     job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
     running = console.client.batch("SubmitJob", **job)["jobId"]

@@ -115,9 +115,7 @@ def test_a_run_that_goes_on_is_renewed(console: Console, store: Store) -> None:
     stream.close()
 
 
-def test_the_comparison_is_what_the_command_computes(
-    console: Console, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_comparison_is_that_of_the_command(console: Console, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUSTER_TOKEN", console.secrets["admin"])
     page = console.visitor().page("/compare?run=fast&run=sure")
     done = call_muster("compare", "fast", "sure", home=console.server.home)

@@ -236,9 +236,7 @@ def test_any_job_is_submitted_as_yaml_with_help_for_the_line_and_its_errors_mark
         ),
     ],
 )
-def test_what_a_request_may_not_bring_is_refused_at_its_line(
-    console: Console, text: str, words: str, line: int
-) -> None:
+def test_what_a_request_must_not_bring_is_told_at_its_line(console: Console, text: str, words: str, line: int) -> None:
     visitor = console.visitor()
     problem = checked(visitor, {"yaml": text})["problem"]
     assert words in problem["message"] and problem["line"] == line and "root:" not in problem["message"]

@@ -87,9 +87,7 @@ def test_a_form_makes_a_track_for_good(console: Console) -> None:
         ({"name": "oval"}, "a preset is called so; choose another name"),
     ],
 )
-def test_a_track_that_can_t_be_made_is_refused_by_the_name_of_its_field(
-    console: Console, wrong: dict[str, str], told: str
-) -> None:
+def test_a_track_that_can_t_be_made_is_refused_by_its_field(console: Console, wrong: dict[str, str], told: str) -> None:
     answer = console.visitor().submit("/tracks", **{"name": "wrong", "seed": "7", **wrong})
     assert answer.status_code == 400 and told in answer.json()["message"], answer.text
     assert "wrong" not in [each["name"] for each in console.client.get("/api/tracks")]

@@ -218,9 +218,7 @@ def test_an_image_without_muster_runs_as_it_is(bench: AwsBench) -> None:
     assert bench.outcome(0).exit_code == 4
 
 
-def test_gangs_that_come_and_go_do_not_double_the_lines_of_one_that_runs(
-    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gangs_that_come_and_go_double_no_line_of_another(bench: AwsBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
     script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"
     running = bench.launch(bench.gang(script, 1, native=False))
@@ -279,9 +277,7 @@ def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(
     assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
 
 
-def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(
-    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monkeypatch: pytest.MonkeyPatch) -> None:
     handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
 
     def reason() -> str:

@@ -187,7 +187,7 @@ def test_two_threads_that_look_at_once_copy_a_log_once(bench: DockerBench, monke
     bench.ended(handle)
 
 
-def test_a_long_log_is_copied_to_its_end_and_keeps_its_head_and_its_tail(
+def test_a_long_log_is_copied_and_keeps_its_head_and_its_tail(
     bench: DockerBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("orchestrator.engines.docker.engine._LOOK", 0.0)  # it goes on at the next look
@@ -199,9 +199,7 @@ def test_a_long_log_is_copied_to_its_end_and_keeps_its_head_and_its_tail(
 
 
 @pytest.mark.parametrize("end", ["echo the error", "printf 'the error'"])
-def test_a_log_that_is_read_slowly_is_copied_to_its_end(
-    bench: DockerBench, monkeypatch: pytest.MonkeyPatch, end: str
-) -> None:
+def test_a_log_read_slowly_is_copied_to_its_end(bench: DockerBench, monkeypatch: pytest.MonkeyPatch, end: str) -> None:
     """Docker Engine 20.10 cuts such a log off when its container ends: not always, so that three are read."""
     append, written = LogWriter.append, itertools.count()
 
@@ -253,9 +251,7 @@ def test_a_gang_gets_sigterm_and_after_the_grace_sigkill(bench: DockerBench) -> 
 
 
 @pytest.mark.parametrize("blow", [lambda c: c.kill(), lambda c: c.remove(force=True)])
-def test_a_container_that_is_killed_or_removed_is_a_node_that_ended(
-    bench: DockerBench, blow: Callable[[Any], None]
-) -> None:
+def test_a_killed_or_removed_container_is_a_node_that_ended(bench: DockerBench, blow: Callable[[Any], None]) -> None:
     handle = bench.launch(bench.gang(nodes=2))
     blow(bench.engine._containers(f"{bench.job}/1/1")[1])
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 10, "its end is seen")

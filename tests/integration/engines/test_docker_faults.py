@@ -83,7 +83,7 @@ class Relay:
 
 
 @pytest.mark.skipif(not Path("/var/run/docker.sock").exists(), reason="NO /var/run/docker.sock: nothing to cut off")
-def test_a_docker_engine_that_goes_away_is_waited_for(
+def test_a_docker_engine_gone_is_waited_for(
     docker_client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     relay = Relay(tmp_path / "docker.sock")
@@ -149,9 +149,7 @@ def ask_stacks(served: Serving, job: str) -> Any:
 
 
 @pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="three minutes: MUSTER_LONG=1, in make bits")
-def test_a_node_that_is_cut_off_is_noticed_by_its_silence_and_the_gang_goes_on(
-    docker_client: Any, tmp_path: Path
-) -> None:
+def test_a_node_that_is_cut_off_is_noticed_and_the_gang_goes_on(docker_client: Any, tmp_path: Path) -> None:
     docker = Serving(tmp_path, "--engine", "docker", "--cpus", "4")
     run = Store(tmp_path / "store").run("cut")
     job = ""

@@ -41,9 +41,7 @@ def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBenc
         bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
 
 
-def test_a_job_for_more_hosts_than_there_are_now_is_taken_and_says_what_it_waits_for(
-    bench: SlurmBench, tmp_path: Path
-) -> None:
+def test_a_job_for_more_hosts_than_there_are_says_what_it_waits_for(bench: SlurmBench, tmp_path: Path) -> None:
     spec = tmp_path / "job.yaml"
     spec.write_text("name: large\nnodes: 3\ncommand: [sleep, '600']\nresources: {cpus: 0.5, memory: 64MiB}\n")
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
@@ -91,9 +89,7 @@ def test_a_node_that_slurm_would_boot_is_a_host_and_one_that_is_out_of_service_i
     assert [(host.name, host.away) for host in list_hosts()] == [("slurm/n1", away)]
 
 
-def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
-    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     hard = "a'b\"c\nd $HOME `date` \\ é\tMUSTER\n@nodes@ %j"
     monkeypatch.setenv("MUSTER_TOKEN", "secret")
     monkeypatch.setenv("MUSTER_DATABASE", "secret")
@@ -127,9 +123,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     assert "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS" not in told[1]
 
 
-def test_without_gpus_a_node_sees_none_and_two_jobs_on_one_host_have_two_ports(
-    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_sees_its_gpus_alone_and_each_job_has_a_port(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
     script = f'echo "gpus[$CUDA_VISIBLE_DEVICES] port $MASTER_PORT"; {WAIT}'
     pin = {"nodelist": "n1"}
@@ -236,9 +230,7 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
         ),
     ],
 )
-def test_a_gang_that_slurm_can_t_start_is_refused_in_one_line(
-    bench: SlurmBench, changes: dict[str, Any], why: str
-) -> None:
+def test_a_gang_that_slurm_refuses_is_refused_in_one_line(bench: SlurmBench, changes: dict[str, Any], why: str) -> None:
     with pytest.raises(EngineError, match=why) as refused:
         bench.launch(bench.gang(**changes))
     assert "\n" not in str(refused.value) and not isinstance(refused.value, NotYet)
@@ -313,9 +305,7 @@ def test_a_directory_missing_on_a_node_is_one_line_with_the_node_s_name(bench: S
     assert " is not the controller's: run run has epoch 1 there, not 2" in node.words
 
 
-def test_a_first_node_that_lacks_this_python_or_the_store_is_reported_in_one_line(
-    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_first_node_without_python_or_store_is_one_line(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(sys, "executable", "/no/python")
         handle = bench.launch(bench.gang(nodes=2))
@@ -368,7 +358,5 @@ def test_slurm_s_reason_for_a_waiting_job_is_put_into_words(state: str, reason: 
         ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
     ],
 )
-def test_a_node_without_an_outcome_ends_as_slurm_ended_its_job(
-    state: str, cause: Cause | None, code: int, words: str
-) -> None:
+def test_a_node_without_outcome_ends_as_slurm_says(state: str, cause: Cause | None, code: int, words: str) -> None:
     assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (cause, code, words)

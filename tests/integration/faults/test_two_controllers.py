@@ -56,9 +56,7 @@ def test_a_controller_that_started_since_the_last_look_is_found_by_its_claim(tmp
     second.close()
 
 
-def test_a_heartbeat_of_a_controller_that_died_long_ago_is_cleared_away(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_heartbeat_of_a_controller_long_dead_is_cleared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = Store(tmp_path / "store").open()
     (store.path / "controllers").mkdir()
     old = {"home": "/old", "host": "h", "pid": 1, "beat": 7, "time": time.time() - 90_000}

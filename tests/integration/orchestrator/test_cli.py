@@ -262,7 +262,7 @@ def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server
     assert "FAILED already" in shared_server.muster("stop", "greeter").stdout
 
 
-def test_a_narrow_terminal_cuts_the_reasons_and_nothing_else(
+def test_a_narrow_terminal_cuts_reasons_alone(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
@@ -313,9 +313,7 @@ def test_a_log_whose_reader_has_had_enough_ends_in_order(shared_server: Serving)
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.endswith("line\n"), done
 
 
-def test_a_plan_of_a_run_that_is_not_there_is_refused_as_its_submission_is(
-    shared_server: Serving, tmp_path: Path
-) -> None:
+def test_a_plan_of_a_missing_run_is_refused_as_its_submission_is(shared_server: Serving, tmp_path: Path) -> None:
     spec = tmp_path / "job.yaml"
     spec.write_text("name: judge\nevaluate: {run: nosuch}\n")
     for option in ([], ["--dry-run"]):

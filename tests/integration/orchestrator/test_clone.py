@@ -75,9 +75,7 @@ def weights(run: Run) -> bytes:
 @pytest.mark.parametrize(
     ("reference", "iteration", "held"), [("taught", 9, b"nine"), ("taught@3", 3, b"three"), ("taught@best", 6, b"six")]
 )
-def test_the_newest_a_named_and_the_best_checkpoint(
-    full: Serving, store: Store, reference: str, iteration: int, held: bytes
-) -> None:
+def test_a_named_checkpoint_is_cloned(full: Serving, store: Store, reference: str, iteration: int, held: bytes) -> None:
     name = f"of-{iteration}"
     answer = clone(full, reference, name)
     assert answer["run"] == name and answer["jobName"] == name and answer["parent"]["iteration"] == iteration
@@ -264,9 +262,7 @@ def student(tmp_path: Path, teacher: str) -> str:
         ("../taught", "train.rsl_rl.teacher_checkpoint: expected RUN or RUN@ITERATION"),
     ],
 )
-def test_a_missing_teacher_is_refused_at_submission(
-    full: Serving, store: Store, tmp_path: Path, teacher: str, said: str
-) -> None:
+def test_a_missing_teacher_is_refused(full: Serving, store: Store, tmp_path: Path, teacher: str, said: str) -> None:
     add_run(store, "idle")
     done = full.muster("submit", student(tmp_path, teacher))
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
@@ -278,9 +274,7 @@ def test_an_existing_teacher_is_accepted(full: Serving, tmp_path: Path, teacher:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_resumed_run_has_its_teacher_and_does_not_need_the_teachers_run(
-    full: Serving, store: Store, tmp_path: Path
-) -> None:
+def test_a_resumed_run_has_its_teacher_and_needs_no_teachers_run(full: Serving, store: Store, tmp_path: Path) -> None:
     add_run(store, "pupil", json.loads(Path(student(tmp_path, "late")).read_text()))
     add_checkpoint(store, "pupil", 1, algorithm="rsl_rl", settings={"teacher_checkpoint": "late"})
     assert full.client.post("/api/runs/pupil/resume", {})["iteration"] == 1
@@ -290,9 +284,7 @@ def held(run: Run, teacher: str) -> list[bytes]:
     return [(each.path / "learner.pt").read_bytes() for each in list_checkpoints(run.teacher(teacher))]
 
 
-def test_a_submitted_job_keeps_its_teachers_weights_whatever_happens_to_the_teacher(
-    full: Serving, store: Store, tmp_path: Path
-) -> None:
+def test_a_submitted_job_keeps_its_teachers_weights_for_good(full: Serving, store: Store, tmp_path: Path) -> None:
     add_run(store, "mentor")
     for iteration in (2, 4):
         add_checkpoint(store, "mentor", iteration, f"weights {iteration}".encode())
@@ -311,9 +303,7 @@ def test_a_submitted_job_keeps_its_teachers_weights_whatever_happens_to_the_teac
     assert {path.name for path in (store.path / "runs").glob(".*.clone")} == hidden
 
 
-def test_a_teacher_whose_weights_are_damaged_is_refused_at_submission(
-    full: Serving, store: Store, tmp_path: Path
-) -> None:
+def test_a_teacher_with_damaged_weights_is_refused_at_submission(full: Serving, store: Store, tmp_path: Path) -> None:
     add_run(store, "broken")
     (add_checkpoint(store, "broken", 2).path / "learner.pt").write_bytes(b"WEIGHTS")
     runs = sorted(path.name for path in (store.path / "runs").iterdir())
@@ -326,9 +316,7 @@ def test_a_teacher_whose_weights_are_damaged_is_refused_at_submission(
 
 
 @pytest.mark.parametrize("fate", ["pruned", "deleted"])
-def test_a_student_with_the_teachers_weights_does_not_need_the_teacher(
-    full: Serving, store: Store, tmp_path: Path, fate: str
-) -> None:
+def test_a_student_with_the_weights_needs_no_teacher(full: Serving, store: Store, tmp_path: Path, fate: str) -> None:
     teacher, pupil = f"teacher-{fate}", f"pupil-{fate}"
     if fate == "pruned":
         add_run(store, teacher)

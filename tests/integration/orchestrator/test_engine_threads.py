@@ -160,7 +160,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
     assert fake.closed == 1
 
 
-def test_an_engine_that_fails_is_logged_once_and_its_gangs_count_as_running(
+def test_an_engine_that_fails_is_logged_once_and_its_gangs_run(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     fake = Fake()

@@ -293,9 +293,7 @@ def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(tmp_pa
     assert read == [2, 2], "when the definition is registered, and when the job is submitted with its overrides"
 
 
-def test_a_job_that_resumes_a_run_is_read_once_for_its_definition_and_once_with_its_overrides(
-    tmp_path: Path, read: list[int]
-) -> None:
+def test_a_resumed_job_is_read_once_for_its_definition_and_once_with_overrides(tmp_path: Path, read: list[int]) -> None:
     spec = validate({"name": "say", "command": ["echo", "here"], "resources": {"cpus": 0.1, "memory": 64}}, "job.yaml")
     server = Server(tmp_path, port=0, cpus=2)
     server.start()

@@ -83,9 +83,7 @@ def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(clie
         client.post("/api/plan", large)
 
 
-def test_a_stop_that_is_never_answered_is_the_reason_of_the_job_and_is_tried_again(
-    client: Client, hanging: Hanging
-) -> None:
+def test_a_stop_that_is_not_answered_is_the_job_s_reason_and_tried_again(client: Client, hanging: Hanging) -> None:
     hanging.answers.set()
     job = submit_gang(client, "pass", queue="fake")
     await_status(client, job, "RUNNING")

@@ -112,7 +112,7 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
     assert http.get("/api/runs/checkpointed").json()["evaluation"] is None
 
 
-def test_no_change_of_a_run_and_no_spec_in_the_store_makes_an_answer_long(
+def test_no_change_of_a_run_and_no_stored_spec_makes_an_answer_long(
     inside: Server, http: httpx.Client, runs: Path
 ) -> None:
     bomb = ", ".join(

@@ -120,9 +120,7 @@ def test_the_addresses_of_the_largest_gang_are_addresses(bench: LocalBench) -> N
 PRINT_ENVIRONMENT = "import json, os; print(json.dumps(dict(os.environ)))"
 
 
-def test_nodes_get_the_contract_their_environment_and_their_gpus(
-    bench: LocalBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nodes_get_contract_environment_and_gpus(bench: LocalBench, monkeypatch: pytest.MonkeyPatch) -> None:
     own = (
         *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_DATABASE", "PGPASSWORD"),
         *("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"),  # of the other engines
@@ -177,9 +175,7 @@ def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: LocalBench) -> 
     assert sorted(bench.printed()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
 
 
-def test_commands_run_in_the_job_s_directory_which_can_not_hide_our_own_packages(
-    bench: LocalBench, tmp_path: Path
-) -> None:
+def test_commands_run_in_the_job_s_directory_which_hides_no_package(bench: LocalBench, tmp_path: Path) -> None:
     directory = tmp_path / "mine"
     (directory / "worker").mkdir(parents=True)
     (directory / "worker" / "__init__.py").write_text("raise SystemExit('the wrong worker')")
@@ -316,9 +312,7 @@ def test_stopping_asks_first(bench: LocalBench) -> None:
 @pytest.mark.parametrize(
     "stopper", [lambda bench: bench.engine, LocalBench.new_engine], ids=["same engine", "new engine"]
 )
-def test_stopping_leaves_no_process_whatever_they_do(
-    bench: LocalBench, stopper: Callable[[LocalBench], LocalEngine]
-) -> None:
+def test_stopping_leaves_no_process_at_all(bench: LocalBench, stopper: Callable[[LocalBench], LocalEngine]) -> None:
     stubborn = f'setsid sh -c "trap \\"\\" TERM; sleep 600" & (setsid sleep 600 &); {STUBBORN}'
     handle = bench.ready(bench.gang(stubborn))
     assert len(bench.processes()) >= 8

@@ -91,7 +91,7 @@ def test_properties_that_describe_no_gang_are_refused(server: Serving, definitio
     assert refusal.value.status == 400 and "\n" not in str(refusal.value)
 
 
-def test_an_image_that_would_not_be_run_is_passed_over_or_refused_as_the_compute_environment_says(
+def test_an_image_that_would_not_run_is_refused_where_the_compute_environment_says(
     server: Serving,
 ) -> None:
     batch = server.client.batch

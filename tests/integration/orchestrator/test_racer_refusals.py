@@ -56,9 +56,7 @@ def jobs_of(server: Serving) -> list[dict[str, Any]]:
         ("clone", "racer", "--name", "other", "--set", "train.config.track=ovall", "--dry-run"),
     ],
 )
-def test_a_training_on_an_unknown_track_is_refused_with_the_nearest_name(
-    full: Serving, arguments: tuple[str, ...]
-) -> None:
+def test_a_training_on_an_unknown_track_is_told_the_nearest_name(full: Serving, arguments: tuple[str, ...]) -> None:
     assert refused(full, *arguments) == f"muster: train.config.track: track ovall does not exist; {NAMED}\n"
 
 
@@ -66,7 +64,7 @@ def test_a_training_on_an_unknown_track_is_refused_with_the_nearest_name(
     ("options", "key"),
     [(("--race", "--track", "ovall"), "race.track"), (("--set", "config.track=ovall"), "evaluate.config.track")],
 )
-def test_an_evaluation_on_an_unknown_track_is_refused_with_the_nearest_name(
+def test_an_evaluation_on_an_unknown_track_is_told_the_nearest(
     full: Serving, options: tuple[str, ...], key: str
 ) -> None:
     assert refused(full, "evaluate", "racer", *options) == f"muster: {key}: track ovall does not exist; {NAMED}\n"

@@ -61,9 +61,7 @@ def large_array(http: httpx.Client, queue: str, size: int, **request: Any) -> st
     return str(call(http, "SubmitJob", **submission, **request)["jobId"])
 
 
-def test_an_array_stores_its_definition_once_and_each_child_shows_it(
-    inside: Server, http: httpx.Client, waiting: str
-) -> None:
+def test_an_array_stores_its_definition_once_for_all_children(inside: Server, http: httpx.Client, waiting: str) -> None:
     array = large_array(http, waiting, 3_000, parameters={"a": "b"}, tags={"c": "d"})
     with inside.reconciler.database.session() as session:
         copies = select(func.count(Job.own_node_properties), func.count()).where(Job.parent == array)
@@ -86,9 +84,7 @@ def test_an_array_stores_its_definition_once_and_each_child_shows_it(
     assert [(each["status"], each["statusReason"]) for each in ended] == [("FAILED", "enough")] * 2
 
 
-def test_the_children_of_an_array_wait_for_each_other_and_for_others_as_asked(
-    inside: Server, http: httpx.Client, waiting: str
-) -> None:
+def test_children_of_an_array_wait_for_each_other_as_asked(inside: Server, http: httpx.Client, waiting: str) -> None:
     first = large_array(http, waiting, 3, dependsOn=[{"type": "SEQUENTIAL"}])
     second = large_array(http, waiting, 3, dependsOn=[{"type": "N_TO_N", "jobId": first}])
 

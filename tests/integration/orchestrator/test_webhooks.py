@@ -84,9 +84,7 @@ def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(told: S
         assert message["timestamp"] == data["stoppedAt"] > data["startedAt"] >= data["createdAt"]
 
 
-def test_a_message_is_tried_again_by_the_next_controller_with_the_same_id_and_body(
-    told: Serving, receiver: Receiver
-) -> None:
+def test_a_message_is_tried_again_by_the_next_controller_unchanged(told: Serving, receiver: Receiver) -> None:
     receiver.answers = [500]
     job = told.gang("print(1)")
     wait_for(lambda: receiver.of(job), 20, "a first try")
@@ -175,7 +173,7 @@ def test_a_receiver_that_answers_a_byte_at_a_time_is_left_after_the_deadline_of_
         assert dripping.drip.wait(30), "the connection is closed, not kept"
 
 
-def test_an_unknown_queue_is_named_at_the_start_with_the_nearest(
+def test_an_unknown_queue_is_told_with_the_nearest_at_the_start(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = write_webhooks(

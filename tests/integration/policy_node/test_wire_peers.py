@@ -176,7 +176,7 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
         running.process.kill()
 
 
-def test_messages_of_the_node_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachment(
+def test_messages_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachment(
     running: Running,
 ) -> None:
     got: list[zenoh.Sample] = []
@@ -242,7 +242,7 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
     assert running.process.poll() is None
 
 
-def test_a_silent_robot_is_reported_a_reset_starts_an_episode_and_the_end_undeclares_everything(
+def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares_all(
     running: Running,
 ) -> None:
     wait_for(lambda: "/joint_states is silent for" in running.said(), 20, "the watchdog")

@@ -249,7 +249,7 @@ def test_a_command_that_can_not_be_started_is_reported_with_a_remedy(node: Nodes
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
     ],
 )
-def test_a_broken_contract_is_reported_in_one_line(
+def test_a_broken_contract_is_told_in_a_line(
     node: Nodes, tmp_path: Path, change: dict[str, str | None], said: str
 ) -> None:
     n = node()

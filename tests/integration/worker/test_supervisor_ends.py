@@ -97,9 +97,7 @@ def test_the_error_file_of_torchrun_is_honoured_if_it_holds_an_error(
         ("file.close(); os.remove(path); os.mkfifo(path)", "not a regular file"),
     ],
 )
-def test_an_error_file_that_can_not_be_used_costs_neither_the_exit_code_nor_time(
-    node: Nodes, write: str, problem: str
-) -> None:
+def test_an_unusable_error_file_costs_neither_the_exit_code_nor_time(node: Nodes, write: str, problem: str) -> None:
     n = node()
     begin = "import os, sys; path = os.environ['TORCHELASTIC_ERROR_FILE']; file = open(path, 'w'); "
     assert n.python(f"{begin}{write}; sys.exit(7)") == 7
