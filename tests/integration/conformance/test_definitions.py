@@ -151,6 +151,7 @@ RETRIES = [{"onExitCode": str(code), "action": "RETRY"} for code in range(6)]
         ({"nodeProperties": properties(6, *(node_range(str(i)) for i in range(6)))}, "6 node ranges"),
         ({"nodeProperties": properties(2, node_range("0:2"))}, "targetNodes 0:2: the nodes are 0 to 1"),
         ({"nodeProperties": properties(2, node_range("0-1"))}, "expected n, a:b, a: or :b"),
+        ({"nodeProperties": properties(2)}, "0 node ranges"),
         ({"nodeProperties": properties(1001, node_range("0:"))}, "1 to 1000"),
         ({"nodeProperties": properties(0, node_range("0:"))}, "numNodes is 0"),
         ({"timeout": {"attemptDurationSeconds": 59}}, "must be at least 60"),

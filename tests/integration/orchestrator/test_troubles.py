@@ -31,7 +31,7 @@ from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
 from tests.conftest import submit_gang, wait_for
-from tests.support.orchestrator.jobs import FOREVER, await_status, detail
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.orchestrator.rows import job
 from tests.support.processes import end_all, processes_of, processes_of_job
 
@@ -41,17 +41,6 @@ def home(tmp_path: Path) -> Iterator[Path]:
     """A home directory; whatever still runs for it at the end is killed."""
     yield tmp_path
     end_all(tmp_path)
-
-
-@contextlib.contextmanager
-def serving(home: Path) -> Iterator[Client]:
-    server = Server(home, port=0, cpus=2)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            yield client
-    finally:
-        server.close()
 
 
 def change(home: Path, statement: str, *values: str) -> list[Any]:

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from orchestrator.client import Client
+from orchestrator.server import Server
 from tests.support.waiting import wait_for
 
 FOREVER = "import time; time.sleep(600)"
+
+
+@contextlib.contextmanager
+def serving(home: Path, **options: Any) -> Iterator[Client]:
+    """A client of a controller in this process, of two CPUs by default."""
+    server = Server(home, **{"cpus": 2, **options})
+    server.start()
+    try:
+        with Client(server.url) as client:
+            yield client
+    finally:
+        server.close()
+
+
+def jobs_of(client: Client, queue: str = "default") -> list[dict[str, Any]]:
+    """All jobs of a queue, whatever their state."""
+    filters = [{"name": "AFTER_CREATED_AT", "values": ["0"]}]
+    found: list[dict[str, Any]] = client.batch("ListJobs", jobQueue=queue, filters=filters)["jobSummaryList"]
+    return found
 
 
 def detail(client: Client, job_id: str) -> dict[str, Any]:
