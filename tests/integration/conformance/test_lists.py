@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import botocore.session
 import httpx
-import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import PREFIX, Batch, aws, refused
 
 HERE = {
@@ -23,18 +21,6 @@ HERE = {
     *("TagResource", "UntagResource", "ListTagsForResource"),
 }
 """What is carried out; the others are refused."""
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
-
-
-@pytest.fixture(scope="module")
-def parked(batch: Batch) -> Iterator[str]:
-    """A queue whose jobs never start."""
-    yield batch.queue("lists-parked", batch.compute_environment("lists-parked", state="DISABLED"))
-    batch.remove(["lists-parked"], ["lists-parked"])
 
 
 # -- lists and filters ------------------------------------------------------------------------------------------------

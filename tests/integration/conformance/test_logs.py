@@ -10,6 +10,7 @@ from botocore.exceptions import ClientError
 
 from shared_store.logs import REPLACED, format_line
 from tests.conftest import MAIN_LAST, Serving
+from tests.support.conformance.aws import Batch
 from tests.support.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, messages, stream_of
 
 
@@ -46,22 +47,12 @@ def test_the_stream_of_a_job_has_both_outputs_and_not_the_supervisors_end(shared
     assert described["createdAt"] <= times[0] <= described["stoppedAt"] + 1000
 
 
-def test_every_child_of_an_array_has_a_stream(shared_server: Serving, logs: Any) -> None:
-    batch = client_of(shared_server.url, "batch")
-    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
-    container = {
-        "image": "any",
-        "command": ["sh", "-c", "echo $AWS_BATCH_JOB_ARRAY_INDEX"],
-        "resourceRequirements": needs,
-    }
-    batch.register_job_definition(jobDefinitionName="array", type="container", containerProperties=container)
-    job = batch.submit_job(jobName="arr", jobQueue="default", jobDefinition="array", arrayProperties={"size": 2})[
-        "jobId"
-    ]
+def test_every_child_of_an_array_has_a_stream(shared_server: Serving, logs: Any, batch: Batch) -> None:
+    definition = batch.single("array", "echo $AWS_BATCH_JOB_ARRAY_INDEX")
+    job = batch.submit(definition, "arr", arrayProperties={"size": 2})
     for child in (0, 1):
         shared_server.wait(f"{job}:{child}")
-        described = batch.describe_jobs(jobs=[f"{job}:{child}"])["jobs"][0]
-        name = described["container"]["logStreamName"]
+        name = batch.describe(f"{job}:{child}")["container"]["logStreamName"]
         assert str(child) in messages(logs.get_log_events(logGroupName=GROUP, logStreamName=name))
     listed = logs.describe_log_streams(logGroupName=GROUP, logStreamNamePrefix=f"arr/{job}")["logStreams"]
     assert len(listed) == 2 and listed[-1]["logStreamName"] == name
@@ -319,9 +310,8 @@ def test_streams_are_listed_by_name_page_by_page(shared_server: Serving, logs: A
     streams = [stream for page in pages for stream in page["logStreams"]]
     assert [stream["logStreamName"] for stream in streams] == [f"{prefix}/1/node-{node}" for node in range(3)]
     for stream in streams:
-        events = logs.get_log_events(logGroupName=GROUP, logStreamName=stream["logStreamName"], startFromHead=True)[
-            "events"
-        ]
+        name = stream["logStreamName"]
+        events = logs.get_log_events(logGroupName=GROUP, logStreamName=name, startFromHead=True)["events"]
         assert stream["firstEventTimestamp"] == events[0]["timestamp"]
         assert stream["lastEventTimestamp"] == stream["lastIngestionTime"] == events[-1]["timestamp"]
         assert stream["creationTime"] <= stream["firstEventTimestamp"]

@@ -9,18 +9,13 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import EXITED, UNTIL, Batch, aws, gate, pairs, refused
 from tests.support.processes import processes_of_job
 
 NODE = "$AWS_BATCH_JOB_NODE_INDEX"
 ADDRESS = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
 STAY = "while :; do sleep 0.05; done"
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
 
 
 @pytest.fixture

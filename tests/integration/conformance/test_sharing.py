@@ -7,13 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import NO_ROOM, PREFIX, UNTIL, Batch, aws, gate, refused
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
 
 
 @pytest.fixture

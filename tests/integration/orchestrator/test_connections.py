@@ -23,6 +23,7 @@ from orchestrator.api.http.connections import Connection, Connections, raise_des
 from orchestrator.client import Client
 from orchestrator.server import Server
 from tests.conftest import MUSTER, Serving, submit_gang, wait_for
+from tests.support.orchestrator.jobs import serving
 
 DESCRIPTORS = 1024
 HALF_OPEN = 1100
@@ -188,15 +189,10 @@ def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(
     limit = 600 + len(os.listdir("/proc/self/fd"))
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
-        server = Server(tmp_path, cpus=1)
-        try:
-            server.start()
+        with serving(tmp_path) as client:
             assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > limit
-            with Client(server.url) as client:
-                job = submit_gang(client, "import resource; print(*resource.getrlimit(resource.RLIMIT_NOFILE))")
-                assert next(line["text"] for line in client.logs(job, follow=True)) == f"{limit} {hard}"
-        finally:
-            server.close()
+            job = submit_gang(client, "import resource; print(*resource.getrlimit(resource.RLIMIT_NOFILE))")
+            assert next(line["text"] for line in client.logs(job, follow=True)) == f"{limit} {hard}"
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 

@@ -9,8 +9,8 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from subprocess import CompletedProcess
 
 import pytest
 from sqlalchemy import select
@@ -19,7 +19,7 @@ from orchestrator.client import Client
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, WebhookDelivery
 from orchestrator.server import Server
-from tests.conftest import Serving, call_muster, submit_gang
+from tests.conftest import Serving, submit_gang
 from tests.support.orchestrator import rows
 from tests.support.orchestrator.receiver import SECRET, Receiver, receiving, write_webhooks
 from tests.support.processes import end_all
@@ -44,9 +44,8 @@ def told(tmp_path_factory: pytest.TempPathFactory, listening: Receiver) -> Itera
     """A controller that tells the receiver of every end."""
     home = tmp_path_factory.mktemp("told")
     file = write_webhooks(home / "hooks.json", chat={"url": listening.url, "link": "https://muster.example/"})
-    server = Serving(home / "home", "--cpus", "2", "--webhooks", file)
-    yield server
-    server.close()
+    with Serving(home / "home", "--cpus", "2", "--webhooks", file) as server:
+        yield server
 
 
 def is_signed(headers: dict[str, str], body: bytes) -> bool:
@@ -109,9 +108,7 @@ def test_a_slow_or_unreachable_receiver_delays_no_job(told: Serving, receiver: R
 
 
 def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serving, receiver: Receiver) -> None:
-    def command(*arguments: str) -> CompletedProcess[str]:
-        return call_muster("webhooks", *arguments, home=told.home)
-
+    command = partial(told.muster, "webhooks")
     sent = command("test", "chat")
     ((headers, body),) = receiver.messages
     place = f"http://127.0.0.1:{receiver.server_port}"
