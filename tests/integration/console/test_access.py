@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import httpx
@@ -68,9 +69,7 @@ def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_pa
     keys = KeyStore(tmp_path)
     keys.create("other")
     key = keys.create("mine")
-    server = Serving(tmp_path, "--cpus", "1")
-    visitor = Visitor(server.url, secret_of(key))
-    try:
+    with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url, secret_of(key))) as visitor:
         token = visitor.page("/").form_token
         server.kill()
         server.options = (*server.options, "--port", server.url.rpartition(":")[2])
@@ -78,9 +77,6 @@ def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_pa
         assert visitor.page("/").form_token == token, "forms of open pages go on"
         keys.delete("mine")
         assert visitor.http.get("/", follow_redirects=False).headers["location"].startswith("/login")
-    finally:
-        visitor.close()
-        server.close()
 
 
 @pytest.mark.parametrize("way", ["deleted key", "logout"])

@@ -3,39 +3,21 @@
 from __future__ import annotations
 
 import re
-import shutil
-from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Locator, Page, expect, sync_playwright
+from playwright.sync_api import Locator, Page, expect
 
-from tests.conftest import PATIENCE, Serving
+from tests.conftest import Serving
+from tests.support.console.person import People
 
 NAME = "train.config.reward_function"
 MESSAGE = f'[data-wrong="{NAME}"]'
 BAD = re.compile(r"\bbad\b")
 
 
-@pytest.fixture(scope="module")
-def browser_page(shared_server: Serving) -> Iterator[Page]:
-    """A browser's page, which may ask this server alone and may have no error of a script or of the policy."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("there is no chromium")
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(base_url=shared_server.url)
-        page.set_default_timeout(30_000 * PATIENCE)
-        expect.set_options(timeout=30_000 * PATIENCE)
-        problems: list[str] = []
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda told: problems.append(told.text) if told.type in ("error", "warning") else None)
-        page.on(
-            "request", lambda asked: problems.append(asked.url) if not asked.url.startswith(shared_server.url) else None
-        )
-        yield page
-        browser.close()
-        assert problems == []
+@pytest.fixture
+def browser_page(shared_server: Serving, people: People) -> Page:
+    return people(shared_server.url).page
 
 
 @pytest.fixture

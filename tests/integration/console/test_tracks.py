@@ -6,14 +6,13 @@ import xml.etree.ElementTree as xml
 
 import pytest
 
-from tests.conftest import call_muster
 from tests.support.console.fixtures import Console
 
 
 def test_tracks_are_shown_with_their_outlines_and_measures(console: Console) -> None:
     visitor = console.visitor("reader")
     order = ("tracks", "make", "hills", "--seed", "7", "--length", "45")
-    made = call_muster(*order, home=console.server.home, MUSTER_TOKEN=console.secrets["admin"])
+    made = console.server.muster(*order, MUSTER_TOKEN=console.secrets["admin"])
     assert made.returncode == 0, made.stderr
     page = visitor.page("/tracks")
     pictures = [str(each["src"]) for each in page.all("img")]
@@ -39,12 +38,8 @@ def test_a_track_has_its_facts_and_the_picture_of_the_command(console: Console) 
 @pytest.mark.parametrize("name", ["ovall", "random:x", "<script>alert(1)</script>", "..%2f..%2fetc", "-o"])
 def test_an_unknown_track_is_told_with_the_nearest_name(console: Console, name: str) -> None:
     visitor = console.visitor()
-    for path in (
-        f"/tracks/{name}",
-        f"/tracks/{name}/outline.svg",
-        f"/tracks/{name}/picture.png",
-        f"/tracks?name={name}",
-    ):
+    of_one = (f"/tracks/{name}{file}" for file in ("", "/outline.svg", "/picture.png"))
+    for path in (*of_one, f"/tracks?name={name}"):
         answer = visitor.http.get(path)
         assert answer.status_code == 404 and "<script>alert" not in answer.text, path
     assert "did you mean oval?" in visitor.page("/tracks/ovall", 404).text
