@@ -40,6 +40,11 @@ print('attempt', os.environ['AWS_BATCH_JOB_ATTEMPT'], 'done')
 """
 
 
+def until(gate: Path) -> str:
+    """A line of a script that imports ``time``: wait until there is a file."""
+    return f"while not __import__('os').path.exists({str(gate)!r}): time.sleep(0.02)"
+
+
 def test_a_native_jobs_child_failure_restarts_the_whole_gang(shared_server: Serving) -> None:
     job = shared_server.gang(FAIL_ON_CHILD_ONCE, nodes=2, attempts=2, env=NATIVE)
     detail = shared_server.wait(job)
@@ -118,9 +123,9 @@ def test_a_killed_supervisor_of_a_native_gang_costs_one_attempt_and_leaves_no_or
     assert not first & set(processes_of(server.home))
 
 
-def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) -> None:
-    script = "import time\nfor i in range(60): print('tick', i); time.sleep(0.1)"
-    job = server.gang(script, nodes=2)
+def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving, tmp_path: Path) -> None:
+    script = f"import time\nfor i in range(60):\n  print('tick', i)\n  if i == 30:\n    {until(tmp_path / 'gate')}"
+    job = server.gang(script + MAIN_LAST, nodes=2)
     server.wait(job, "RUNNING")
     follower = subprocess.Popen(
         [MUSTER, "logs", job, "-f", "--json"],
@@ -130,13 +135,13 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) ->
     )
     assert follower.stdout is not None
     first = follower.stdout.readline()
-    before = set(
-        wait_for(lambda: len(found := processes_of(server.home)) == 6 and found, what="two shims, supervisors, ranks")
-    )
+    both = lambda: len(found := processes_of(server.home)) == 6 and found  # noqa: E731
+    before = set(wait_for(both, what="two shims, supervisors, ranks"))
     server.kill()
     time.sleep(0.3)
     assert set(processes_of(server.home)) == before
     server.start()
+    (tmp_path / "gate").touch()
     detail = server.wait(job)
     assert detail["status"] == "SUCCEEDED" and len(detail["attempts"]) == 1
     assert [line for line in server.log(job, rank=1)] == [f"tick {i}" for i in range(60)]
@@ -145,10 +150,11 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) ->
         assert [line["text"] for line in followed if line["rank"] == rank] == [f"tick {i}" for i in range(60)]
 
 
-def test_a_gang_that_ends_while_no_controller_runs_is_judged_by_its_outcomes(server: Serving) -> None:
-    failing = server.gang("import time; time.sleep(2); raise ValueError('late')", name="late")
+def test_a_gang_that_ends_while_no_controller_runs_is_judged_by_its_outcomes(server: Serving, tmp_path: Path) -> None:
+    failing = server.gang(f"import time\n{until(tmp_path / 'gate')}\nraise ValueError('late')", name="late")
     server.wait(failing, "RUNNING")
     server.kill()
+    (tmp_path / "gate").touch()
     wait_for(lambda: not processes_of(server.home), what="the gang's end")
     server.start()
     detail = server.wait(failing)
@@ -156,8 +162,8 @@ def test_a_gang_that_ends_while_no_controller_runs_is_judged_by_its_outcomes(ser
 
 
 def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_server: Serving, tmp_path: Path) -> None:
-    script = "import pathlib, time\nfor i in range(3):\n  print('line', i)\n  while not pathlib.Path({!r}, str(i)).exists(): time.sleep(0.02)"
-    job = shared_server.gang(script.format(str(tmp_path)))
+    lines = "\n".join(f"print('line {i}')\n{until(tmp_path / str(i))}" for i in range(3))
+    job = shared_server.gang(f"import time\n{lines}")
     texts = []
     for line in shared_server.client.logs(job, follow=True):
         texts.append(line["text"])
