@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 from botocore.exceptions import ClientError
 from sqlalchemy import func, select, update
@@ -89,25 +89,21 @@ def test_the_database_ends_jobs_on_a_volume_without_a_free_byte(volume: Path) ->
         with database.session() as session:
             session.execute(update(JobQueue).values(priority=priority))
     with pytest.raises(DatabaseFull, match="its volume is full; make room there"), database.session() as session:
-        for number in range(200):
-            session.add(
-                JobQueue(name=f"q{number}", priority=1, compute_environments=["x" * 100_000], tags={}, limits=[])
-            )
+        large = {"priority": 1, "compute_environments": ["x" * 100_000], "tags": {}, "limits": []}
+        session.add_all(JobQueue(name=f"q{number}", **large) for number in range(200))
     with database.session() as session:
         assert session.scalar(select(func.count()).where(JobQueue.name.startswith("q"))) == 1
     database.close()
 
 
 def test_the_database_may_lie_on_another_volume_than_the_home(tmp_path: Path, volume: Path) -> None:
-    server = Serving(tmp_path / "home", "--cpus", "1", "--database", str(volume / "jobs.db"))
-    try:
+    with Serving(tmp_path / "home", "--cpus", "1", "--database", str(volume / "jobs.db")) as server:
         assert (volume / "jobs.db").exists() and not (tmp_path / "home" / "muster.db").exists()
         fill(volume)
-        time.sleep(1.5)  # a look at the volume
+        short = 'muster_volume_short{volume="database"} 1.0'
+        wait_for(lambda: short in httpx.get(f"{server.url}/metrics").text, 20, "a look at the volume")
         with pytest.raises(ApiError, match=r"the volume of the database \(.*volume\) has 0 MB free"):
             server.gang("pass")
-    finally:
-        server.close()
 
 
 def test_a_minimum_is_a_size_a_share_or_nothing() -> None:

@@ -74,10 +74,8 @@ def test_a_heartbeat_of_a_controller_long_dead_is_cleared(tmp_path: Path, caplog
 def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: Path) -> None:
     store = Store(tmp_path / "store")
     options = ("--cpus", "4", "--store", str(store.path))
-    first = Serving(tmp_path / "a", *options)
-    second = Serving(tmp_path / "b", *options)
     end, free = {"END": str(tmp_path / "end")}, {"END": str(tmp_path / "free")}
-    try:
+    with Serving(tmp_path / "a", *options) as first, Serving(tmp_path / "b", *options) as second:
         earlier = second.gang(WAIT, env=free)
         waiting = after(second, earlier, {"MUSTER_RUN": "shared", **end})
         writer = first.gang(WAIT, env={"MUSTER_RUN": "shared", **end}, name="writer")
@@ -104,10 +102,6 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
             f"store {store.path}: can't prepare run damaged: {damaged.path}/EPOCH: expected a whole number of at most 15 "
             "digits, found '99999999999999999999999'"
         )
-    finally:
-        (tmp_path / "end").touch()
-        first.close()
-        second.close()
     assert second.process.stderr is not None
     told = second.process.stderr.read()
     assert f"the controller of {tmp_path}/a on " in told and "Traceback" not in told
