@@ -9,14 +9,17 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+from unittest.mock import patch as mock_patch
 
 import pytest
 
 from orchestrator.cli import main
 from orchestrator.client import Client
+from tests.support.definitions import container, multinode
 from tests.support.processes import end_all
 from tests.support.suite.caches import kernel_cache
 from tests.support.waiting import PATIENCE, wait_for
@@ -34,10 +37,35 @@ os.environ.setdefault("WARP_CACHE_PATH", str(kernel_cache()))
 os.environ.setdefault("MUSTER_PICTURE", "0")
 
 
+def call_muster(*arguments: str, home: Path, cwd: Path = REPOSITORY, **env: str) -> subprocess.CompletedProcess[str]:
+    """The command in this process, which is a second quicker than one of its own; nobody is there to answer a question."""
+    assert threading.current_thread() is threading.main_thread(), "it replaces what all threads share"
+    said, errors = io.StringIO(), io.StringIO()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        mock_patch.dict(os.environ, {"MUSTER_HOME": str(home), "COLUMNS": "200", **env}),
+        contextlib.redirect_stdout(said),
+        contextlib.redirect_stderr(errors),
+    ):
+        patch.setattr(sys, "argv", ["muster", *arguments])
+        patch.setattr(sys, "stdin", io.StringIO())
+        patch.chdir(cwd)
+        code: int | str | None = 0
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    return subprocess.CompletedProcess(arguments, int(code or 0), said.getvalue(), errors.getvalue())
+
+
 def run_muster(
     *arguments: str, home: Path, timeout: float = 120, cwd: Path = REPOSITORY, **env: str
 ) -> subprocess.CompletedProcess[str]:
-    """The real command in a subprocess."""
+    """The command as a process: where it brings a controller, starts a worker, or is asked from several threads."""
     return subprocess.run(
         [MUSTER, *arguments],
         env={**os.environ, "MUSTER_HOME": str(home), "COLUMNS": "200", **env},
@@ -46,26 +74,6 @@ def run_muster(
         text=True,
         timeout=timeout * PATIENCE,
     )
-
-
-def call_muster(*arguments: str, home: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    """The command in this process, where none has to be started for it: a second is saved each time."""
-    said, errors = io.StringIO(), io.StringIO()
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        contextlib.redirect_stdout(said),
-        contextlib.redirect_stderr(errors),
-    ):
-        for name, value in {"MUSTER_HOME": str(home), "COLUMNS": "200", **env}.items():
-            patch.setenv(name, value)
-        patch.setattr(sys, "argv", ["muster", *arguments])
-        patch.chdir(REPOSITORY)
-        try:
-            main()
-            code: int | str | None = 0
-        except SystemExit as ended:
-            code = ended.code
-    return subprocess.CompletedProcess(arguments, int(code or 0), said.getvalue(), errors.getvalue())
 
 
 @pytest.hookimpl(wrapper=True)
@@ -83,7 +91,7 @@ def _written_out(text: str) -> str:
 
 
 class Serving:
-    """A ``muster serve`` subprocess."""
+    """A ``muster serve`` subprocess. ``with`` closes it."""
 
     def __init__(self, home: Path, *options: str) -> None:
         self.home, self.options = home, options
@@ -108,7 +116,10 @@ class Serving:
         self.process.kill()
         self.process.wait()
 
-    def muster(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    def muster(self, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
+        return call_muster(*arguments, home=self.home, **env)
+
+    def muster_process(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
         return run_muster(*arguments, home=self.home, timeout=timeout)
 
     def gang(self, script: str, nodes: int = 1, name: str = "test", **container: Any) -> str:
@@ -141,6 +152,12 @@ class Serving:
         self.client.close()
         end_all(self.home)
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
 
 MAIN_LAST = """
 import os, pathlib, time
@@ -165,16 +182,8 @@ def submit_gang(
     queue: str = "default",
 ) -> str:
     """Register and submit a Python script as a multi-node job; returns the job id."""
-    container = {
-        "image": "muster",
-        "command": ["python", "-u", "-c", script],
-        "environment": [{"name": key, "value": value} for key, value in (env or {}).items()],
-        "resourceRequirements": [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "16"}],
-    }
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": ranges}
-    definition: dict[str, Any] = {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
-    definition["retryStrategy"] = {"attempts": attempts}
+    needs = container(["python", "-u", "-c", script], cpus, env)
+    definition = multinode(name, needs, nodes, retryStrategy={"attempts": attempts})
     if timeout:
         definition["timeout"] = {"attemptDurationSeconds": timeout}
     registered = client.batch("RegisterJobDefinition", **definition)
@@ -193,14 +202,12 @@ def nothing_is_frozen() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     """One server for the tests that neither kill it nor fill it."""
-    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "8")
-    yield server
-    server.close()
+    with Serving(tmp_path_factory.mktemp("home"), "--cpus", "8") as server:
+        yield server
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Serving]:
     """A server of the test's own."""
-    server = Serving(tmp_path / "home", "--cpus", "4")
-    yield server
-    server.close()
+    with Serving(tmp_path / "home", "--cpus", "4") as server:
+        yield server

@@ -26,9 +26,7 @@ def row(person: Person, job: str) -> Locator:
     return person.page.locator(f'tr[data-key="{job}"]')
 
 
-def test_two_people_see_each_others_changes_and_a_reader_has_no_buttons(
-    console: Console, people: People, waiting: str
-) -> None:
+def test_two_people_see_changes_and_a_reader_has_no_buttons(console: Console, people: People, waiting: str) -> None:
     one, other = people(console.url, console.secrets["admin"]), people(console.url, console.secrets["reader"])
     for each in (one, other):
         each.goto("/")
@@ -80,7 +78,7 @@ def test_a_job_is_submitted_by_the_wizard_without_a_mouse(console: Console, peop
     console.client.batch("TerminateJob", jobId=page.url.rpartition("/")[2], reason="seen")
 
 
-def test_an_open_page_leads_to_the_login_when_its_key_is_deleted_and_back_with_another(
+def test_an_open_page_leads_to_the_login_when_its_key_is_deleted(
     console: Console, people: People, waiting: str
 ) -> None:
     person = people(console.url, secret_of(console.keys.create("passing")))

@@ -24,9 +24,8 @@ SMALL = {
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     """A server without keys: its own user needs no login."""
-    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "4")
-    yield server
-    server.close()
+    with Serving(tmp_path_factory.mktemp("home"), "--cpus", "4") as server:
+        yield server
 
 
 def newest(person: Person) -> int:
@@ -101,6 +100,8 @@ def saves_and_stops(person: Person) -> None:
     person.confirm()
     expect(state_of(person)).to_have_text("FAILED")
     expect(person.page.locator(".headline .why")).to_contain_text("stopped in the console by")
+    expect(person.page.get_by_role("log").locator(".line").last).to_contain_text("node 0 ended")
+    expect(person.page.locator("[data-attempts] .span").first).to_have_attribute("data-state", "stopped")
 
 
 def resumes(person: Person) -> str:

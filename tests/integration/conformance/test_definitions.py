@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +11,6 @@ import pytest
 
 from tests.conftest import Serving
 from tests.support.conformance.aws import PREFIX, Batch, aws, container, pairs, refused
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
-
-
-@pytest.fixture(scope="module")
-def parked(batch: Batch) -> Iterator[str]:
-    """A queue whose jobs never start: what was submitted can be looked at for as long as it takes."""
-    yield batch.queue("def-parked", batch.compute_environment("def-parked", state="DISABLED"))
-    batch.remove(["def-parked"], ["def-parked"])
 
 
 def node_range(target: str, **changes: Any) -> dict[str, Any]:
@@ -50,12 +37,8 @@ def test_every_registration_is_a_revision_and_the_latest_active_one_counts(batch
         return str(batch.describe(batch.submit(reference, "def-revised", parked))["jobDefinition"])
 
     bare = f"{PREFIX}job-definition/def-revised"
-    assert [used(each) for each in ("def-revised", bare, "def-revised:1", f"{bare}:1")] == [
-        f"{bare}:2",
-        f"{bare}:2",
-        f"{bare}:1",
-        f"{bare}:1",
-    ]
+    found = [used(each) for each in ("def-revised", bare, "def-revised:1", f"{bare}:1")]
+    assert found == [f"{bare}:{revision}" for revision in (2, 2, 1, 1)]
     batch.api.deregister_job_definition(jobDefinition="def-revised:2")
     assert used("def-revised") == f"{bare}:1"
     for gone in ("def-revised:2", f"{bare}:2"):
@@ -136,6 +119,14 @@ def test_the_inner_of_nested_ranges_is_what_a_node_runs(batch: Batch, parked: st
     assert roles == ["outer", "inner", "inner", "outer"]
 
 
+def exits(**condition: str) -> dict[str, Any]:
+    return {"retryStrategy": {"attempts": 2, "evaluateOnExit": [{"action": "EXIT", **condition}]}}
+
+
+def of_one(**container: Any) -> dict[str, Any]:
+    return {"nodeProperties": properties(1, node_range("0", container=container))}
+
+
 # -- refusals ---------------------------------------------------------------------------------------------------------
 
 RETRIES = [{"onExitCode": str(code), "action": "RETRY"} for code in range(6)]
@@ -151,6 +142,7 @@ RETRIES = [{"onExitCode": str(code), "action": "RETRY"} for code in range(6)]
         ({"nodeProperties": properties(6, *(node_range(str(i)) for i in range(6)))}, "6 node ranges"),
         ({"nodeProperties": properties(2, node_range("0:2"))}, "targetNodes 0:2: the nodes are 0 to 1"),
         ({"nodeProperties": properties(2, node_range("0-1"))}, "expected n, a:b, a: or :b"),
+        ({"nodeProperties": properties(2)}, "0 node ranges"),
         ({"nodeProperties": properties(1001, node_range("0:"))}, "1 to 1000"),
         ({"nodeProperties": properties(0, node_range("0:"))}, "numNodes is 0"),
         ({"timeout": {"attemptDurationSeconds": 59}}, "must be at least 60"),
@@ -158,45 +150,15 @@ RETRIES = [{"onExitCode": str(code), "action": "RETRY"} for code in range(6)]
         ({"retryStrategy": {"attempts": 11}}, "must be 1 to 10"),
         ({"retryStrategy": {"attempts": 2, "evaluateOnExit": RETRIES}}, "6 entries; at most 5"),
         ({"retryStrategy": {"evaluateOnExit": RETRIES[:1]}}, "needs attempts"),
-        (
-            {"retryStrategy": {"attempts": 2, "evaluateOnExit": [{"onReason": "a*b", "action": "EXIT"}]}},
-            "* at the end only",
-        ),
-        (
-            {"retryStrategy": {"attempts": 2, "evaluateOnExit": [{"onExitCode": "one", "action": "EXIT"}]}},
-            "onExitCode 'one'",
-        ),
-        (
-            {"retryStrategy": {"attempts": 2, "evaluateOnExit": [{"onExitCode": "1", "action": "STOP"}]}},
-            "RETRY or EXIT",
-        ),
+        (exits(onReason="a*b"), "* at the end only"),
+        (exits(onExitCode="one"), "onExitCode 'one'"),
+        (exits(onExitCode="1", action="STOP"), "RETRY or EXIT"),
         ({"schedulingPriority": 10000}, "must be 0 to 9999"),
         ({"nodeProperties": properties(1, node_range("0", env={"AWS_BATCH_X": "1"}))}, "AWS_BATCH are reserved"),
         ({"nodeProperties": properties(1, node_range("0", cpus="0"))}, "VCPU is '0'"),
-        (
-            {
-                "nodeProperties": properties(
-                    1, node_range("0", container={"resourceRequirements": [{"type": "MEMORY", "value": "3"}]})
-                )
-            },
-            "MEMORY is '3'",
-        ),
-        (
-            {
-                "nodeProperties": properties(
-                    1, node_range("0", container={"resourceRequirements": [{"type": "VCPU", "value": "1"}] * 2})
-                )
-            },
-            "VCPU twice",
-        ),
-        (
-            {
-                "nodeProperties": properties(
-                    1, node_range("0", container={"mountPoints": [{"sourceVolume": "x", "containerPath": "/x"}]})
-                )
-            },
-            "volume 'x'",
-        ),
+        (of_one(resourceRequirements=[{"type": "MEMORY", "value": "3"}]), "MEMORY is '3'"),
+        (of_one(resourceRequirements=[{"type": "VCPU", "value": "1"}] * 2), "VCPU twice"),
+        (of_one(mountPoints=[{"sourceVolume": "x", "containerPath": "/x"}]), "volume 'x'"),
         ({"containerProperties": container("true", {})}, "type multinode needs nodeProperties, and only that"),
         ({"type": "container"}, "type container needs containerProperties or ecsProperties, and only that"),
         ({"tags": {f"key-{i}": "" for i in range(51)}}, "at most 50"),
@@ -212,6 +174,11 @@ def test_bad_definitions_are_refused(batch: Batch, change: dict[str, Any], messa
     assert not batch.api.describe_job_definitions(jobDefinitionName="def-bad")["jobDefinitions"]
 
 
+FAIR_ALONE = "Job with shareIdentifier or schedulingPriority can onlybe submitted to job queue with fair share scheduling policy."
+MATCH = "NodeOverride targets should match job definition. "
+UNKNOWN = "Unable to substitute value. No parameter found for reference"
+
+
 def node_override(target: str, **overrides: Any) -> dict[str, Any]:
     return {"nodePropertyOverrides": [{"targetNodes": target, "containerOverrides": overrides}]}
 
@@ -219,31 +186,17 @@ def node_override(target: str, **overrides: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"nodeOverrides": node_override("0:0")},
-            "NodeOverride targets should match job definition. Non matching targets - 0:0",
-        ),
+        ({"nodeOverrides": node_override("0:0")}, f"{MATCH}Non matching targets - 0:0"),
         ({"nodeOverrides": {"numNodes": 3}}, "open end"),
         ({"jobDefinition": "def-open", "nodeOverrides": {"numNodes": 1}}, "mainNode is 1"),
         ({"jobDefinition": "def-open", "nodeOverrides": {"numNodes": 1001}}, "1 to 1000"),
         ({"jobDefinition": "def-high", "nodeOverrides": {"numNodes": 2}}, "begins behind the last node"),
         ({"nodeOverrides": node_override("0:1", environment=pairs({"AWS_BATCH_JOB_ID": "1"}))}, "are reserved"),
         ({"nodeOverrides": node_override("0:1", environment=pairs({"AWS_BATCHX": "1"}))}, "are reserved"),
-        ({"jobDefinition": "def-refers"}, "Unable to substitute value. No parameter found for reference task"),
-        (
-            {"nodeOverrides": node_override("0:1", command=["Ref::unknown"]), "parameters": {"task": "Ant"}},
-            "Unable to substitute value. No parameter found for reference unknown",
-        ),
-        (
-            {"shareIdentifier": "A"},
-            "Job with shareIdentifier or schedulingPriority can onlybe submitted to job queue with fair share "
-            "scheduling policy.",
-        ),
-        (
-            {"schedulingPriorityOverride": 1},
-            "Job with shareIdentifier or schedulingPriority can onlybe submitted to job queue with fair share "
-            "scheduling policy.",
-        ),
+        ({"jobDefinition": "def-refers"}, f"{UNKNOWN} task"),
+        ({"nodeOverrides": node_override("0:1", command=["Ref::no"]), "parameters": {"task": "Ant"}}, f"{UNKNOWN} no"),
+        ({"shareIdentifier": "A"}, FAIR_ALONE),
+        ({"schedulingPriorityOverride": 1}, FAIR_ALONE),
         ({"timeout": {"attemptDurationSeconds": 59}}, "must be at least 60"),
         ({"retryStrategy": {"attempts": 0}}, "must be 1 to 10"),
         ({"retryStrategy": {"attempts": 11}}, "must be 1 to 10"),
@@ -322,13 +275,9 @@ def test_the_aws_command_registers_describes_and_reads_errors(batch: Batch, park
     [entry] = shown["jobDefinitions"][0]["nodeProperties"]["nodeRangeProperties"]
     given = request["nodeProperties"]["nodeRangeProperties"][0]["container"]  # type: ignore[index]
     assert {key: entry["container"][key] for key in given} == given
-    said = aws(
-        *(url, "batch", "submit-job", "--job-name", "def-typed", "--job-queue", parked),
-        *("--job-definition", "def-typed:2"),
-        fails=True,
-    )
+    submit = ("submit-job", "--job-name", "def-typed", "--job-queue", parked, "--job-definition", "def-typed:2")
+    said = aws(url, "batch", *submit, fails=True)
     assert "(ClientException) when calling the SubmitJob operation: Job definition def-typed:2 does not exist" in said
     aws(url, "batch", "deregister-job-definition", "--job-definition", registered["jobDefinitionArn"])
-    assert (
-        batch.api.describe_job_definitions(jobDefinitionName="def-typed")["jobDefinitions"][0]["status"] == "INACTIVE"
-    )
+    [found] = batch.api.describe_job_definitions(jobDefinitionName="def-typed")["jobDefinitions"]
+    assert found["status"] == "INACTIVE"

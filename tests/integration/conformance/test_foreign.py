@@ -33,9 +33,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     folder = tmp_path_factory.mktemp("foreign")
     (folder / "secrets.json").touch(0o600)
     (folder / "secrets.json").write_text(json.dumps({"db": SECRET}))
-    serving = Serving(folder / "home", "--cpus", "8", "--secrets", str(folder / "secrets.json"))
-    yield serving
-    serving.close()
+    with Serving(folder / "home", "--cpus", "8", "--secrets", str(folder / "secrets.json")) as serving:
+        yield serving
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +62,7 @@ def batch(server: Serving) -> Batch:
         ("route53", lambda route53: route53.list_hosted_zones(), "InvalidAction"),
     ],
 )
-def test_an_unsupported_service_is_refused_in_its_own_protocol(
+def test_another_service_is_refused_as_it_would_say(
     server: Serving, service: str, call: Callable[[Any], Any], code: str
 ) -> None:
     with pytest.raises(ClientError) as caught:
@@ -203,13 +202,7 @@ def test_secrets_reach_the_job_and_nothing_else(batch: Batch) -> None:
 
 
 def test_ecs_properties_of_one_container_run_and_are_shown_as_they_came(batch: Batch) -> None:
-    only = {
-        "name": "main",
-        "image": "any",
-        "command": ["sh", "-c", "echo $A $B"],
-        "environment": [{"name": "A", "value": "1"}],
-        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
-    }
+    only = {**container("echo $A $B", {"env": {"A": "1"}}), "name": "main"}
     ecs: dict[str, Any] = {"taskProperties": [{"containers": [only], "taskRoleArn": "arn:aws:iam::1:role/any"}]}
     change = {"name": "main", "environment": [{"name": "B", "value": "2"}]}
     override = {"taskProperties": [{"containers": [change]}]}
@@ -221,11 +214,11 @@ def test_ecs_properties_of_one_container_run_and_are_shown_as_they_came(batch: B
     job = batch.submit(single, ecsPropertiesOverride=override)
     detail = batch.wait(job)
     [task] = detail["ecsProperties"]["taskProperties"]
-    [container] = task["containers"]
+    [shown] = task["containers"]
     assert re.fullmatch(r"arn:aws:ecs:us-east-1:000000000000:task/AWSBatch-local/[0-9a-f]{32}", task["taskArn"])
     assert detail["container"] == {} and task["taskRoleArn"] == "arn:aws:iam::1:role/any"
-    assert (container["name"], container["exitCode"]) == ("main", 0)
-    assert batch.stream(container["logStreamName"]) == ["1 2"]
+    assert (shown["name"], shown["exitCode"]) == ("main", 0)
+    assert batch.stream(shown["logStreamName"]) == ["1 2"]
     [attempt] = detail["attempts"]
     assert attempt["taskProperties"][0]["containers"][0]["exitCode"] == 0 and attempt["container"] == {}
     ranges = [{"targetNodes": "0:", "ecsProperties": ecs}]
@@ -256,9 +249,7 @@ def test_ecs_properties_of_one_container_run_and_are_shown_as_they_came(batch: B
         ("MEMORY", "Memory is not provided."),
     ],
 )
-def test_a_definition_without_image_or_resources_is_refused_when_it_is_registered(
-    batch: Batch, lacking: str, message: str
-) -> None:
+def test_a_definition_without_image_or_resources_is_refused_at_once(batch: Batch, lacking: str, message: str) -> None:
     given = container("true", {})
     given.pop(lacking, None)
     given["resourceRequirements"] = [each for each in given["resourceRequirements"] if each["type"] != lacking]

@@ -202,9 +202,8 @@ def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed
             return [each for page in client.get_paginator(operation).paginate(**request) for each in page[member]]
 
         assert pages("describe_compute_environments", "computeEnvironments")
-        assert pages("describe_job_definitions", "jobDefinitions") and pages(
-            "list_scheduling_policies", "schedulingPolicies"
-        )
+        assert pages("describe_job_definitions", "jobDefinitions")
+        assert pages("list_scheduling_policies", "schedulingPolicies")
         jobs = {status: 0 for status in statuses}
         for queue in pages("describe_job_queues", "jobQueues"):
             batch.get_job_queue_snapshot(jobQueue=queue["jobQueueName"])

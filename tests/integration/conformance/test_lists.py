@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import botocore.session
 import httpx
-import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import PREFIX, Batch, aws, refused
 
 HERE = {
@@ -23,18 +21,6 @@ HERE = {
     *("TagResource", "UntagResource", "ListTagsForResource"),
 }
 """What is carried out; the others are refused."""
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
-
-
-@pytest.fixture(scope="module")
-def parked(batch: Batch) -> Iterator[str]:
-    """A queue whose jobs never start."""
-    yield batch.queue("lists-parked", batch.compute_environment("lists-parked", state="DISABLED"))
-    batch.remove(["lists-parked"], ["lists-parked"])
 
 
 # -- lists and filters ------------------------------------------------------------------------------------------------
@@ -191,9 +177,8 @@ def test_every_other_operation_of_aws_is_refused_by_name_with_what_to_use(batch:
         answer = httpx.post(f"{batch.server.url}/v1/{name.lower()}", content=b"{}")
         assert answer.status_code == 400 and answer.headers["x-amzn-errortype"] == "ClientException", name
         message = answer.json()["message"]
-        assert message.startswith(f"{name} is not supported here; ") and (
-            "use " in message or "supported are " in message
-        )
+        assert message.startswith(f"{name} is not supported here; ")
+        assert "use " in message or "supported are " in message
     for part, instead in [
         ("SubmitServiceJob", "SubmitJob"),
         ("CreateServiceEnvironment", "CreateComputeEnvironment"),

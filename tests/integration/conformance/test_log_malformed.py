@@ -1,4 +1,4 @@
-"""Whatever is sent to ``POST /``: a refusal in CloudWatch Logs' shape, never an internal error."""
+"""Whatever is sent to ``POST /`` and to operations of Batch: a refusal in AWS's shape, never an internal error."""
 
 from __future__ import annotations
 
@@ -43,3 +43,13 @@ def test_a_request_without_a_known_target_is_refused(shared_server: Serving, tar
         shared_server.url, content=b"{}", headers={"X-Amz-Target": target} if target is not None else {}
     )
     assert answer.status_code == 400 and "supported are" in answer.json()["message"]
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"[]", b"{", b'"x"', b'{"jobs": 3}', b'{"jobs": [null]}', b"\xff\xfe", b"[" * 5000]
+)
+def test_no_malformed_request_of_batch_is_a_server_error(shared_server: Serving, body: bytes) -> None:
+    for operation in ("describejobs", "submitjob", "registerjobdefinition", "listjobs", "terminatejob", "nonsense"):
+        answer = httpx.post(f"{shared_server.url}/v1/{operation}", content=body)
+        assert answer.status_code == 400, answer.text
+        assert answer.headers["x-amzn-errortype"] == "ClientException" and "\n" not in answer.json()["message"]

@@ -10,6 +10,7 @@ from botocore.exceptions import ClientError
 
 from shared_store.logs import REPLACED, format_line
 from tests.conftest import MAIN_LAST, Serving
+from tests.support.conformance.aws import Batch
 from tests.support.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, messages, stream_of
 
 
@@ -33,9 +34,7 @@ def quiet(shared_server: Serving) -> str:
 # -- GetLogEvents -----------------------------------------------------------------------------------------------------
 
 
-def test_the_stream_that_describe_jobs_names_has_both_outputs_and_not_the_supervisors_end(
-    shared_server: Serving, logs: Any
-) -> None:
+def test_the_stream_of_a_job_has_both_outputs_and_not_the_supervisors_end(shared_server: Serving, logs: Any) -> None:
     job = finished(shared_server, "import sys; print('to out'); sys.stdout.flush(); print('to err', file=sys.stderr)")
     described = client_of(shared_server.url, "batch").describe_jobs(jobs=[f"{job}#0"])["jobs"][0]
     name = described["container"]["logStreamName"]
@@ -48,30 +47,18 @@ def test_the_stream_that_describe_jobs_names_has_both_outputs_and_not_the_superv
     assert described["createdAt"] <= times[0] <= described["stoppedAt"] + 1000
 
 
-def test_every_child_of_an_array_has_a_stream(shared_server: Serving, logs: Any) -> None:
-    batch = client_of(shared_server.url, "batch")
-    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
-    container = {
-        "image": "any",
-        "command": ["sh", "-c", "echo $AWS_BATCH_JOB_ARRAY_INDEX"],
-        "resourceRequirements": needs,
-    }
-    batch.register_job_definition(jobDefinitionName="array", type="container", containerProperties=container)
-    job = batch.submit_job(jobName="arr", jobQueue="default", jobDefinition="array", arrayProperties={"size": 2})[
-        "jobId"
-    ]
+def test_every_child_of_an_array_has_a_stream(shared_server: Serving, logs: Any, batch: Batch) -> None:
+    definition = batch.single("array", "echo $AWS_BATCH_JOB_ARRAY_INDEX")
+    job = batch.submit(definition, "arr", arrayProperties={"size": 2})
     for child in (0, 1):
         shared_server.wait(f"{job}:{child}")
-        described = batch.describe_jobs(jobs=[f"{job}:{child}"])["jobs"][0]
-        name = described["container"]["logStreamName"]
+        name = batch.describe(f"{job}:{child}")["container"]["logStreamName"]
         assert str(child) in messages(logs.get_log_events(logGroupName=GROUP, logStreamName=name))
     listed = logs.describe_log_streams(logGroupName=GROUP, logStreamNamePrefix=f"arr/{job}")["logStreams"]
     assert len(listed) == 2 and listed[-1]["logStreamName"] == name
 
 
-def test_at_the_end_the_same_token_comes_back_and_goes_on_when_lines_arrive(
-    shared_server: Serving, logs: Any, quiet: str
-) -> None:
+def test_at_the_end_the_same_token_comes_back_until_lines_arrive(shared_server: Serving, logs: Any, quiet: str) -> None:
     query = {"logGroupName": GROUP, "logStreamName": stream_of(shared_server, quiet)}
     first = logs.get_log_events(**query)
     assert messages(first) == ["quiet"]
@@ -100,9 +87,7 @@ def test_a_line_that_is_still_being_written_is_not_given_out(shared_server: Serv
 
 
 @pytest.mark.parametrize("forward", [True, False])
-def test_pages_in_either_direction_give_every_line_once(
-    shared_server: Serving, logs: Any, counted: str, forward: bool
-) -> None:
+def test_pages_either_way_give_every_line_once(shared_server: Serving, logs: Any, counted: str, forward: bool) -> None:
     query = {"logGroupName": GROUP, "logStreamName": stream_of(shared_server, counted), "limit": 700}
     key = "nextForwardToken" if forward else "nextBackwardToken"
     page = logs.get_log_events(**query, startFromHead=forward)
@@ -143,7 +128,7 @@ def test_a_time_range_has_its_start_and_not_its_end(shared_server: Serving, logs
     assert messages(logs.filter_log_events(**query, logStreamNames=[name])) == ["second 1", "second 2", "second 3"]
 
 
-def test_times_never_fall_when_a_clock_steps_back_and_nothing_is_lost(
+def test_times_never_fall_when_a_clock_steps_back_nothing_is_lost(
     shared_server: Serving, logs: Any, quiet: str
 ) -> None:
     high = int(time.time()) - 100
@@ -165,9 +150,7 @@ def test_a_malformed_token_is_an_invalid_parameter(shared_server: Serving, logs:
         logs.get_log_events(logGroupName=GROUP, logStreamName=stream_of(shared_server, counted), nextToken=token)
 
 
-def test_a_token_inside_a_line_continues_at_the_next_and_one_beyond_the_end_at_the_first(
-    shared_server: Serving, logs: Any, counted: str
-) -> None:
+def test_a_token_inside_a_line_or_beyond_the_end_is_understood(shared_server: Serving, logs: Any, counted: str) -> None:
     name = stream_of(shared_server, counted)
     page = logs.get_log_events(logGroupName=GROUP, logStreamName=name, nextToken="f/5", limit=1)
     assert messages(page) == ["line 0001"]
@@ -257,7 +240,7 @@ def test_bad_patterns_are_invalid_parameters_that_say_why(logs: Any, pattern: st
 # -- rules and refusals -----------------------------------------------------------------------------------------------
 
 
-def test_names_and_prefix_and_the_two_ways_to_name_the_group_exclude_each_other(
+def test_names_and_prefix_and_two_names_of_the_group_exclude_each_other(
     shared_server: Serving, logs: Any, counted: str
 ) -> None:
     name, refused = stream_of(shared_server, counted), logs.exceptions.InvalidParameterException
@@ -327,9 +310,8 @@ def test_streams_are_listed_by_name_page_by_page(shared_server: Serving, logs: A
     streams = [stream for page in pages for stream in page["logStreams"]]
     assert [stream["logStreamName"] for stream in streams] == [f"{prefix}/1/node-{node}" for node in range(3)]
     for stream in streams:
-        events = logs.get_log_events(logGroupName=GROUP, logStreamName=stream["logStreamName"], startFromHead=True)[
-            "events"
-        ]
+        name = stream["logStreamName"]
+        events = logs.get_log_events(logGroupName=GROUP, logStreamName=name, startFromHead=True)["events"]
         assert stream["firstEventTimestamp"] == events[0]["timestamp"]
         assert stream["lastEventTimestamp"] == stream["lastIngestionTime"] == events[-1]["timestamp"]
         assert stream["creationTime"] <= stream["firstEventTimestamp"]

@@ -8,17 +8,18 @@ from typing import Any
 import botocore.session
 import pytest
 
-from tests.conftest import REPOSITORY, Serving
+from tests.conftest import REPOSITORY
 from tests.support.conformance.aws import Batch, refused
+from tests.support.definitions import container
 
-CONTAINER: dict[str, Any] = {
-    "image": "any",
-    "command": ["true"],
-    "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "16"}],
-}
+CONTAINER = container(cpus="1")
 LOG = {"logDriver": "awslogs"}
 CONSUMABLE = {"consumableResourceList": [{"consumableResource": "licence", "quantity": 1}]}
 SECRET = [{"name": "A", "valueFrom": "b"}]
+LIMITED = "consumableResourceProperties"
+EKS = {"podProperties": {"containers": [{"image": "any"}]}}
+S3 = {"volumes": [{"name": "v", "s3filesVolumeConfiguration": {"fileSystemArn": "any"}}]}
+FARGATE = {"fargatePlatformConfiguration": {"platformVersion": "LATEST"}}
 
 SAME = {
     "nodeProperties.nodeRangeProperties.container": "container",
@@ -63,18 +64,14 @@ WITHOUT_EFFECT = {
 
 REFUSED: dict[str, dict[str, Any]] = {
     "container.networkConfiguration": {"container": {"networkConfiguration": {"assignPublicIp": "ENABLED"}}},
-    "container.fargatePlatformConfiguration": {
-        "container": {"fargatePlatformConfiguration": {"platformVersion": "LATEST"}}
-    },
+    "container.fargatePlatformConfiguration": {"container": FARGATE},
     "container.enableExecuteCommand": {"container": {"enableExecuteCommand": True}},
     "container.ephemeralStorage": {"container": {"ephemeralStorage": {"sizeInGiB": 30}}},
     "container.runtimePlatform": {"container": {"runtimePlatform": {"cpuArchitecture": "ARM64"}}},
     "container.repositoryCredentials": {"container": {"repositoryCredentials": {"credentialsParameter": "any"}}},
     "container.logConfiguration.logDriver": {"container": {"logConfiguration": {"logDriver": "syslog"}}},
     "container.logConfiguration.secretOptions": {"container": {"logConfiguration": {**LOG, "secretOptions": SECRET}}},
-    "container.volumes.s3filesVolumeConfiguration": {
-        "container": {"volumes": [{"name": "v", "s3filesVolumeConfiguration": {"fileSystemArn": "any"}}]}
-    },
+    "container.volumes.s3filesVolumeConfiguration": {"container": S3},
     "task.containers.dependsOn": {"only": {"dependsOn": [{"containerName": "b", "condition": "START"}]}},
     "task.containers.firelensConfiguration": {"only": {"firelensConfiguration": {"type": "fluentd"}}},
     "task.containers.startTimeout": {"only": {"startTimeout": 2}},
@@ -82,9 +79,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "task.containers.repositoryCredentials": {"only": {"repositoryCredentials": {"credentialsParameter": "any"}}},
     "task.containers.logConfiguration.logDriver": {"only": {"logConfiguration": {"logDriver": "splunk"}}},
     "task.containers.logConfiguration.secretOptions": {"only": {"logConfiguration": {**LOG, "secretOptions": SECRET}}},
-    "task.volumes.s3filesVolumeConfiguration": {
-        "task": {"volumes": [{"name": "v", "s3filesVolumeConfiguration": {"fileSystemArn": "any"}}]}
-    },
+    "task.volumes.s3filesVolumeConfiguration": {"task": S3},
     "task.ephemeralStorage": {"task": {"ephemeralStorage": {"sizeInGiB": 30}}},
     "task.platformVersion": {"task": {"platformVersion": "LATEST"}},
     "task.ipcMode": {"task": {"ipcMode": "host"}},
@@ -94,29 +89,16 @@ REFUSED: dict[str, dict[str, Any]] = {
     "task.runtimePlatform": {"task": {"runtimePlatform": {"cpuArchitecture": "ARM64"}}},
     "task.enableExecuteCommand": {"task": {"enableExecuteCommand": True}},
     "platformCapabilities": {"definition": {"platformCapabilities": ["FARGATE"]}},
-    "eksProperties": {"definition": {"eksProperties": {"podProperties": {"containers": [{"image": "any"}]}}}},
-    "consumableResourceProperties": {"definition": {"consumableResourceProperties": CONSUMABLE}},
-    "nodeProperties.nodeRangeProperties.eksProperties": {
-        "range": {"eksProperties": {"podProperties": {"containers": [{"image": "any"}]}}}
-    },
-    "nodeProperties.nodeRangeProperties.consumableResourceProperties": {
-        "range": {"consumableResourceProperties": CONSUMABLE}
-    },
-    "eksPropertiesOverride": {"job": {"eksPropertiesOverride": {"podProperties": {"containers": [{"image": "a"}]}}}},
-    "consumableResourcePropertiesOverride": {"job": {"consumableResourcePropertiesOverride": CONSUMABLE}},
-    "nodeOverrides.nodePropertyOverrides.eksPropertiesOverride": {
-        "override": {"eksPropertiesOverride": {"podProperties": {"containers": [{"image": "a"}]}}}
-    },
-    "nodeOverrides.nodePropertyOverrides.consumableResourcePropertiesOverride": {
-        "override": {"consumableResourcePropertiesOverride": CONSUMABLE}
-    },
+    "eksProperties": {"definition": {"eksProperties": EKS}},
+    LIMITED: {"definition": {LIMITED: CONSUMABLE}},
+    "nodeProperties.nodeRangeProperties.eksProperties": {"range": {"eksProperties": EKS}},
+    f"nodeProperties.nodeRangeProperties.{LIMITED}": {"range": {LIMITED: CONSUMABLE}},
+    "eksPropertiesOverride": {"job": {"eksPropertiesOverride": EKS}},
+    f"{LIMITED}Override": {"job": {f"{LIMITED}Override": CONSUMABLE}},
+    "nodeOverrides.nodePropertyOverrides.eksPropertiesOverride": {"override": {"eksPropertiesOverride": EKS}},
+    f"nodeOverrides.nodePropertyOverrides.{LIMITED}Override": {"override": {f"{LIMITED}Override": CONSUMABLE}},
 }
 """A request for each: what it adds to a definition or a submission that is fine."""
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
 
 
 def members(shape: Any, above: str = "") -> Iterator[str]:

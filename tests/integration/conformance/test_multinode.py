@@ -9,18 +9,13 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import EXITED, UNTIL, Batch, aws, gate, pairs, refused
 from tests.support.processes import processes_of_job
 
 NODE = "$AWS_BATCH_JOB_NODE_INDEX"
 ADDRESS = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
 STAY = "while :; do sleep 0.05; done"
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
 
 
 @pytest.fixture
@@ -239,9 +234,7 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
 
 
 @pytest.mark.parametrize("code", [1, 75])
-def test_without_attempts_left_any_exit_code_of_the_main_node_is_a_failure(
-    batch: Batch, code: int, tmp_path: Path
-) -> None:
+def test_without_attempts_left_any_code_of_the_main_node_is_a_failure(batch: Batch, code: int, tmp_path: Path) -> None:
     """75 means "requeue me" in our own jobs only (there after 10 s at the soonest, and this one is older)."""
     script = f"{UNTIL.format('go')}; exit {code}"
     job = batch.submit(batch.multinode(f"mnp-exits-{code}", script, 1, env={"GATE": str(tmp_path)}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,18 +11,6 @@ from tests.conftest import Serving, wait_for
 from tests.support.conformance.aws import NO_ROOM, PREFIX, Batch, refused
 
 INVALID = "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
-
-
-@pytest.fixture(scope="module")
-def parked(batch: Batch) -> Iterator[str]:
-    """A queue whose jobs never start."""
-    yield batch.queue("q-parked", batch.compute_environment("q-parked", state="DISABLED"))
-    batch.remove(["q-parked"], ["q-parked"])
 
 
 # -- compute environments, queues, policies ---------------------------------------------------------------------------
@@ -127,9 +114,9 @@ def test_a_queue_from_its_creation_to_its_end(batch: Batch, parked: str) -> None
         ({"computeEnvironmentOrder": []}, "name 1 to 3 compute environments"),
         ({"computeEnvironmentOrder": [{"order": 1, "computeEnvironment": "q-none"}]}, "q-none does not exist"),
         ({"computeEnvironmentOrder": [{"order": i, "computeEnvironment": f"q-{i}"} for i in range(4)]}, "at most 3"),
-        ({"computeEnvironmentOrder": [{"order": i, "computeEnvironment": "q-parked"} for i in range(2)]}, "once"),
+        ({"computeEnvironmentOrder": [{"order": i, "computeEnvironment": "queues-parked"} for i in range(2)]}, "once"),
         ({"schedulingPolicyArn": f"{PREFIX}scheduling-policy/q-none"}, "q-none does not exist"),
-        ({"jobQueueName": "q-parked"}, "q-parked exists already"),
+        ({"jobQueueName": "queues-parked"}, "queues-parked exists already"),
         ({"limit": {"maxTimeSeconds": 599}}, "maxTimeSeconds is 599; it must be 600 to 86400"),
         ({"limit": {"maxTimeSeconds": 86401}}, "maxTimeSeconds is 86401; it must be 600 to 86400"),
         ({"limit": {"reason": "CAPACITY:OTHER"}}, "CAPACITY:OTHER"),

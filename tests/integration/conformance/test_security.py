@@ -20,16 +20,14 @@ from botocore.httpsession import URLLib3Session
 
 from orchestrator.client import Client
 from orchestrator.keys import Key, KeyStore
-from tests.conftest import Serving, run_muster, wait_for
+from tests.conftest import Serving, call_muster, wait_for
 from tests.support.conformance.keys import client, refused
+from tests.support.definitions import container, multinode
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job/6c4a7d0e-0000-4000-8000-000000000000"
 SIGNATURE_ERRORS = {
-    "UnrecognizedClientException",
-    "InvalidSignatureException",
-    "IncompleteSignature",
-    "MissingAuthenticationToken",
-    "RequestExpired",
+    *("UnrecognizedClientException", "InvalidSignatureException", "IncompleteSignature"),
+    *("MissingAuthenticationToken", "RequestExpired"),
 }
 
 
@@ -46,10 +44,9 @@ def key(home: Path) -> Key:
 
 @pytest.fixture(scope="module")
 def served(home: Path, key: Key) -> Iterator[Serving]:
-    server = Serving(home, "--cpus", "2")
-    server.client = Client(server.url, f"{key.access_key_id}:{key.secret}")
-    yield server
-    server.close()
+    with Serving(home, "--cpus", "2") as server:
+        server.client = Client(server.url, f"{key.access_key_id}:{key.secret}")
+        yield server
 
 
 def signed(key: Key, method: str, url: str, body: bytes = b"", service: str = "batch", **headers: str) -> AWSRequest:
@@ -72,15 +69,7 @@ def code(error: pytest.ExceptionInfo[ClientError]) -> tuple[str, int]:
 
 
 def definition(name: str, size: int = 0) -> dict[str, Any]:
-    container = {
-        "image": "any",
-        "command": ["true"],
-        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
-        "environment": [{"name": "FILLING", "value": "x" * size}],
-    }
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
-    return {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
+    return multinode(name, container(env={"FILLING": "x" * size}))
 
 
 def test_boto3_with_a_right_key_works(served: Serving, key: Key) -> None:
@@ -118,13 +107,10 @@ def test_no_signature_is_refused_everywhere_but_at_the_health_check(served: Serv
 
 def test_a_websocket_needs_the_same_authentication(served: Serving) -> None:
     address = urlsplit(served.url)
-    upgrade = (
-        b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: " + b"A" * 22
-    )
+    head = f"GET /live HTTP/1.1\r\nHost: {address.netloc}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    key = f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {'A' * 22}==\r\n\r\n"
     with socket.create_connection((address.hostname, address.port), timeout=30) as connection:
-        connection.sendall(
-            b"GET /live HTTP/1.1\r\nHost: " + address.netloc.encode() + b"\r\n" + upgrade + b"==\r\n\r\n"
-        )
+        connection.sendall((head + key).encode())
         assert connection.recv(65536).splitlines()[0].startswith(b"HTTP/1.1 403 ")
 
 
@@ -183,7 +169,7 @@ def test_a_body_that_is_not_signed_is_refused(served: Serving, key: Key, digest:
 
 
 @pytest.mark.parametrize("minutes", [-16, 16, -14, 14])
-def test_a_signature_holds_for_fifteen_minutes(
+def test_a_signature_holds_for_15_minutes(
     served: Serving, key: Key, monkeypatch: pytest.MonkeyPatch, minutes: int
 ) -> None:
     then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=minutes)
@@ -199,8 +185,8 @@ def test_the_bearer_form_of_a_key_and_the_command_work(served: Serving, key: Key
     assert served.client.batch("DescribeJobs", jobs=["x"]) == {"jobs": []}
     assert served.client.get("/api/capacity")["hosts"]
     right = f"{key.access_key_id}:{key.secret}"
-    assert run_muster("list", home=home, MUSTER_TOKEN=right).returncode == 0
-    without = run_muster("list", home=home)
+    assert call_muster("list", home=home, MUSTER_TOKEN=right).returncode == 0
+    without = call_muster("list", home=home)
     assert without.returncode == 1 and without.stderr.startswith("muster: a token is needed"), without.stderr
     for wrong in (f"{right}x", right[:-1], key.secret, f"{key.access_key_id}:", ":", key.access_key_id):
         answer = httpx.get(f"{served.url}/api/runs", headers={"Authorization": f"Bearer {wrong}"})
@@ -229,14 +215,14 @@ def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
 
 
 def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None:
-    done = run_muster("keys", "create", "passing", "--queue", "robots", "--queue", "default", home=home)
+    done = call_muster("keys", "create", "passing", "--queue", "robots", "--queue", "default", home=home)
     assert done.returncode == 0, done.stderr
     passing = next(each for each in KeyStore(home).load().values() if each.name == "passing")
     assert passing.queues == ("robots", "default")
     assert f"export MUSTER_TOKEN={passing.access_key_id}:{passing.secret}" in done.stdout
     batch = client(served.url, passing.access_key_id, passing.secret)
     batch.list_jobs(jobQueue="default")
-    assert run_muster("keys", "delete", "passing", home=home).returncode == 0
+    assert call_muster("keys", "delete", "passing", home=home).returncode == 0
     with pytest.raises(ClientError) as caught:
         batch.list_jobs(jobQueue="default")
     assert code(caught)[0] == "UnrecognizedClientException"
@@ -244,10 +230,7 @@ def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None
 
 def test_a_key_for_one_queue_changes_nothing_that_others_depend_on(served: Serving, home: Path, key: Key) -> None:
     robots = KeyStore(home).create("robots", ("robots",))
-    own, all_of = (
-        client(served.url, robots.access_key_id, robots.secret),
-        client(served.url, key.access_key_id, key.secret),
-    )
+    own, all_of = (client(served.url, each.access_key_id, each.secret) for each in (robots, key))
     prefix = "arn:aws:batch:us-east-1:000000000000:"
     fair = {"shareDecaySeconds": 60}
     policy = all_of.create_scheduling_policy(name="fair", fairsharePolicy=fair)["arn"]
@@ -295,7 +278,7 @@ def test_no_host_that_a_web_page_can_name_reaches_an_open_server(shared_server: 
     ],
 )
 @pytest.mark.parametrize("date", [b"20269999T999999Z", b"\xb2\xb2", b"{now}"])
-def test_binary_garbage_in_headers_is_refused_in_one_line(
+def test_garbage_in_headers_is_refused_in_one_line(
     served: Serving, key: Key, authorization: bytes, date: bytes
 ) -> None:
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ").encode()
@@ -332,12 +315,8 @@ def test_requests_are_as_large_as_on_aws_and_no_larger(served: Serving, key: Key
     assert batch.describe_jobs(jobs=["x" * (100 << 10)])["jobs"] == []
     bearer = {"Authorization": f"Bearer {key.access_key_id}:{key.secret}"}
     chunks = (b" " * 65536 for _ in range(17))  # without a Content-Length
-    refused(
-        httpx.post(f"{served.url}/api/runs/x/resume", headers=bearer, content=chunks),
-        "ClientException",
-        f"more than {1 << 20} bytes",
-        413,
-    )
+    answer = httpx.post(f"{served.url}/api/runs/x/resume", headers=bearer, content=chunks)
+    refused(answer, "ClientException", f"more than {1 << 20} bytes", 413)
 
 
 def test_a_body_is_refused_by_its_declared_length_and_a_disconnecting_client_does_no_harm(served: Serving) -> None:
@@ -355,8 +334,7 @@ def test_a_body_is_refused_by_its_declared_length_and_a_disconnecting_client_doe
 
 def test_over_the_rate_boto3_is_throttled_and_gets_through_by_trying_again(tmp_path: Path) -> None:
     key, other = KeyStore(tmp_path).create("a"), KeyStore(tmp_path).create("b")
-    server = Serving(tmp_path, "--cpus", "1", "--rate-limit", "5")
-    try:
+    with Serving(tmp_path, "--cpus", "1", "--rate-limit", "5") as server:
         once = client(server.url, key.access_key_id, key.secret)
         with pytest.raises(ClientError, match="key a may send 5 requests per second") as caught:
             for _ in range(200):
@@ -378,5 +356,3 @@ def test_over_the_rate_boto3_is_throttled_and_gets_through_by_trying_again(tmp_p
             return httpx.get(f"{server.url}/api/runs", headers=headers).status_code
 
         wait_for(lambda: guess() == 429, 10, "limited guesses")
-    finally:
-        server.close()

@@ -7,13 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import NO_ROOM, PREFIX, UNTIL, Batch, aws, gate, refused
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
 
 
 @pytest.fixture
@@ -35,7 +30,7 @@ def test_a_disabled_queue_finishes_what_it_has(batch: Batch, one_cpu: str, tmp_p
     assert [batch.wait(job)["status"] for job in jobs] == ["SUCCEEDED", "SUCCEEDED"]
 
 
-def test_a_deleted_queue_ends_its_jobs_and_is_there_until_the_last_one_is_over(
+def test_a_deleted_queue_ends_its_jobs_and_stays_until_the_last_ended(
     batch: Batch, one_cpu: str, tmp_path: Path
 ) -> None:
     script = f"trap 'touch $GATE/asked' TERM; touch $GATE/ready; {UNTIL.format('go')}"
@@ -55,9 +50,7 @@ def test_a_deleted_queue_ends_its_jobs_and_is_there_until_the_last_one_is_over(
     wait_for(lambda: not batch.api.describe_job_queues(jobQueues=["q-ended"])["jobQueues"], what="the queue's end")
 
 
-def test_every_job_that_waits_says_what_it_needs_and_for_whom_it_waits(
-    batch: Batch, one_cpu: str, tmp_path: Path
-) -> None:
+def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
     holds = batch.single("q-holds", UNTIL.format("go"), env={"GATE": str(tmp_path)}, cpus="1")
     plain, wide = batch.single("q-plain", "true", cpus="0.5"), batch.single("q-wide", "true", cpus="2")
     gang = batch.multinode("q-gang", "true", 3, cpus="500")
@@ -178,9 +171,7 @@ def test_the_share_with_less_use_goes_first_and_a_reservation_is_kept_free(batch
     batch.api.delete_scheduling_policy(arn=policy)
 
 
-def test_a_preemptible_job_makes_way_and_runs_again_without_spending_an_attempt(
-    batch: Batch, one_cpu: str, tmp_path: Path
-) -> None:
+def test_a_preemptible_job_makes_way_and_spends_no_attempt(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
     """Two attempts are allowed. The first launch is preempted, the second fails, so that the third is the second that counts."""
     script = f"""
 trap 'echo checkpointed; exit 75' TERM

@@ -11,22 +11,10 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.conformance.aws import EXITED, OVER, UNTIL, Batch, aws, container, gate, pairs, refused
 
 ATTEMPT, INDEX = "$AWS_BATCH_JOB_ATTEMPT", "$AWS_BATCH_JOB_ARRAY_INDEX"
-
-
-@pytest.fixture(scope="module")
-def batch(shared_server: Serving) -> Batch:
-    return Batch(shared_server)
-
-
-@pytest.fixture(scope="module")
-def parked(batch: Batch) -> Iterator[str]:
-    """A queue whose jobs never start."""
-    yield batch.queue("one-parked", batch.compute_environment("one-parked", state="DISABLED"))
-    batch.remove(["one-parked"], ["one-parked"])
 
 
 # -- shape and parameters ---------------------------------------------------------------------------------------------
@@ -220,9 +208,7 @@ def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
         ({"nodeOverrides": {"numNodes": 2}}, "use containerOverrides"),
     ],
 )
-def test_impossible_arrays_and_dependencies_are_refused(
-    batch: Batch, parked: str, change: dict[str, Any], message: str
-) -> None:
+def test_impossible_arrays_are_refused(batch: Batch, parked: str, change: dict[str, Any], message: str) -> None:
     definition = batch.single("one-refused", "true")
     known = {
         "ARRAY": batch.submit(definition, queue=parked, arrayProperties={"size": 2}),

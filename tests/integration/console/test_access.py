@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import httpx
@@ -68,9 +69,7 @@ def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_pa
     keys = KeyStore(tmp_path)
     keys.create("other")
     key = keys.create("mine")
-    server = Serving(tmp_path, "--cpus", "1")
-    visitor = Visitor(server.url, secret_of(key))
-    try:
+    with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url, secret_of(key))) as visitor:
         token = visitor.page("/").form_token
         server.kill()
         server.options = (*server.options, "--port", server.url.rpartition(":")[2])
@@ -78,9 +77,6 @@ def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_pa
         assert visitor.page("/").form_token == token, "forms of open pages go on"
         keys.delete("mine")
         assert visitor.http.get("/", follow_redirects=False).headers["location"].startswith("/login")
-    finally:
-        visitor.close()
-        server.close()
 
 
 @pytest.mark.parametrize("way", ["deleted key", "logout"])
@@ -139,7 +135,7 @@ def test_a_change_needs_the_token_of_a_form_of_the_same_session(console: Console
         {"Host": "evil.example"},
     ],
 )
-def test_on_loopback_without_keys_another_web_page_can_neither_read_nor_change(
+def test_another_web_page_neither_reads_nor_changes_an_open_server(
     shared_server: Serving, headers: dict[str, str]
 ) -> None:
     visitor = Visitor(shared_server.url)
@@ -181,9 +177,8 @@ def test_files_are_kept_for_ever_under_the_address_of_their_content_and_no_other
     visitor = console.visitor()
     (script,) = visitor.page("/").all("script")
     answer = httpx.get(f"{console.url}{script['src']}", trust_env=False)
-    assert "immutable" in answer.headers["cache-control"] and answer.headers["content-type"].startswith(
-        "text/javascript"
-    )
+    assert "immutable" in answer.headers["cache-control"]
+    assert answer.headers["content-type"].startswith("text/javascript")
     old = httpx.get(f"{console.url}/static/0/console.js", trust_env=False)
     assert old.text == answer.text and old.headers["cache-control"] == "no-store"
     for name in ("../__init__.py", "..%2f__init__.py", "nothing.js"):

@@ -3,39 +3,21 @@
 from __future__ import annotations
 
 import re
-import shutil
-from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Locator, Page, expect, sync_playwright
+from playwright.sync_api import Locator, Page, expect
 
-from tests.conftest import PATIENCE, Serving
+from tests.conftest import Serving
+from tests.support.console.person import People
 
 NAME = "train.config.reward_function"
 MESSAGE = f'[data-wrong="{NAME}"]'
 BAD = re.compile(r"\bbad\b")
 
 
-@pytest.fixture(scope="module")
-def browser_page(shared_server: Serving) -> Iterator[Page]:
-    """A browser's page, which may ask this server alone and may have no error of a script or of the policy."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("there is no chromium")
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(base_url=shared_server.url)
-        page.set_default_timeout(30_000 * PATIENCE)
-        expect.set_options(timeout=30_000 * PATIENCE)
-        problems: list[str] = []
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda told: problems.append(told.text) if told.type in ("error", "warning") else None)
-        page.on(
-            "request", lambda asked: problems.append(asked.url) if not asked.url.startswith(shared_server.url) else None
-        )
-        yield page
-        browser.close()
-        assert problems == []
+@pytest.fixture
+def browser_page(shared_server: Serving, people: People) -> Page:
+    return people(shared_server.url).page
 
 
 @pytest.fixture
@@ -95,9 +77,7 @@ def test_a_function_that_fails_on_a_sample_is_told_when_its_editor_is_left(brows
     expect(numbers(code).nth(1)).to_have_class(BAD)
 
 
-def test_the_wizard_leads_by_review_and_yaml_to_a_job(
-    browser_page: Page, code: Locator, shared_server: Serving
-) -> None:
+def test_the_wizard_leads_by_review_and_yaml_to_jobs(browser_page: Page, code: Locator, shared_server: Serving) -> None:
     code.fill("# </script><script>alert(1)</script>\ndef reward_function(params):\n    return 1.0\n")
     browser_page.locator('[name="name"]').fill("clicked")
     browser_page.locator('select[name="train.algorithm"]').select_option("sac")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from shared_store.metrics import MetricsWriter
 from tests.conftest import Serving, submit_gang, wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page, Visitor
+from tests.support.definitions import container, single
 from tests.support.orchestrator.jobs import FOREVER, await_status
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
@@ -135,9 +137,7 @@ def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(console: C
         assert visitor.http.get(f"/jobs/{talking}/log", params=wrong).status_code == 400
 
 
-def test_the_log_is_searched_and_the_first_error_is_found_with_the_lines_around_it(
-    console: Console, talking: str
-) -> None:
+def test_the_log_is_searched_and_the_first_error_found_with_lines_around_it(console: Console, talking: str) -> None:
     visitor = console.visitor()
     found = log_of(visitor, talking, "/search", text="LINE 77 OF")
     assert sorted(said(found)) == ["line 77 of 0", "line 77 of 1"] and found["over"]
@@ -169,24 +169,21 @@ def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(console: Co
         assert lines == expected
 
 
-def test_a_page_that_missed_too_much_gets_the_last_lines_and_how_much_it_missed(
+def test_a_page_that_missed_too_much_gets_the_last_lines_and_a_count(
     console: Console, talking: str, store: Store
 ) -> None:
     run = store.run(console.client.get(f"/api/jobs/{talking}")["run"])
     with open(run.log(talking, 1, 0), "a") as file:
         file.writelines(format_line(4e9, 0, "o", f"late {i} " + "x" * 100) for i in range(20_000))
     visitor = console.visitor()
-    (window,) = [
-        data for name, data, _ in visitor.events(f'/jobs/{talking}/stream?last={{"i":0,"l":{{}}}}') if name == "window"
-    ]
+    events = visitor.events(f'/jobs/{talking}/stream?last={{"i":0,"l":{{}}}}')
+    (window,) = [data for name, data, _ in events if name == "window"]
     assert len(window["lines"]) == 400 and window["skipped"] > 2 << 20
     assert said(window)[-1].startswith("late 19999 ")
 
 
 def test_a_restart_of_the_server_loses_no_line_and_repeats_none(tmp_path: Path) -> None:
-    server = Serving(tmp_path, "--cpus", "1")
-    visitor = Visitor(server.url)
-    try:
+    with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url)) as visitor:
         script = "import time\nfor i in range(400):\n  print('number', i, flush=True)\n  time.sleep(0.02)\n"
         job = submit_gang(server.client, script, cpus="0.5")
         server.wait(job, "RUNNING")
@@ -197,9 +194,6 @@ def test_a_restart_of_the_server_loses_no_line_and_repeats_none(tmp_path: Path) 
         rest, _ = read_until(visitor, job, last, "number 399")
         numbers = [text for text in lines + rest if text.startswith("number ")]
         assert numbers == [f"number {i}" for i in range(400)]
-    finally:
-        visitor.close()
-        server.close()
 
 
 def read_until(visitor: Visitor, job: str, last: str, text: str) -> tuple[list[str], str]:
@@ -212,7 +206,7 @@ def read_until(visitor: Visitor, job: str, last: str, text: str) -> tuple[list[s
     raise AssertionError(f"{text} never came; there is {found[-5:]}")
 
 
-def test_new_iterations_come_over_the_stream_and_a_run_that_went_back_is_read_again(
+def test_the_stream_has_new_iterations_and_tells_of_a_run_that_went_back(
     console: Console, training: str, store: Store
 ) -> None:
     visitor = console.visitor()
@@ -249,9 +243,7 @@ def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(co
     assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
 
 
-def test_a_run_goes_on_from_an_older_checkpoint_only_once_the_person_has_said_yes(
-    console: Console, store: Store
-) -> None:
+def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console: Console, store: Store) -> None:
     add_run(store, "again", {**SPEC, "name": "again"})
     for iteration in (3, 6):
         add_checkpoint(store, "again", iteration)
@@ -300,9 +292,7 @@ def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, store: 
     assert ended["statusReason"] == "stopped in the console by key admin"
 
 
-def test_a_read_only_key_sees_no_buttons_and_no_values_and_is_refused_each_action(
-    console: Console, training: str
-) -> None:
+def test_a_read_only_key_sees_no_buttons_nor_values_and_is_refused_actions(console: Console, training: str) -> None:
     visitor = console.visitor("reader")
     page = visitor.page(f"/jobs/{training}")
     assert "taught" in page.text and page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
@@ -325,7 +315,7 @@ def test_a_key_of_another_queue_sees_nothing_of_the_job_and_changes_nothing(cons
         assert visitor.submit(f"/jobs/{training}/{action}", name="x", confirmed="yes").status_code == 403, action
 
 
-def test_files_of_a_run_are_downloads_pictures_are_shown_and_nothing_leads_out_of_the_run(
+def test_files_of_a_run_are_downloads_and_nothing_leads_out_of_it(
     console: Console, training: str, store: Store
 ) -> None:
     run, visitor = store.run("taught"), console.visitor()
@@ -342,28 +332,19 @@ def test_files_of_a_run_are_downloads_pictures_are_shown_and_nothing_leads_out_o
     assert download.headers["content-type"] == "application/octet-stream"
     assert download.headers["content-disposition"].startswith("attachment")
     assert "sandbox" in ", ".join(download.headers.get_list("content-security-policy"))
-    for path in (
-        "run.json",
-        "recordings/../run.json",
-        "recordings/..%2f..%2frun.json",
-        "recordings/.x",
-        "recordings/no",
-    ):
+    up = ("../run.json", "..%2f..%2frun.json", ".x", "no")
+    for path in ("run.json", *(f"recordings/{each}" for each in up)):
         assert visitor.http.get(f"/runs/taught/files/{path}").status_code == 404, path
     assert visitor.http.get("/runs/taught/files/recordings/way-out").status_code == 409
 
 
 def test_the_page_of_an_array_leads_to_its_jobs(console: Console, store: Store) -> None:
-    needs = [{"type": "VCPU", "value": "4"}, {"type": "MEMORY", "value": "16"}]
-    container = {"image": "muster", "command": ["true"], "resourceRequirements": needs}
-    definition = {"jobDefinitionName": "child", "type": "container", "containerProperties": container}
-    arn = console.client.batch("RegisterJobDefinition", **definition)["jobDefinitionArn"]
-    sent = {"jobName": "many", "jobQueue": "default", "jobDefinition": arn, "arrayProperties": {"size": 3}}
+    console.client.batch("RegisterJobDefinition", **single("child", container(cpus="4")))
+    sent = {"jobName": "many", "jobQueue": "default", "jobDefinition": "child", "arrayProperties": {"size": 3}}
     job = console.client.batch("SubmitJob", **sent)["jobId"]
     page = console.visitor().page(f"/jobs/{job}")
-    assert [each["href"] for each in page.all("a") if f"{job}:" in str(each["href"])] == [
-        f"/jobs/{job}:{i}" for i in range(3)
-    ]
+    found = [each["href"] for each in page.all("a") if f"{job}:" in str(each["href"])]
+    assert found == [f"/jobs/{job}:{i}" for i in range(3)]
     wait_for(lambda: "RUNNABLE" in console.visitor().page(f"/jobs/{job}:1").text, 20, "the child's reason")
     with pytest.raises(ApiError):
         console.client.get(f"/api/jobs/{job}:7")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 
 from tests.conftest import wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page
+from tests.support.orchestrator.jobs import await_status
 
 HOSTILE = ("</td><script>alert(1)</script>", '" onload="alert(1)', "{{ 7 * 7 }}", "' or 1=1 --")
 
@@ -16,16 +15,6 @@ HOSTILE = ("</td><script>alert(1)</script>", '" onload="alert(1)', "{{ 7 * 7 }}"
 @pytest.fixture(scope="module")
 def definition(console: Console) -> str:
     return console.register("waits")
-
-
-def await_end(console: Console, *jobs: str) -> None:
-    """All of them have failed."""
-    for job in jobs:
-        wait_for(partial(failed, console, job), 20, "the job's end")
-
-
-def failed(console: Console, job: str) -> bool:
-    return bool(console.client.get(f"/api/jobs/{job}")["status"] == "FAILED")
 
 
 def names(page: Page) -> list[str]:
@@ -51,23 +40,18 @@ def test_the_newest_jobs_come_first_a_page_at_a_time(console: Console, many: lis
     assert len(names(last)) == 20 and "hidden" in last.all("a", rel="next")[0]
     beyond = visitor.page("/?page=9")
     assert names(beyond) == [] and "This page of the table is empty" in beyond.text
-    for page, words in (
-        ("x", "a whole number, found a text ('x')"),
-        ("0", "a value greater than or equal to 1, found '0'"),
-    ):
+    wrong = {"x": "a whole number, found a text ('x')", "0": "a value greater than or equal to 1, found '0'"}
+    for page, words in wrong.items():
         assert f"page: expected {words}" in visitor.page(f"/?page={page}", 400).text
 
 
 def test_jobs_are_found_by_state_queue_and_part_of_a_name(console: Console, many: list[str]) -> None:
     visitor = console.visitor()
-    assert names(visitor.page("/?search=JOB-11")) == [
-        f"job-{i}" for i in (119, 118, 117, 116, 115, 114, 113, 112, 111, 110, 11)
-    ]
+    assert names(visitor.page("/?search=JOB-11")) == [f"job-{i}" for i in (*range(119, 109, -1), 11)]
     assert names(visitor.page(f"/?search={many[7][:8]}")) == ["job-7"]
     assert names(visitor.page("/?queue=lab")) == ["job-60"]
-    assert (
-        names(visitor.page("/?state=succeeded")) == [] and "No job is like this" in visitor.page("/?state=failed").text
-    )
+    assert names(visitor.page("/?state=succeeded")) == []
+    assert "No job is like this" in visitor.page("/?state=failed").text
     assert len(names(visitor.page("/?state=waiting&search=job-1"))) == 31
     assert "it is one of waiting" in visitor.page("/?state=x", 400).text
 
@@ -96,10 +80,8 @@ def test_a_read_only_key_sees_no_buttons_and_changes_nothing(console: Console, m
     visitor = console.visitor("reader")
     page = visitor.page("/")
     assert "job-119" in page.text and "(read-only)" in page.text
-    assert (
-        page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
-        and page.all("input", name="job") == []
-    )
+    assert page.all("form", method="post") == [{"method": "post", "action": "/logout"}]
+    assert page.all("input", name="job") == []
     answer = visitor.submit("/jobs/stop", job=many[0], confirmed="yes")
     assert answer.status_code == 403 and "is read-only" in answer.json()["message"]
 
@@ -108,7 +90,7 @@ def test_names_of_others_are_text_and_nothing_else(console: Console, definition:
     job = console.submit(definition, "hostile", "lab")
     for text in HOSTILE:
         console.client.batch("TerminateJob", jobId=job, reason=text)
-        await_end(console, job)
+        await_status(console.client, job, "FAILED")
         visitor = console.visitor("lab")
         for path in ("/?search=hostile", f"/?search={text}", f"/?queue={text}", f"/?state={text}"):
             answer = visitor.http.get(path)
@@ -141,7 +123,8 @@ def test_marked_jobs_are_stopped_once_the_person_has_said_yes(console: Console, 
     assert console.client.get(f"/api/jobs/{many[0]}")["status"] == "RUNNABLE"
     told = visitor.submit("/jobs/stop", job=many[:2], confirmed="yes").json()
     assert told == {"location": "/", "message": "2 jobs asked to stop"}
-    await_end(console, *many[:2])
+    for job in many[:2]:
+        await_status(console.client, job, "FAILED")
     assert console.client.get(f"/api/jobs/{many[0]}")["statusReason"] == "stopped in the console by key admin"
 
 
@@ -156,7 +139,8 @@ def test_without_scripts_a_page_asks_and_its_form_goes_on(console: Console, many
         fields.setdefault(str(each["name"]), []).append(str(each["value"]))
     answer = visitor.http.post("/jobs/stop", data=fields)
     assert answer.status_code == 200 and answer.url.query == b"search=job-2"
-    await_end(console, *many[2:4])
+    for job in many[2:4]:
+        await_status(console.client, job, "FAILED")
 
 
 def test_all_that_the_filter_finds_is_stopped_also_beyond_the_page(console: Console, many: list[str]) -> None:

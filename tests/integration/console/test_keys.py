@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import httpx
@@ -83,9 +84,7 @@ def test_a_hostile_name_is_refused_as_text(console: Console, name: str) -> None:
 
 
 def test_the_first_key_is_made_after_a_warning_and_from_then_on_everybody_needs_one(tmp_path: Path) -> None:
-    server = Serving(tmp_path, "--cpus", "1")
-    visitor = Visitor(server.url)
-    try:
+    with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url)) as visitor:
         assert "There is no key" in visitor.page("/keys").text
         asked = post(visitor, "/keys/create", name="first")
         assert asked.status_code == 409 and "everybody needs a key, you too" in Page(asked.text).text
@@ -93,17 +92,15 @@ def test_the_first_key_is_made_after_a_warning_and_from_then_on_everybody_needs_
         (key,) = KeyStore(tmp_path).load().values()
         assert key.secret in made.text
         assert visitor.http.get("/keys", follow_redirects=False).headers["location"].startswith("/login")
-    finally:
-        visitor.close()
-        server.close()
 
 
 def test_a_server_that_other_machines_can_reach_shows_keys_and_makes_none(tmp_path: Path) -> None:
     keys = KeyStore(tmp_path)
     secret = secret_of(keys.create("admin"))
-    server = Serving(tmp_path, "--cpus", "1", "--host", "0.0.0.0")
-    visitor = Visitor(server.url, secret)
-    try:
+    with (
+        Serving(tmp_path, "--cpus", "1", "--host", "0.0.0.0") as server,
+        contextlib.closing(Visitor(server.url, secret)) as visitor,
+    ):
         page = visitor.page("/keys")
         assert "muster keys create NAME" in page.text and not page.all("form", action="/keys/create")
         for path, fields in (("/keys/create", {"name": "x"}), ("/keys/delete", {"name": "admin", "confirmed": "yes"})):
@@ -112,6 +109,3 @@ def test_a_server_that_other_machines_can_reach_shows_keys_and_makes_none(tmp_pa
         bearer = {"Authorization": f"Bearer {secret}"}
         answer = httpx.post(f"{server.url}/api/keys", json={"name": "x"}, headers=bearer, trust_env=False)
         assert answer.status_code == 403 and [key.name for key in keys.load().values()] == ["admin"]
-    finally:
-        visitor.close()
-        server.close()

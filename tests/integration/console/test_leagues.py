@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from shared_store.evaluations import evaluation_name
 from shared_store.files import write_json
 from shared_store.layout import Store
-from tests.conftest import wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.racers import add_league, add_racer
 from tests.support.console.visitor import Page
+from tests.support.orchestrator.jobs import await_status
 from tests.support.shared_store.leagues import race, summary
 
 HOSTILE = "'<script>alert(1)</script>"
@@ -82,11 +84,7 @@ def test_a_model_is_raced_and_its_race_entered_once_it_has_ended(console: Consol
     started = visitor.submit("/leagues/cup/races", model="fast@2", racer="O'Neil").json()
     assert started["location"] == "/leagues/cup" and "submitted the race of fast@2" in started["message"]
     page = visitor.page("/leagues/cup")
-    (link,) = [
-        str(each["href"])
-        for each in page.all("a")
-        if str(each.get("href")).startswith("/jobs/") and each["href"] != "/jobs/"
-    ]
+    (link,) = [href for each in page.all("a") if re.match("/jobs/.", href := str(each.get("href")))]
     job = link.removeprefix("/jobs/")
     assert "Races that are not entered" in page.text and "fast@2" in page.text
     assert driven(page) == [], "it has not ended"
@@ -101,27 +99,20 @@ def test_a_model_is_raced_and_its_race_entered_once_it_has_ended(console: Consol
         changed |= next(stream)[1].get("rows", {}).get(job, {})
     assert changed["reason"] == HOSTILE
     stream.close()
-    wait_for(lambda: console.client.get(f"/api/jobs/{job}")["status"] == "FAILED", 30, "the job's end")
+    await_status(console.client, job, "FAILED")
     page = visitor.page("/leagues/cup")
     assert HOSTILE in page.text and page.is_inert
 
 
 def test_what_has_succeeded_is_entered_for_good(console: Console, store: Store) -> None:
     visitor = console.visitor()
-    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
-    container = {"image": "muster", "command": ["true"], "resourceRequirements": needs}
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
-    definition = {"jobDefinitionName": "driven", "type": "multinode", "nodeProperties": properties}
-    registered = console.client.batch("RegisterJobDefinition", **definition)["jobDefinitionArn"]
+    registered = console.register("driven", "0.1")
     tags = {"muster:league": "cup", "muster:model": "fast@2"}
     given = {"jobName": "race-cup-fast-2", "jobQueue": "default", "jobDefinition": registered, "tags": tags}
     job = str(console.client.batch("SubmitJob", **given)["jobId"])
-    wait_for(lambda: console.client.get(f"/api/jobs/{job}")["status"] == "SUCCEEDED", 30, "the job's end")
-    run = store.run("racer")
-    write_json(
-        run.evaluations / f"{evaluation_name('00000007-e1', job)}.json", summary(race([11.0, 11.5, 12.0]), job=job)
-    )
+    await_status(console.client, job, "SUCCEEDED")
+    path = store.run("racer").evaluations / f"{evaluation_name('00000007-e1', job)}.json"
+    write_json(path, summary(race([11.0, 11.5, 12.0]), job=job))
     page = visitor.page("/leagues/cup")
     assert driven(page) == [job]
     entered = visitor.submit("/leagues/cup/entries", model="fast@2", job=job, racer="O'Neil")

@@ -10,6 +10,7 @@ from orchestrator.client import Client
 from tests.conftest import wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page
+from tests.support.orchestrator.jobs import await_status
 
 POLICY = {"shareDecaySeconds": 600, "shareDistribution": [{"shareIdentifier": "red", "weightFactor": 0.5}]}
 
@@ -19,9 +20,8 @@ def waiting(console: Console) -> dict[str, str]:
     """A job that waits in each of three queues, by queue; ``shared`` is served by fair share."""
     policy = console.client.batch("CreateSchedulingPolicy", name="even", fairsharePolicy=POLICY)["arn"]
     order = [{"order": 1, "computeEnvironment": "local"}]
-    console.client.batch(
-        "CreateJobQueue", jobQueueName="shared", priority=7, computeEnvironmentOrder=order, schedulingPolicyArn=policy
-    )
+    shared = {"jobQueueName": "shared", "priority": 7, "schedulingPolicyArn": policy}
+    console.client.batch("CreateJobQueue", **shared, computeEnvironmentOrder=order)
     definition = console.register("waits")
     found = {queue: console.submit(definition, f"in-{queue}", queue) for queue in ("default", "lab")}
     job = {"jobName": "in-shared", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
@@ -54,9 +54,8 @@ def test_why_a_job_waits_is_what_the_api_says(console: Console, waiting: dict[st
     assert " ".join(reason.split()) in page.text
     assert not rows_of(page, waiting["default"]) and rows_of(page, waiting["shared"])
     (told,) = console.client.get("/api/queues", queue="shared")["queues"]
-    assert [(each["id"], each["reason"], each["share"]) for each in told["front"]] == [
-        (waiting["shared"], reason, "red")
-    ]
+    (front,) = told["front"]
+    assert (front["id"], front["reason"], front["share"]) == (waiting["shared"], reason, "red")
 
 
 def test_a_key_sees_its_queues_alone(console: Console, waiting: dict[str, str]) -> None:
@@ -82,13 +81,11 @@ def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str])
     stream.close()
 
 
-def test_a_share_that_uses_something_is_told_with_its_weight_and_the_host_as_full(
-    console: Console, waiting: dict[str, str]
-) -> None:
+def test_a_share_in_use_is_told_with_its_weight_and_the_host_as_full(console: Console, waiting: dict[str, str]) -> None:
     definition = console.register("runs", cpus="1", command=["sleep", "600"])
     job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
     running = console.client.batch("SubmitJob", **job)["jobId"]
-    wait_for(lambda: console.client.get(f"/api/jobs/{running}")["status"] == "RUNNING", 30, "the job to run")
+    await_status(console.client, running, "RUNNING")
     told = console.client.get("/api/queues", queue="shared")
     (share,) = told["queues"][0]["shares"]
     assert (share["share"], share["weight"], share["inUse"]) == ("red", 0.5, {"cpus": 1.0, "gpus": 0})
@@ -97,7 +94,7 @@ def test_a_share_that_uses_something_is_told_with_its_weight_and_the_host_as_ful
     page = console.visitor().page("/queues")
     assert rows_of(page, "shared/red") and "1 of 1" in page.text
     console.client.batch("TerminateJob", jobId=running, reason="enough")
-    wait_for(lambda: console.client.get(f"/api/jobs/{running}")["status"] == "FAILED", 30, "the end of the job")
+    await_status(console.client, running, "FAILED")
 
 
 def test_hostile_names_are_text(console: Console) -> None:
@@ -106,9 +103,8 @@ def test_hostile_names_are_text(console: Console) -> None:
         answer = visitor.http.get("/queues", params={"queue": text})
         assert answer.status_code == 404 and Page(answer.text).is_inert and "<script>alert" not in answer.text
     hostile = "<img src=x onerror=alert(1)>"
-    console.client.batch(
-        "CreateComputeEnvironment", computeEnvironmentName="odd", type="UNMANAGED", tags={"muster:hosts": hostile}
-    )
+    odd = {"computeEnvironmentName": "odd", "type": "UNMANAGED", "tags": {"muster:hosts": hostile}}
+    console.client.batch("CreateComputeEnvironment", **odd)
     wait_for(lambda: hostile in visitor.page("/queues").text, 10, "the new one")
     page = visitor.page("/queues")
     assert page.is_inert and not page.all("img")

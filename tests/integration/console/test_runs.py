@@ -17,6 +17,7 @@ from tests.support.console.visitor import Page
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
 HOSTILE = "<script>alert(1)</script>"
+LENGTHS = {"mean_length": 9.0, "max_length": 10}
 
 
 def trained(store: Store, name: str, returns: list[float], **changes: Any) -> Run:
@@ -24,38 +25,19 @@ def trained(store: Store, name: str, returns: list[float], **changes: Any) -> Ru
     train = {**SPEC["train"], "seed": 1, **changes.pop("train", {})}
     add_run(store, name, {**SPEC, "name": name, "train": train})
     run = store.run(name)
-    described = run.description()
-    assert described is not None
-    write_json(
-        run.path / "run.json", {**described, "created": 1.7e12, "queue": "default", "owner": "key admin", **changes}
-    )
+    facts = {"created": 1.7e12, "queue": "default", "owner": "key admin", **changes}
+    write_json(run.path / "run.json", {**(run.description() or {}), **facts})
     for iteration in (6, 9):
         add_checkpoint(store, name, iteration)
     with MetricsWriter(run, 1, 0) as metrics:
-        for iteration in range(1, 10):
-            record = {
-                "iteration": iteration,
-                "env_steps": 100 * iteration,
-                "reward": returns[0] * iteration,
-                "kl": 0.01,
-            }
-            metrics.write({**record, "note": HOSTILE})
-    mean = sum(returns) / len(returns)
-    write_json(
-        run.evaluations / "00000009-e1-job.json",
-        {
-            "mean_return": mean,
-            "mean_length": 9.0,
-            "max_length": 10,
-            "episodes": len(returns),
-            "time": 1.7e9,
-            "task": "Cartpole",
-            "seed": 7,
-            "iteration": 9,
-            "return": {"mean": mean, "low": mean - 1, "high": mean + 1},
-            "success": {"share": 0.75},
-        },
-    )
+        for i in range(1, 10):
+            record = {"iteration": i, "env_steps": 100 * i, "reward": returns[0] * i, "kl": 0.01, "note": HOSTILE}
+            metrics.write(record)
+    mean, episodes = sum(returns) / len(returns), len(returns)
+    found: dict[str, Any] = {**LENGTHS, "mean_return": mean, "episodes": episodes, "time": 1.7e9, "task": "Cartpole"}
+    found |= {"seed": 7, "iteration": 9, "success": {"share": 0.75}}
+    found["return"] = {"mean": mean, "low": mean - 1, "high": mean + 1}
+    write_json(run.evaluations / "00000009-e1-job.json", found)
     columns = {"episode": list(range(len(returns))), "return": returns}
     pyarrow.parquet.write_table(pyarrow.table(columns), run.evaluations / "00000009-e1-job.parquet")
     return run
@@ -115,9 +97,7 @@ def test_a_run_that_goes_on_is_renewed(console: Console, store: Store) -> None:
     stream.close()
 
 
-def test_the_comparison_is_what_the_command_computes(
-    console: Console, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_comparison_is_that_of_the_command(console: Console, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUSTER_TOKEN", console.secrets["admin"])
     page = console.visitor().page("/compare?run=fast&run=sure")
     done = call_muster("compare", "fast", "sure", home=console.server.home)
@@ -143,10 +123,8 @@ def test_curves_over_seeds_have_their_spread(console: Console, store: Store) -> 
 
 def test_an_unknown_metric_is_refused_with_the_nearest_one(console: Console, store: Store) -> None:
     visitor = console.visitor()
-    assert (
-        "no run here has a metric 'rewrd'; did you mean reward?"
-        in visitor.page("/compare?run=fast&metric=rewrd", 404).text
-    )
+    said = visitor.page("/compare?run=fast&metric=rewrd", 404).text
+    assert "no run here has a metric 'rewrd'; did you mean reward?" in said
 
 
 def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
@@ -160,30 +138,16 @@ def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
 
 def test_what_is_in_a_run_is_text_and_nothing_else(console: Console, store: Store) -> None:
     parent = {"run": HOSTILE, "checkpoint": HOSTILE}
-    run = trained(
-        store,
-        "hostile",
-        [1.0],
-        train={"task": HOSTILE, "seed": HOSTILE},
-        owner=HOSTILE,
-        parent=parent,
-    )
+    run = trained(store, "hostile", [1.0], train={"task": HOSTILE, "seed": HOSTILE}, owner=HOSTILE, parent=parent)
     written = run.evaluations / "00000009-e1-job.json"
-    summary = {**SPEC, "mean_return": 1.0, "mean_length": 1.0, "max_length": 1, "episodes": 1, "time": 1.0}
-    write_json(
-        written, {**summary, "seed": HOSTILE, "config": {HOSTILE: HOSTILE}, "success": HOSTILE, "return": HOSTILE}
-    )
+    summary = {**SPEC, **LENGTHS, "mean_return": 1.0, "episodes": 1, "time": 1.0}
+    hostile = {"seed": HOSTILE, "config": {HOSTILE: HOSTILE}, "success": HOSTILE, "return": HOSTILE}
+    write_json(written, {**summary, **hostile})
     visitor = console.visitor()
     add_checkpoint(store, "hostile", 12, reward=HOSTILE, score=[HOSTILE], created=HOSTILE)
     add_run(store, "odd", {"name": HOSTILE, "train": HOSTILE})
-    for path in (
-        "/runs",
-        "/runs/odd",
-        "/compare?run=odd&run=hostile",
-        "/runs/hostile",
-        "/compare?run=hostile&run=fast",
-        f"/runs?search={HOSTILE}",
-    ):
+    compared = ("/compare?run=odd&run=hostile", "/compare?run=hostile&run=fast")
+    for path in ("/runs", "/runs/odd", "/runs/hostile", *compared, f"/runs?search={HOSTILE}"):
         page = visitor.page(path)
         assert page.is_inert and "<script>alert" not in page.source, path
     for path in (f"/runs/{HOSTILE}", f"/compare?run={HOSTILE}"):

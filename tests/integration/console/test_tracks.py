@@ -6,14 +6,13 @@ import xml.etree.ElementTree as xml
 
 import pytest
 
-from tests.conftest import run_muster
 from tests.support.console.fixtures import Console
 
 
 def test_tracks_are_shown_with_their_outlines_and_measures(console: Console) -> None:
     visitor = console.visitor("reader")
     order = ("tracks", "make", "hills", "--seed", "7", "--length", "45")
-    made = run_muster(*order, home=console.server.home, MUSTER_TOKEN=console.secrets["admin"])
+    made = console.server.muster(*order, MUSTER_TOKEN=console.secrets["admin"])
     assert made.returncode == 0, made.stderr
     page = visitor.page("/tracks")
     pictures = [str(each["src"]) for each in page.all("img")]
@@ -39,12 +38,8 @@ def test_a_track_has_its_facts_and_the_picture_of_the_command(console: Console) 
 @pytest.mark.parametrize("name", ["ovall", "random:x", "<script>alert(1)</script>", "..%2f..%2fetc", "-o"])
 def test_an_unknown_track_is_told_with_the_nearest_name(console: Console, name: str) -> None:
     visitor = console.visitor()
-    for path in (
-        f"/tracks/{name}",
-        f"/tracks/{name}/outline.svg",
-        f"/tracks/{name}/picture.png",
-        f"/tracks?name={name}",
-    ):
+    of_one = (f"/tracks/{name}{file}" for file in ("", "/outline.svg", "/picture.png"))
+    for path in (*of_one, f"/tracks?name={name}"):
         answer = visitor.http.get(path)
         assert answer.status_code == 404 and "<script>alert" not in answer.text, path
     assert "did you mean oval?" in visitor.page("/tracks/ovall", 404).text
@@ -52,9 +47,8 @@ def test_an_unknown_track_is_told_with_the_nearest_name(console: Console, name: 
 
 def test_the_api_lists_tracks_and_draws_them(console: Console) -> None:
     listed = console.client.get("/api/tracks")
-    assert [each["name"] for each in listed][:3] == ["oval", "rounded-rectangle", "chicane"] and "rings" not in listed[
-        0
-    ]
+    assert [each["name"] for each in listed][:3] == ["oval", "rounded-rectangle", "chicane"]
+    assert "rings" not in listed[0]
     (drawn,) = console.client.get("/api/tracks", name="oval", rings="true")
     assert len(drawn["rings"]["inner"]) == len(drawn["rings"]["outer"]) == drawn["waypoints"]
 
@@ -88,9 +82,7 @@ def test_a_form_makes_a_track_for_good(console: Console) -> None:
         ({"name": "oval"}, "a preset is called so; choose another name"),
     ],
 )
-def test_a_track_that_can_t_be_made_is_refused_by_the_name_of_its_field(
-    console: Console, wrong: dict[str, str], told: str
-) -> None:
+def test_a_track_that_can_t_be_made_is_refused_by_its_field(console: Console, wrong: dict[str, str], told: str) -> None:
     answer = console.visitor().submit("/tracks", **{"name": "wrong", "seed": "7", **wrong})
     assert answer.status_code == 400 and told in answer.json()["message"], answer.text
     assert "wrong" not in [each["name"] for each in console.client.get("/api/tracks")]

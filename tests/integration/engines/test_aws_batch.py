@@ -23,10 +23,10 @@ from orchestrator.engines.aws_batch.config import is_mounted_from
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
-from tests.conftest import Serving, run_muster, wait_for
+from tests.conftest import Serving, call_muster, wait_for
 from tests.support.engines.aws_bench import AwsBench
-from tests.support.engines.sites import POLITE, WAIT
-from tests.support.processes import command, parent, processes_of
+from tests.support.engines.sites import WAIT
+from tests.support.processes import command, processes_of
 
 LAST = (
     '[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/$MUSTER_JOB_ID/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '
@@ -38,12 +38,10 @@ LAST = (
 @pytest.fixture(scope="module")
 def aws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     """The second Muster."""
-    serving = Serving(tmp_path_factory.mktemp("aws"), "--cpus", "16")
-    with pytest.MonkeyPatch.context() as patch:
+    with Serving(tmp_path_factory.mktemp("aws"), "--cpus", "16") as serving, pytest.MonkeyPatch.context() as patch:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             patch.setenv(name, "any")
         yield serving
-    serving.close()
 
 
 @pytest.fixture
@@ -128,11 +126,8 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     assert again["RegisterJobDefinition"] == definition, "one definition for all attempts"
     tagged = bench.gang(nodes=1, options={"job-queue": "night", "image": "other:1", "share": "alice"}, priority=7)
     changed = json.loads(bench.engine.plan(tagged).document)["SubmitJob"]
-    assert (changed["jobQueue"], changed["shareIdentifier"], changed["schedulingPriorityOverride"]) == (
-        "night",
-        "alice",
-        7,
-    )
+    found = [changed[name] for name in ("jobQueue", "shareIdentifier", "schedulingPriorityOverride")]
+    assert found == ["night", "alice", 7]
 
 
 def test_aws_gets_the_request_of_the_plan(bench: AwsBench) -> None:
@@ -176,13 +171,6 @@ def test_a_job_that_a_dead_controller_submitted_is_found(bench: AwsBench) -> Non
     assert len(definitions["jobDefinitions"]) == 2, "another command is another revision"
 
 
-def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: AwsBench) -> None:
-    handle = bench.ready(bench.gang(POLITE, 2))
-    bench.stopped(handle, 10.0)
-    assert bench.outcome(0).exit_code == 75 and bench.log().count("saved") == 2, bench.log()
-    assert [node.running for node in bench.engine.observe(handle)] == [False, False]
-
-
 @pytest.mark.parametrize("store", ["bench", "workstation"])
 def test_a_child_whose_supervisor_is_killed_ends_the_gang(request: pytest.FixtureRequest, store: str) -> None:
     """AWS itself would let it run for ever; no controller looks meanwhile."""
@@ -218,9 +206,7 @@ def test_an_image_without_muster_runs_as_it_is(bench: AwsBench) -> None:
     assert bench.outcome(0).exit_code == 4
 
 
-def test_gangs_that_come_and_go_do_not_double_the_lines_of_one_that_runs(
-    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gangs_that_come_and_go_double_no_line_of_another(bench: AwsBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
     script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"
     running = bench.launch(bench.gang(script, 1, native=False))
@@ -257,31 +243,26 @@ def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path
     bench.close()
 
 
-def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: AwsBench) -> None:
-    volume = bench.volume.run("run")
-    volume.create({"run": "run"})
-    raise_epoch(volume, 9)
-    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
-    assert node.exit_code == 3 and read_epoch(volume) == 9
-    lines = [line.text for line in bench.lines()]
-    assert not any("wrote" in line for line in lines)
-    assert any("the run now belongs to epoch 9" in line for line in lines), lines
-
-
-def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(bench: AwsBench) -> None:
-    volume = bench.volume.run("run")
-    volume.create({"run": "run"})
-    raise_epoch(volume, 1, Claim("", "another-job", 2))
-    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
-    assert node.exit_code == 3
-    lines = [line.text for line in bench.lines()]
-    assert not any("wrote" in line for line in lines)
-    assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
-
-
-def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(
-    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("epoch", "claim", "said"),
+    [
+        (9, (), "the run now belongs to epoch 9"),
+        (1, (Claim("", "another-job", 2),), "attempt 2 of job another-job has epoch 1 already; leaving"),
+    ],
+)
+def test_a_run_that_is_another_attempt_s_refuses_this_one(
+    bench: AwsBench, epoch: int, claim: tuple[Claim, ...], said: str
 ) -> None:
+    volume = bench.volume.run("run")
+    volume.create({"run": "run"})
+    raise_epoch(volume, epoch, *claim)
+    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
+    assert node.exit_code == 3 and read_epoch(volume) == epoch
+    lines = [line.text for line in bench.lines()]
+    assert not any("wrote" in line for line in lines) and any(said in line for line in lines), lines
+
+
+def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monkeypatch: pytest.MonkeyPatch) -> None:
     handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
 
     def reason() -> str:
@@ -367,59 +348,17 @@ def test_an_unusable_endpoint_queue_or_key_is_reported_at_the_start(aws: Serving
         AwsBench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
     with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):
         AwsBench(aws, tmp_path / "queue", job_queue="robots")
-    assert run_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
-    keyed = Serving(tmp_path / "keyed")
-    try:
-        with pytest.raises(EngineError, match=r"refuses: .*; see `aws configure`"):
-            AwsBench(keyed, tmp_path / "credentials")
-    finally:
-        keyed.close()
+    assert call_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
+    with Serving(tmp_path / "keyed") as keyed, pytest.raises(EngineError, match=r"refuses: .*; see `aws configure`"):
+        AwsBench(keyed, tmp_path / "credentials")
 
 
 def test_the_doctor_looks_at_the_configuration_that_the_controller_has(bench: AwsBench) -> None:
-    examined = run_muster("doctor", "--engine", "aws-batch", home=bench.home)
+    examined = call_muster("doctor", "--engine", "aws-batch", home=bench.home)
     assert examined.returncode == 0, examined.stdout
     assert re.search(r"ok  engine aws-batch queue aws-batch/default, at most \d+ CPUs for a gang\n", examined.stdout)
-
-
-YAML = """
-name: survivor
-nodes: 3
-resources: {{cpus: 0.1, memory: 32MiB}}
-retry: {{attempts: 3}}
-command: [sh, -c, 'echo ready $AWS_BATCH_JOB_ATTEMPT; while [ ! -e {gate}/$AWS_BATCH_JOB_ATTEMPT ]; do sleep 0.05; done; echo done']
-"""
-
-
-def test_a_controller_drives_aws_through_a_killed_child_and_its_own_death(bench: AwsBench) -> None:
-    (bench.home / "job.yaml").write_text(YAML.format(gate=bench.home))
-    controller = Serving(bench.home, "--engine", "aws-batch", "--store", str(bench.home / "store"))
-    try:
-        submitted = controller.muster("submit", str(bench.home / "job.yaml"))
-        assert submitted.returncode == 0, submitted.stderr
-        job = json.loads(controller.muster("list", "--json").stdout)[0]["jobId"]
-        wait_for(lambda: controller.log(job).count("ready 1") == 3, 60, "attempt 1 is ready")
-        os.kill(_rank(bench, 2), signal.SIGKILL)
-        wait_for(lambda: controller.log(job).count("ready 2") == 3, 60, "attempt 2 is ready")
-        controller.kill()
-        (bench.home / "2").touch()
-        wait_for(lambda: not processes_of(bench.volume.path), 30, "the gang ends while nobody looks")
-        controller.start()
-        detail = controller.wait(job)
-        assert detail["status"] == "SUCCEEDED", detail
-        assert detail["attempts"][0]["statusReason"].startswith("node 2: rank 2 was killed by SIGKILL"), detail
-        log = controller.log(job)
-        assert [log.count(line) for line in ("ready 1", "ready 2", "done")] == [3, 3, 3], log
-    finally:
-        controller.close()
 
 
 def _supervisor(bench: AwsBench, node: int) -> int:
     found = processes_of(bench.aws.home, AWS_BATCH_JOB_NODE_INDEX=str(node))
     return next(pid for pid in found if "worker.aws_node" in command(pid)[:5])
-
-
-def _rank(bench: AwsBench, node: int) -> int:
-    """The script itself: what it starts may have a lower pid, since pids begin again at 1 after the highest."""
-    found = processes_of(bench.volume.path, AWS_BATCH_JOB_NODE_INDEX=str(node))
-    return next(pid for pid in found if parent(pid) not in found)

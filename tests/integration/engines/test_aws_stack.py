@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +17,12 @@ import yaml
 from moto.cloudformation.models import cloudformation_backends
 from moto.ec2.models import ec2_backends
 
-from orchestrator.cli import main
 from orchestrator.domain.hosts import Limit, Placement, Queued
 from orchestrator.domain.resources import Resources
 from orchestrator.engines.aws_batch.config import load_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from orchestrator.engines.aws_batch.stack import Event, first_failure
-from tests.conftest import REPOSITORY, run_muster
+from tests.conftest import REPOSITORY, call_muster
 from tests.support.engines.bench import make_gang
 from tests.support.engines.moto_aws import moto_server
 
@@ -41,6 +38,7 @@ NO_CONFIGURATION = {
 }
 # moto does not split the default of a list, and knows few images
 PARAMETERS = ["--parameter", "InstanceTypes=g6.12xlarge", "--parameter", "WorkstationImage=ami-12c6146b"]
+NO_STACK = "muster: there is no stack {} in us-east-1; create it with `muster aws up`\n"
 WHOLE = [f"--parameter={name}=true" for name in ("Workstation", "InterfaceEndpoints", "UseEfa")]
 
 
@@ -58,23 +56,11 @@ class Account:
         }
 
     def client(self, service: str) -> Any:
-        return boto3.client(
-            service, endpoint_url=self.url, region_name=REGION, aws_access_key_id="a", aws_secret_access_key="b"
-        )
+        key = {"aws_access_key_id": "a", "aws_secret_access_key": "b"}
+        return boto3.client(service, endpoint_url=self.url, region_name=REGION, **key)
 
     def muster(self, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
-        """The command in this process, which saves its start; nobody is there to answer a question."""
-        out, err, code = io.StringIO(), io.StringIO(), 0
-        with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-            for name, value in {**self.env, "MUSTER_HOME": str(self.home), "COLUMNS": "200", **env}.items():
-                patch.setenv(name, value)
-            patch.setattr(sys, "argv", ["muster", "aws", *arguments])
-            patch.setattr(sys, "stdin", io.StringIO())
-            try:
-                main()
-            except SystemExit as end:
-                code = int(end.code or 0)
-        return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+        return call_muster("aws", *arguments, home=self.home, **{**self.env, **env})
 
     def outputs(self) -> dict[str, str]:
         [stack] = self.client("cloudformation").describe_stacks(StackName="muster")["Stacks"]
@@ -90,7 +76,7 @@ def account(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Account]:
     """With the whole stack in it: workstation, endpoints and EFA too."""
     with moto_server() as url:
         account = Account(url, tmp_path_factory.mktemp("home"))
-        made = run_muster("aws", "up", "--yes", *PARAMETERS, *WHOLE, home=account.home, **account.env)
+        made = account.muster("up", "--yes", *PARAMETERS, *WHOLE)
         assert made.returncode == 0, made.stdout + made.stderr
         yield account
 
@@ -132,13 +118,10 @@ def test_the_gang_may_talk_to_itself_and_the_volume_to_the_gang_alone(account: A
         return sorted(found)
 
     gang, desk = account.physical("GangSecurityGroup"), account.physical("WorkstationSecurityGroup")
-    assert [(rule[0], rule[2]) for rule in rules("GangSecurityGroup")] == [("-1", gang)], (
-        "among themselves, and nobody else"
-    )
+    assert [(rule[0], rule[2]) for rule in rules("GangSecurityGroup")] == [("-1", gang)], "themselves alone"
     assert rules("VolumeSecurityGroup") == sorted([("tcp", 2049, gang), ("tcp", 2049, desk)])
-    assert rules("WorkstationSecurityGroup") == [("tcp", 8443, "127.0.0.1/32"), ("udp", 8443, "127.0.0.1/32")], (
-        "nobody outside until a person says who"
-    )
+    nobody = [(protocol, 8443, "127.0.0.1/32") for protocol in ("tcp", "udp")]
+    assert rules("WorkstationSecurityGroup") == nobody, "until a person says who"
 
 
 def test_private_subnets_have_the_volume_and_a_way_out(account: Account) -> None:
@@ -164,21 +147,18 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
     batch = account.client("batch")
     [queue] = batch.describe_job_queues(jobQueues=["muster"])["jobQueues"]
     [order] = queue["computeEnvironmentOrder"]
-    [described] = batch.describe_compute_environments(computeEnvironments=[order["computeEnvironment"]])[
-        "computeEnvironments"
-    ]
+    named = {"computeEnvironments": [order["computeEnvironment"]]}
+    [described] = batch.describe_compute_environments(**named)["computeEnvironments"]
     resources = described["computeResources"]
     assert (described["type"], resources["type"], int(resources["maxvCpus"])) == ("MANAGED", "EC2", 256)
-    assert resources["subnets"] == [account.physical("PrivateSubnet1")] and resources["instanceTypes"] == [
-        "g6.12xlarge"
-    ]
+    assert resources["subnets"] == [account.physical("PrivateSubnet1")]
+    assert resources["instanceTypes"] == ["g6.12xlarge"]
     assert resources["securityGroupIds"] == [account.physical("GangSecurityGroup")]
     assert resources["instanceRole"].endswith(account.physical("InstanceProfile"))
     [definition] = batch.describe_job_definitions(jobDefinitionName="muster-check")["jobDefinitions"]
     assert definition["type"] == "multinode"
-    [template] = account.client("ec2").describe_launch_template_versions(
-        LaunchTemplateId=account.physical("LaunchTemplate")
-    )["LaunchTemplateVersions"]
+    named = {"LaunchTemplateId": account.physical("LaunchTemplate")}
+    [template] = account.client("ec2").describe_launch_template_versions(**named)["LaunchTemplateVersions"]
     data = template["LaunchTemplateData"]
     assert data["MetadataOptions"]["HttpTokens"] == "required"
     assert data["NetworkInterfaces"][0]["InterfaceType"] == "efa"
@@ -217,7 +197,7 @@ def test_roles_allow_no_more_than_they_must(account: Account) -> None:
     assert iam.list_attached_role_policies(RoleName=account.physical("JobRole"))["AttachedPolicies"] == []
 
 
-def test_the_engine_works_with_the_configuration_that_up_has_written(
+def test_the_engine_works_with_what_up_has_written(
     account: Account, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     for name, value in account.env.items():
@@ -236,9 +216,8 @@ def test_the_engine_works_with_the_configuration_that_up_has_written(
     )
     handle = engine.launch(engine.plan(gang))
     job = handle.facts["aws"]
-    [listed] = account.client("batch").list_jobs(
-        jobQueue="muster", filters=[{"name": "JOB_NAME", "values": [f"ant-{gang.job}-1-1"]}]
-    )["jobSummaryList"]
+    filters = [{"name": "JOB_NAME", "values": [f"ant-{gang.job}-1-1"]}]
+    [listed] = account.client("batch").list_jobs(jobQueue="muster", filters=filters)["jobSummaryList"]
     assert listed["jobId"] == job and engine.launch(engine.plan(gang)) == handle
     [definition] = account.client("batch").describe_job_definitions(jobDefinitionName="muster-ant")["jobDefinitions"]
     assert definition["type"] == "multinode" and definition["tags"]["muster:digest"]
@@ -249,10 +228,8 @@ def test_status_lists_the_resources_and_writes_the_engine_s_configuration(accoun
     assert shown.returncode == 0, shown.stderr
     assert "muster in us-east-1: CREATE_COMPLETE" in shown.stdout and "not pushed yet" in shown.stdout
     manifest = json.dumps({"schemaVersion": 2, "config": {"digest": "sha256:0"}, "layers": []})
-    kind = "application/vnd.docker.distribution.manifest.v2+json"
-    account.client("ecr").put_image(
-        repositoryName="muster", imageManifest=manifest, imageTag="latest", imageManifestMediaType=kind
-    )
+    image = {"imageManifestMediaType": "application/vnd.docker.distribution.manifest.v2+json", "imageTag": "latest"}
+    account.client("ecr").put_image(repositoryName="muster", imageManifest=manifest, **image)
     assert "image " in account.muster("status").stdout and "not pushed" not in account.muster("status").stdout
     before = (account.home / "aws.json").read_text()
     (account.home / "aws.json").unlink()
@@ -263,9 +240,7 @@ def test_status_lists_the_resources_and_writes_the_engine_s_configuration(accoun
     assert refused.splitlines()[-1].endswith("aws.json: poll: expected a number, found a text ('2')")
     (account.home / "aws.json").write_text(before)
     assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
-    assert account.muster("status", "--stack-name", "other").stderr == (
-        "muster: there is no stack other in us-east-1; create it with `muster aws up`\n"
-    )
+    assert account.muster("status", "--stack-name", "other").stderr == NO_STACK.format("other")
 
 
 @pytest.mark.parametrize(
@@ -282,10 +257,8 @@ def test_a_wrong_call_is_refused_before_anything_is_asked(account: Account, argu
 
 def test_without_credentials_or_region_it_says_what_to_do(account: Account) -> None:
     refused = account.muster("status", AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY="")
-    assert (refused.returncode, refused.stderr) == (
-        1,
-        "muster: AWS: no credentials; run `aws configure`, or set AWS_PROFILE\n",
-    )
+    said = "muster: AWS: no credentials; run `aws configure`, or set AWS_PROFILE\n"
+    assert (refused.returncode, refused.stderr) == (1, said)
     refused = account.muster("status", AWS_DEFAULT_REGION="")
     assert refused.stderr == "muster: AWS: no region; give --region, or set AWS_DEFAULT_REGION\n"
     refused = account.muster("status", AWS_ENDPOINT_URL="http://127.0.0.1:9", AWS_MAX_ATTEMPTS="1")
@@ -315,9 +288,7 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
         assert not (tmp_path / "aws.json").exists()
         networks = [each["CidrBlock"] for each in account.client("ec2").describe_vpcs()["Vpcs"]]
         assert "10.20.0.0/16" not in networks and account.client("efs").describe_file_systems()["FileSystems"]
-        assert account.muster("down", "--yes").stderr == (
-            "muster: there is no stack muster in us-east-1; create it with `muster aws up`\n"
-        )
+        assert account.muster("down", "--yes").stderr == NO_STACK.format("muster")
 
 
 def test_the_resource_that_failed_first_is_named_not_those_that_it_took_along() -> None:
@@ -330,9 +301,8 @@ def test_the_resource_that_failed_first_is_named_not_those_that_it_took_along() 
         event("NatGateway", "CREATE_FAILED", "The maximum number of addresses has been reached."),
         event("muster", "ROLLBACK_IN_PROGRESS", "The following resource(s) failed to create: [NatGateway]."),
     ]
-    assert (
-        first_failure(events) == "NatGateway (AWS::EC2::NatGateway): The maximum number of addresses has been reached."
-    )
+    said = "NatGateway (AWS::EC2::NatGateway): The maximum number of addresses has been reached."
+    assert first_failure(events) == said
 
 
 def _section(name: str) -> list[str]:
@@ -348,7 +318,6 @@ def _resource(name: str) -> list[str]:
     found = []
     for line in lines:
         if line.startswith(f"  {name}:"):
-            found = [
-                each.partition(" #")[0].strip() for each in itertools.takewhile(lambda each: each[2:3] == " ", lines)
-            ]
+            inner = itertools.takewhile(lambda each: each[2:3] == " ", lines)
+            found = [each.partition(" #")[0].strip() for each in inner]
     return found

@@ -19,7 +19,7 @@ from orchestrator.engines.slurm.commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm.engine import SlurmEngine
 from orchestrator.engines.slurm.states import ending, waiting
 from tests.conftest import Serving, wait_for
-from tests.support.engines.sites import POLITE, STUBBORN, WAIT
+from tests.support.engines.sites import STUBBORN, WAIT
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
 from tests.support.engines.slurm_cluster import GPUS, NODES
 
@@ -41,9 +41,7 @@ def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBenc
         bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
 
 
-def test_a_job_for_more_hosts_than_there_are_now_is_taken_and_says_what_it_waits_for(
-    bench: SlurmBench, tmp_path: Path
-) -> None:
+def test_a_job_for_more_hosts_than_there_are_says_what_it_waits_for(bench: SlurmBench, tmp_path: Path) -> None:
     spec = tmp_path / "job.yaml"
     spec.write_text("name: large\nnodes: 3\ncommand: [sleep, '600']\nresources: {cpus: 0.5, memory: 64MiB}\n")
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
@@ -91,9 +89,7 @@ def test_a_node_that_slurm_would_boot_is_a_host_and_one_that_is_out_of_service_i
     assert [(host.name, host.away) for host in list_hosts()] == [("slurm/n1", away)]
 
 
-def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
-    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     hard = "a'b\"c\nd $HOME `date` \\ é\tMUSTER\n@nodes@ %j"
     monkeypatch.setenv("MUSTER_TOKEN", "secret")
     monkeypatch.setenv("MUSTER_DATABASE", "secret")
@@ -127,9 +123,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     assert "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS" not in told[1]
 
 
-def test_without_gpus_a_node_sees_none_and_two_jobs_on_one_host_have_two_ports(
-    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_sees_its_gpus_alone_and_each_job_has_a_port(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
     script = f'echo "gpus[$CUDA_VISIBLE_DEVICES] port $MASTER_PORT"; {WAIT}'
     pin = {"nodelist": "n1"}
@@ -208,37 +202,29 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
     bench.engine.stop(big, 0.0)
 
 
+UNEQUAL = {"nodes": 2, "placements": [Placement("a", (), 1, 64), Placement("b", (), 1, 128)]}
+MOUNTED = {
+    "volumes": [{"name": "v", "host": {"sourcePath": "/data"}}],
+    "mountPoints": [{"sourceVolume": "v", "containerPath": "/mnt"}],
+}
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
         (
             {"options": {"partition": "gpu"}},
-            "for partition gpu: invalid partition specified: gpu; .*Invalid partition name",
+            "partition gpu: invalid partition specified: gpu; .*Invalid partition name",
         ),
         ({"gpus": 3}, "Slurm refuses the job: .*Requested node configuration is not available"),
         ({"cpus": 5}, "Slurm refuses the job: .*Requested node configuration is not available"),
         ({"options": {"nice": "much"}}, "muster:nice is 'much', not a whole number"),
         ({"title": "a\nb"}, "title .* has a control character"),
-        (
-            {"nodes": 2, "placements": [Placement("a", (), 1, 64), Placement("b", (), 1, 128)]},
-            "nodes of one gang are of one size on Slurm, these are not .*64 MiB.*128 MiB",
-        ),
-        (
-            {
-                "containers": [
-                    {
-                        "volumes": [{"name": "v", "host": {"sourcePath": "/data"}}],
-                        "mountPoints": [{"sourceVolume": "v", "containerPath": "/mnt"}],
-                    }
-                ]
-            },
-            "volume /mnt: the slurm engine mounts nothing",
-        ),
+        (UNEQUAL, "nodes of one gang are of one size on Slurm, these are not .*64 MiB.*128 MiB"),
+        ({"containers": [MOUNTED]}, "volume /mnt: the slurm engine mounts nothing"),
     ],
 )
-def test_a_gang_that_slurm_can_t_start_is_refused_in_one_line(
-    bench: SlurmBench, changes: dict[str, Any], why: str
-) -> None:
+def test_a_gang_that_slurm_refuses_is_refused_in_one_line(bench: SlurmBench, changes: dict[str, Any], why: str) -> None:
     with pytest.raises(EngineError, match=why) as refused:
         bench.launch(bench.gang(**changes))
     assert "\n" not in str(refused.value) and not isinstance(refused.value, NotYet)
@@ -252,25 +238,14 @@ def test_the_script_has_the_options_of_the_queue_and_of_the_job(bench: SlurmBenc
     )
     document = bench.engine.plan(gang).document
     for line in (
-        '--job-name="my \\"job\\" é"',
-        f"--comment={gang.name}",
-        "--nodes=2",
-        "--ntasks-per-node=1",
-        "--mem=64M",
-        "--gpus-per-node=a100:2",
-        "--partition=urgent",
-        "--qos=high",
-        "--nice=70",
-        "--time=62",
-        "--signal=B:USR1@35",
-        "--open-mode=append",
-        "--no-requeue",
+        *('--job-name="my \\"job\\" é"', f"--comment={gang.name}", "--nodes=2", "--ntasks-per-node=1", "--mem=64M"),
+        *("--gpus-per-node=a100:2", "--partition=urgent", "--qos=high", "--nice=70", "--time=62"),
+        *("--signal=B:USR1@35", "--open-mode=append", "--no-requeue"),
     ):
         assert f"#SBATCH {line}\n" in document, document
     assert "secret" not in document
-    assert (
-        "#SBATCH --time=0:20:00\n" in bench.engine.plan(dataclasses.replace(gang, options={"time": "0:20:00"})).document
-    )
+    timed = dataclasses.replace(gang, options={"time": "0:20:00"})
+    assert "#SBATCH --time=0:20:00\n" in bench.engine.plan(timed).document
 
 
 def test_slurm_gets_the_script_of_the_plan(bench: SlurmBench) -> None:
@@ -283,11 +258,8 @@ def test_slurm_gets_the_script_of_the_plan(bench: SlurmBench) -> None:
     assert plan.document == plan.request.script.replace("the credential", "\\u2026"), "all of it but the credential"
 
 
-def test_a_gang_gets_sigterm_and_after_the_grace_sigkill(bench: SlurmBench) -> None:
-    polite = bench.ready(bench.gang(POLITE, 3))
-    assert bench.stopped(polite, 30.0) == [75, 75, 75]
-    assert bench.log().count("saved") >= 3  # Slurm signals every process of a step, and the supervisor its rank
-    stubborn = bench.ready(bench.gang(STUBBORN, suffix="2", grace=60.0))
+def test_a_gang_that_does_not_heed_sigterm_gets_sigkill_after_the_grace(bench: SlurmBench) -> None:
+    stubborn = bench.ready(bench.gang(STUBBORN, grace=60.0))
     asked = time.monotonic()
     assert bench.stopped(stubborn, 1.0) == [137]
     assert time.monotonic() - asked > 0.9
@@ -313,9 +285,7 @@ def test_a_directory_missing_on_a_node_is_one_line_with_the_node_s_name(bench: S
     assert " is not the controller's: run run has epoch 1 there, not 2" in node.words
 
 
-def test_a_first_node_that_lacks_this_python_or_the_store_is_reported_in_one_line(
-    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_first_node_without_python_or_store_is_one_line(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(sys, "executable", "/no/python")
         handle = bench.launch(bench.gang(nodes=2))
@@ -327,25 +297,23 @@ def test_a_first_node_that_lacks_this_python_or_the_store_is_reported_in_one_lin
         slurm_script, "render", lambda gang: render(gang).replace(slurm_script.output_path(gang), elsewhere)
     )
     [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
-    assert (
-        node.words.startswith("Slurm could not start it on n1: is ")
-        and "file system that all nodes share" in node.words
-    )
+    assert node.words.startswith("Slurm could not start it on n1: is ")
+    assert "file system that all nodes share" in node.words
+
+
+LIMIT = "QOSMaxCpuPerUserLimit"
+DOWN = "Slurm: nodes that it needs are down, drained or reserved"
 
 
 @pytest.mark.parametrize(
     ("state", "reason", "words"),
     [
-        (
-            "PENDING",
-            "QOSMaxCpuPerUserLimit",
-            "Slurm: a limit of the account or QOS is reached (QOSMaxCpuPerUserLimit; job 5)",
-        ),
-        ("PENDING", "ReqNodeNotAvail, UnavailableNodes:n1", "Slurm: nodes that it needs are down, drained or reserved"),
+        ("PENDING", LIMIT, f"Slurm: a limit of the account or QOS is reached ({LIMIT}; job 5)"),
+        ("PENDING", "ReqNodeNotAvail, UnavailableNodes:n1", DOWN),
         (
             "PENDING",
             "Nodes required for job are DOWN, DRAINED or reserved for jobs in higher priority partitions",
-            "Slurm: nodes that it needs are down, drained or reserved",
+            DOWN,
         ),
         ("PENDING", "SomethingNew", "Slurm: waits (SomethingNew; job 5)"),
         ("CONFIGURING", "None", "Slurm: n1 is being made ready (job 5)"),
@@ -358,19 +326,12 @@ def test_slurm_s_reason_for_a_waiting_job_is_put_into_words(state: str, reason: 
 @pytest.mark.parametrize(
     ("state", "cause", "code", "words"),
     [
-        ("PREEMPTED", Cause.PREEMPTED, 75, "preempted by Slurm, and did not leave in time (job 5)"),
-        (
-            "TIMEOUT",
-            Cause.STOPPED,
-            137,
-            "Slurm ended it at its time limit; ask for more (timeout, or muster:time) (job 5)",
-        ),
-        ("OUT_OF_MEMORY", Cause.OUT_OF_MEMORY, 137, "OutOfMemoryError: Container killed due to memory usage (job 5)"),
-        ("NODE_FAIL", Cause.HOST_LOST, 137, "Slurm lost a node of n1 (job 5)"),
-        ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
+        ("PREEMPTED", Cause.PREEMPTED, 75, "preempted by Slurm, and did not leave in time"),
+        ("TIMEOUT", Cause.STOPPED, 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time)"),
+        ("OUT_OF_MEMORY", Cause.OUT_OF_MEMORY, 137, "OutOfMemoryError: Container killed due to memory usage"),
+        ("NODE_FAIL", Cause.HOST_LOST, 137, "Slurm lost a node of n1"),
+        ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why"),
     ],
 )
-def test_a_node_without_an_outcome_ends_as_slurm_ended_its_job(
-    state: str, cause: Cause | None, code: int, words: str
-) -> None:
-    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (cause, code, words)
+def test_a_node_without_outcome_ends_as_slurm_says(state: str, cause: Cause | None, code: int, words: str) -> None:
+    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (cause, code, f"{words} (job 5)")

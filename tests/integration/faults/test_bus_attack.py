@@ -155,9 +155,7 @@ def test_a_node_publishes_below_its_own_key_only(bus: Bus, victim: Victim, mallo
     assert bus.progress("victim", 1, 0) == {"iteration": 7}
 
 
-def test_a_node_feigns_neither_presence_nor_absence_of_another(
-    bus: Bus, victim: Victim, mallory: zenoh.Session
-) -> None:
+def test_a_node_feigns_no_presence_nor_absence_of_another(bus: Bus, victim: Victim, mallory: zenoh.Session) -> None:
     keys = [
         presence_key(own(bus), "victim", 1, 0),
         presence_key(own(bus), "victim", 1, 1),
@@ -174,7 +172,7 @@ def test_a_node_feigns_neither_presence_nor_absence_of_another(
 
 
 @pytest.mark.parametrize("complete", [False, True])
-def test_an_answer_under_the_name_of_another_node_is_ignored(
+def test_an_answer_in_another_node_s_name_is_ignored(
     bus: Bus, victim: Victim, mallory: zenoh.Session, complete: bool
 ) -> None:
     overheard: list[dict[str, Any]] = []

@@ -17,9 +17,7 @@ from orchestrator.persistence.models import Job
 from tests.support.orchestrator.fake_controller import FakeController, properties
 
 
-def test_an_attempt_is_read_back_from_the_database_as_the_state_machine_left_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     left: dict[int, State] = {}
     """By number of the attempt."""
     found: list[tuple[State, State]] = []

@@ -135,7 +135,7 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     assert len(owners) == 1, "the evaluations are the training's owner's"
 
 
-def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate_as_other_commands_take_it(
+def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate(
     controller: Controller,
 ) -> None:
     training = controller.train({"every": 1})
@@ -298,7 +298,7 @@ def test_evaluations_that_could_never_start_are_refused_with_the_training(
 
 
 @pytest.mark.parametrize("command", [("resume", "taught"), ("clone", "taught", "--name", "twin")])
-def test_evaluations_that_could_never_start_are_refused_with_a_resume_and_a_clone(
+def test_a_resume_and_a_clone_refuse_evaluations_that_never_start(
     controller: Controller, command: tuple[str, ...]
 ) -> None:
     add_run(controller.server.store, "taught")

@@ -23,6 +23,7 @@ from orchestrator.api.http.connections import Connection, Connections, raise_des
 from orchestrator.client import Client
 from orchestrator.server import Server
 from tests.conftest import MUSTER, Serving, submit_gang, wait_for
+from tests.support.orchestrator.jobs import serving
 
 DESCRIPTORS = 1024
 HALF_OPEN = 1100
@@ -114,9 +115,7 @@ def test_a_head_that_is_too_large_is_refused_however_it_arrives(inside: Server, 
             assert answer.startswith(b"HTTP/1.1 400 ") or not answer, answer
 
 
-def test_slow_sending_does_not_extend_the_time_limit_of_a_connection(
-    inside: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_sending_does_not_extend_a_connection_s_limit(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "HEADER_TIMEOUT", 0.5)
     with half_open(inside.url) as connection:
         connection.settimeout(0.1)
@@ -161,9 +160,7 @@ def address_of_large(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int
 
 
 @pytest.mark.parametrize("another", [False, True], ids=["one", "and begins another request"])
-def test_a_client_that_reads_a_large_answer_slowly_gets_all_of_it(
-    address_of_large: tuple[str, int], another: bool
-) -> None:
+def test_a_slow_reader_gets_all_of_a_large_answer(address_of_large: tuple[str, int], another: bool) -> None:
     with socket.socket() as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
         connection.settimeout(60)
@@ -192,15 +189,10 @@ def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(
     limit = 600 + len(os.listdir("/proc/self/fd"))
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
-        server = Server(tmp_path, cpus=1)
-        try:
-            server.start()
+        with serving(tmp_path) as client:
             assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > limit
-            with Client(server.url) as client:
-                job = submit_gang(client, "import resource; print(*resource.getrlimit(resource.RLIMIT_NOFILE))")
-                assert next(line["text"] for line in client.logs(job, follow=True)) == f"{limit} {hard}"
-        finally:
-            server.close()
+            job = submit_gang(client, "import resource; print(*resource.getrlimit(resource.RLIMIT_NOFILE))")
+            assert next(line["text"] for line in client.logs(job, follow=True)) == f"{limit} {hard}"
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 

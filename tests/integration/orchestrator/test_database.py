@@ -66,9 +66,7 @@ def opened(url: str) -> Iterator[Callable[[], Database]]:
 
 
 @pytest.mark.parametrize("history", ["new", "migrated"])
-def test_a_new_database_and_a_migrated_one_have_what_the_tables_say(
-    url: str, opened: Callable[[], Database], history: str
-) -> None:
+def test_a_new_and_a_migrated_database_match_the_tables(url: str, opened: Callable[[], Database], history: str) -> None:
     if history == "migrated":
         migrate(url, "upgrade", "head")
     database = opened()
@@ -80,9 +78,7 @@ def test_a_new_database_and_a_migrated_one_have_what_the_tables_say(
         assert [each.name for each in session.scalars(select(ComputeEnvironment))] == ["local"]
 
 
-def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_jobs(
-    url: str, opened: Callable[[], Database]
-) -> None:
+def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0001")
     engine = create_engine(url)
     with engine.begin() as connection:
@@ -112,9 +108,7 @@ def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_job
         )
 
 
-def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_definition(
-    url: str, opened: Callable[[], Database]
-) -> None:
+def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0003")
     engine = create_engine(url)
     insert = (
@@ -140,9 +134,7 @@ def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_defin
     engine.dispose()
 
 
-def test_runs_of_an_older_database_belong_to_the_queue_and_owner_of_their_first_job(
-    url: str, opened: Callable[[], Database]
-) -> None:
+def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0004")
     engine = create_engine(url)
     with engine.begin() as connection:
@@ -237,9 +229,7 @@ def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path:
         os.umask(before)
 
 
-def test_a_controller_that_lost_its_database_to_another_refuses_writes_and_goes_on_reading(
-    server: postgres.Server, tmp_path: Path
-) -> None:
+def test_a_controller_that_lost_its_database_refuses_writes_alone(server: postgres.Server, tmp_path: Path) -> None:
     url = server.new_database()
     losing = Server(tmp_path, database=url)
     losing.start()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.conftest import Serving, run_muster
+from tests.conftest import Serving, call_muster
 
 
 def test_all_requirements_are_installed(tmp_path: Path) -> None:
-    done = run_muster("doctor", "--worker", "--engine", "local", home=tmp_path)
+    done = call_muster("doctor", "--worker", "--engine", "local", home=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     for said in ("torch 2.", "a durable write takes", "muster serve starts one", "1 host, "):
         assert said in done.stdout
@@ -23,7 +23,7 @@ def test_a_controller_is_found(shared_server: Serving) -> None:
 
 def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    bad = run_muster(
+    bad = call_muster(
         *("doctor", "--store", str(tmp_path / "file" / "store"), "--engine", "docker", "--engine", "nothing"),
         home=tmp_path,
         DOCKER_HOST="unix:///nowhere.sock",

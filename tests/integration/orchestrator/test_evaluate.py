@@ -1,10 +1,10 @@
-"""`muster evaluate`, `compare` and `checkpoints` through a real server: what is submitted, what is refused, what is shown."""
+"""`muster evaluate`, `compare` and `checkpoints` through a real server, and what a racer's job can't be: submitted, refused, shown."""
 
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,21 @@ import pytest
 from shared_store.files import write_json
 from shared_store.layout import Store
 from shared_store.metrics import MetricsWriter
-from tests.conftest import Serving, call_muster
+from tests.conftest import Serving
+from tests.support.orchestrator.jobs import jobs_of, refusal
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
 CONFIG = {"angle_limit": 0.2}
+CHOICES = json.dumps({"action_space": [{"steering_angle": angle, "speed": 1.0} for angle in (-30, 0, 30)]})
+TRAIN = {"task": "Racer", "worlds": 8, "iterations": 9, "config": {"track": "oval"}}
+RACER: dict[str, Any] = {"name": "racer", "resources": {"cpus": 1, "memory": 64}, "train": TRAIN}
+NAMED = "did you mean oval?"
 
 
-@pytest.fixture(scope="module")
-def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
-    """A server whose only CPU is taken: what is submitted waits. Its store has trained runs."""
-    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "1")
-    blocker = server.gang("import time; time.sleep(3600)", cpus="1", name="blocker")
-    server.wait(blocker, "RUNNING")
-    store = Store(server.home / "store")
+@pytest.fixture(scope="module", autouse=True)
+def store(full: Serving) -> Store:
+    """It has trained runs."""
+    store = Store(full.home / "store")
     for name, seed, reward in (("taught", 1, 10.0), ("taught-b", 2, 14.0), ("slow", 1, 3.0)):
         train = {**SPEC["train"], "seed": seed, **({"worlds": 2} if name == "slow" else {})}
         add_run(store, name, {**SPEC, "name": name, "train": train, "environment": {"LEVEL": "1"}})
@@ -35,145 +37,120 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
             facts = {"train": {**train, "config": CONFIG}, "score": float(iteration)}
             add_checkpoint(store, name, iteration, **facts)
         with MetricsWriter(store.run(name), 1, 0) as metrics:
-            for iteration in range(1, 10):
-                metrics.write(
-                    {"iteration": iteration, "env_steps": 100 * iteration, "reward": reward, "episode_length": 5}
-                )
+            for i in range(1, 10):
+                metrics.write({"iteration": i, "env_steps": 100 * i, "reward": reward, "episode_length": 5})
     add_run(store, "empty")
     add_run(store, "fast-car", {**SPEC, "name": "fast-car", "train": {**SPEC["train"], "task": "Racer"}})
     add_checkpoint(store, "fast-car", 9, task="Racer", train={"task": "Racer", "config": {"track": "oval"}})
+    add_run(store, "racer", RACER)  # with ranges of actions
+    add_checkpoint(store, "racer", 9, task="Racer", train=TRAIN, settings={})
     for iteration, mean in ((9, 21.0), (6, 29.0)):
         evaluated(store, "taught", f"{iteration:08d}-e1-0123abcd", mean)
     evaluated(store, "taught-b", "00000009-e1", 25.0)
-    yield server
-    server.close()
+    return store
 
 
 def evaluated(store: Store, run: str, name: str, mean: float, **facts: Any) -> None:
-    figures = {
-        "mean_return": mean,
-        "mean_length": 9.0,
-        "max_length": 10,
-        "episodes": 100,
-        "time": mean,
-        "task": "Cartpole",
-    }
+    figures = {"mean_return": mean, "mean_length": 9.0, "max_length": 10, "episodes": 100, "time": mean}
+    figures["task"] = "Cartpole"
     share = {"share": 0.75, "low": 0.66, "high": 0.82, "count": 75}
     interval = {"mean": mean, "std": 2.0, "low": mean - 0.5, "high": mean + 0.5}
     write_json(store.run(run).evaluations / f"{name}.json", {**figures, "success": share, "return": interval, **facts})
 
 
-def submitted(server: Serving, tmp_path: Path, section: dict[str, Any], *options: str) -> Any:
-    spec = tmp_path / "judge.yaml"
-    spec.write_text(json.dumps({"name": "judge", "evaluate": section}))
-    return call_muster("submit", str(spec), *options, home=server.home)
-
-
 REFUSED = {
-    ("nosuch",): (2, "run nosuch does not exist"),
-    ("taugt",): (2, "did you mean taught"),
-    ("taught@4",): (2, "run taught has no checkpoint of iteration 4; it has: 3, 6, 9"),
-    ("taught@last",): (2, "expected an iteration, best or latest after @"),
-    ("empty",): (2, "run empty has no checkpoint yet; train it first"),
-    ("taught", "--episodes", "0"): (2, "evaluate.episodes: expected a value greater than or equal to 1, found 0"),
-    ("taught", "--set", "config.angel_limit=1.0"): (2, "CartpoleConfig has no such key; did you mean angle_limit?"),
-    ("taught", "--set", "config.angle_limit=wide"): (2, "evaluate.config.angle_limit: expected a number"),
-    ("taught", "--set", "resource.cpus=1"): (2, "resource: unknown key; did you mean resources?"),
-    ("taught", "--name", "a b"): (2, "name: expected letters"),
-    ("taught", "--set", "resources.cpus=400"): (2, "lower nodes or resources"),
-    ("taught", "--race"): (
-        2,
-        "race: run taught trained Cartpole, which drives no laps; race only runs of a racer's",
-    ),
-    ("fast-car", "--trials", "3"): (2, "--trials: only races take it; add --race"),
-    ("fast-car", "-o", "there"): (2, "--output: only races take it; add --race"),
-    ("fast-car", "--race", "--episodes", "3"): (2, "--episodes: a race takes --trials instead, one world each"),
-    ("fast-car", "--race", "--trials", "0"): (2, "race.trials: expected a value greater than or equal to 1, found 0"),
-    ("fast-car", "--race", "--penalty", "-1"): (
-        2,
-        "race.off_track_penalty: expected a value greater than or equal to 0",
-    ),
-    ("fast-car", "--race", "--set", "config.put_bakc=2.0"): (
-        2,
-        "race.config.put_bakc: RacerConfig has no such key; did you",
-    ),
-    ("fast-car", "--race", "--set", "config.put_back=20.0"): (2, "race.config.put_back: expected a value less than"),
-    ("fast-car", "--race", "--set", "race.traks=[oval]"): (2, "race.traks: unknown key; did you mean track?"),
-    ("fast-car", "--race", "--set", "nodes=2"): (2, "race: it runs on one node with at most one GPU"),
+    "nosuch": "run nosuch does not exist",
+    "taugt": "did you mean taught",
+    "taught@4": "run taught has no checkpoint of iteration 4; it has: 3, 6, 9",
+    "taught@last": "expected an iteration, best or latest after @",
+    "empty": "run empty has no checkpoint yet; train it first",
+    "taught --episodes 0": "evaluate.episodes: expected a value greater than or equal to 1, found 0",
+    "taught --set config.angel_limit=1.0": "CartpoleConfig has no such key; did you mean angle_limit?",
+    "taught --set config.angle_limit=wide": "evaluate.config.angle_limit: expected a number",
+    "taught --set resource.cpus=1": "resource: unknown key; did you mean resources?",
+    "taught --name 'a b'": "name: expected letters",
+    "taught --set resources.cpus=400": "lower nodes or resources",
+    "taught --race": "race: run taught trained Cartpole, which drives no laps; race only runs of a racer's",
+    "fast-car --trials 3": "--trials: only races take it; add --race",
+    "fast-car -o there": "--output: only races take it; add --race",
+    "fast-car --race --episodes 3": "--episodes: a race takes --trials instead, one world each",
+    "fast-car --race --trials 0": "race.trials: expected a value greater than or equal to 1, found 0",
+    "fast-car --race --penalty -1": "race.off_track_penalty: expected a value greater than or equal to 0",
+    "fast-car --race --set config.put_bakc=2.0": "race.config.put_bakc: RacerConfig has no such key; did you",
+    "fast-car --race --set config.put_back=20.0": "race.config.put_back: expected a value less than",
+    "fast-car --race --set race.traks=[oval]": "race.traks: unknown key; did you mean track?",
+    "fast-car --race --set nodes=2": "race: it runs on one node with at most one GPU",
+    "racer --race --track ovall": f"muster: race.track: track ovall does not exist; {NAMED}\n",
+    "racer --set config.track=ovall": f"muster: evaluate.config.track: track ovall does not exist; {NAMED}\n",
 }
 
 
-@pytest.mark.parametrize("options", REFUSED)
-def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, options: tuple[str, ...]) -> None:
-    code, said = REFUSED[options]
-    jobs = json.loads(call_muster("list", "--json", home=full.home).stdout)
-    done = call_muster("evaluate", *options, home=full.home)
-    assert done.returncode == code and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
-    assert json.loads(call_muster("list", "--json", home=full.home).stdout) == jobs
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
+    assert REFUSED[line] in refusal(full, "evaluate", *shlex.split(line))
 
 
 def test_a_job_from_yaml_is_checked_as_the_command_s_is(full: Serving, tmp_path: Path) -> None:
+    spec = tmp_path / "judge.yaml"
     for section, said in (
-        ({"run": "taught", "checkpoint": 4}, "no checkpoint of iteration 4"),
-        ({"run": "taught", "config": {"angel_limit": 1}}, "did you mean angle_limit?"),
-        (
-            {"run": "taught", "checkpoint": "newest"},
-            "evaluate.checkpoint: expected an iteration, best or latest, found 'newest'",
-        ),
+        ({"checkpoint": 4}, "no checkpoint of iteration 4"),
+        ({"config": {"angel_limit": 1}}, "did you mean angle_limit?"),
+        ({"checkpoint": "new"}, "evaluate.checkpoint: expected an iteration, best or latest, found 'new'"),
     ):
+        spec.write_text(json.dumps({"name": "judge", "evaluate": {"run": "taught", **section}}))
         for options in ([], ["--dry-run"]):
-            done = submitted(full, tmp_path, section, *options)
-            assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
-    done = submitted(full, tmp_path, {"run": "taught", "checkpoint": "best", "config": {"angle_limit": 0.3}}, "--json")
+            assert said in refusal(full, "submit", str(spec), *options)
+    spec.write_text(
+        '{"name": "judge", "evaluate": {"run": "taught", "checkpoint": "best", "config": {"angle_limit": 0.3}}}'
+    )
+    done = full.muster("submit", str(spec), "--json")
     assert done.returncode == 0, done.stderr
     assert full.detail(json.loads(done.stdout)["jobId"])["spec"]["evaluate"]["checkpoint"] == "best"
 
 
 def test_checkpoints_show_what_was_evaluated_and_the_best_follows_from_it(full: Serving) -> None:
-    listed = call_muster("checkpoints", "taught", home=full.home).stdout.splitlines()
+    listed = full.muster("checkpoints", "taught").stdout.splitlines()
     third, sixth, ninth = listed[1:]
     assert "29.00 ± 0.50" in sixth and "the best" in sixth
     assert "21.00 ± 0.50" in ninth and "the best" not in ninth + third
     found = full.client.get("/api/runs/taught/evaluations")
     assert [each["checkpoint"] for each in found] == ["00000009-e1", "00000006-e1"]
-    answer = json.loads(call_muster("clone", "taught@best", "--name", "of-best", "--json", home=full.home).stdout)
+    answer = json.loads(full.muster("clone", "taught@best", "--name", "of-best", "--json").stdout)
     assert answer["parent"]["iteration"] == 6
     shutil.rmtree(full.home / "store" / "runs" / "of-best")
 
 
 def test_compare_puts_seeds_into_one_group_and_draws_curves(full: Serving, tmp_path: Path) -> None:
     picture = tmp_path / "curves.png"
-    done = call_muster("compare", "taught*", "slow", "-o", str(picture), home=full.home)
+    done = full.muster("compare", "taught*", "slow", "-o", str(picture))
     assert done.returncode == 0, done.stderr
     header, both, slow, drawn = done.stdout.splitlines()
     assert header.split() == ["RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS"]
     assert "taught* (2)" in both and "1, 2" in both and "12.00 ± 2.83" in both and "27.00 ± 2.83" in both
     assert both.rstrip().endswith("75.0 %") and "3.00" in slow and slow.rstrip().endswith("-")
     assert drawn == f"written: {picture}" and picture.read_bytes().startswith(b"\x89PNG")
-    (group, _) = json.loads(call_muster("compare", "taught*", "slow", "--json", home=full.home).stdout)
+    (group, _) = json.loads(full.muster("compare", "taught*", "slow", "--json").stdout)
     assert group["runs"] == ["taught", "taught-b"] and group["evaluated"]["mean"] == 27.0
 
 
-def test_single_runs_that_played_the_same_episodes_are_compared_pair_by_pair(full: Serving, tmp_path: Path) -> None:
-    store = Store(full.home / "store")
+def test_single_runs_that_played_the_same_episodes_are_compared(full: Serving, store: Store, tmp_path: Path) -> None:
     returns = {"fast": [10.0, 20.0, 30.0, 41.0], "sure": [11.0, 21.5, 31.0, 42.5, 99.0], "odd": [1.0, 2.0, 3.0, 4.0]}
     for worlds, (name, values) in enumerate(returns.items(), 5):
         add_run(store, name, {**SPEC, "name": name, "train": {**SPEC["train"], "worlds": worlds}})
         add_checkpoint(store, name, 9)
         table = store.run(name).evaluations / "00000009-e1-job.parquet"
-        evaluated(
-            store, name, "00000009-e1-job", sum(values) / len(values), seed=8 if name == "odd" else 7, iteration=9
-        )
+        mean, seed = sum(values) / len(values), 8 if name == "odd" else 7
+        evaluated(store, name, "00000009-e1-job", mean, seed=seed, iteration=9)
         columns = {"episode": list(range(len(values))), "return": values}
         pyarrow.parquet.write_table(pyarrow.table(columns), table)
     try:
-        done = call_muster("compare", "fast", "sure", "odd", "-o", str(tmp_path / "curves.csv"), home=full.home)
+        done = full.muster("compare", "fast", "sure", "odd", "-o", str(tmp_path / "curves.csv"))
         assert done.returncode == 2 and "so nothing can be drawn" in done.stderr
-        done = call_muster("compare", "fast", "sure", "odd", home=full.home)
+        done = full.muster("compare", "fast", "sure", "odd")
         # the differences are 1, 1.5, 1, 1.5: mean 1.25, s = 0.5 / sqrt(3), and t(3) = 3.182446, so that half is 0.459
         line = "sure@9 against fast@9: return +1.25 (+0.79 to +1.71, paired over 4 episodes): better"
         assert done.stdout.splitlines()[-1] == line, "other worlds are not paired"
-        told = json.loads(call_muster("compare", "fast", "sure", "odd", "--json", home=full.home).stdout)
+        told = json.loads(full.muster("compare", "fast", "sure", "odd", "--json").stdout)
         assert [each["against"] and each["against"]["verdict"] for each in told] == [None, "better", None]
     finally:
         for name in returns:
@@ -182,7 +159,7 @@ def test_single_runs_that_played_the_same_episodes_are_compared_pair_by_pair(ful
 
 def test_the_curves_are_written_as_numbers_too(full: Serving, tmp_path: Path) -> None:
     table = tmp_path / "curves.csv"
-    assert call_muster("compare", "taught", "slow", "-o", str(table), home=full.home).returncode == 0
+    assert full.muster("compare", "taught", "slow", "-o", str(table)).returncode == 0
     header, *rows = table.read_text().splitlines()
     assert header == "group,env_steps,return,std,runs" and len(rows) == 18
     assert rows[0] == "taught,100.0,10.0,0.0,1" and rows[-1] == "slow,900.0,3.0,0.0,1"
@@ -194,32 +171,88 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
         (["taught", "slwo"], "did you mean slow"),
         (["robot-*", "slow"], "no run matches robot-*"),
         (["taught", "slow", "-o", str(tmp_path / "no" / "x.png")], "is not a directory"),
-        (
-            ["taught", "slow", "-o", str(tmp_path / "x.xyz")],
-            "unknown ending; use .png, .svg, .pdf",
-        ),
+        (["taught", "slow", "-o", str(tmp_path / "x.xyz")], "unknown ending; use .png, .svg, .pdf"),
         (["empty", "empty*", "of-*", "-o", str(tmp_path / "x.png")], "no run matches of-*"),
     ):
-        done = call_muster("compare", *options, home=full.home)
-        assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+        assert said in refusal(full, "compare", *options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Serving, tmp_path: Path) -> None:
     spec = tmp_path / "race.yaml"
-    spec.write_text(
-        '{"name": "final", "race": {"run": "fast-car", "trials": 5, "continuous": true, "track": ["oval"]}}'
-    )
-    done = call_muster("submit", str(spec), "--json", home=full.home)
+    race = {"run": "fast-car", "trials": 5, "continuous": True, "track": ["oval"]}
+    spec.write_text(json.dumps({"name": "final", "race": race}))
+    done = full.muster("submit", str(spec), "--json")
     assert done.returncode == 0, done.stderr
     detail = full.detail(json.loads(done.stdout)["jobId"])
     race = detail["spec"]["race"]
     assert (race["trials"], race["continuous"], race["off_track_penalty"], race["seconds"]) == (5, True, 1.0, 1200.0)
-    shown = call_muster("show", detail["id"], home=full.home).stdout
+    shown = full.muster("show", detail["id"]).stdout
     assert "races" in shown and "fast-car" in shown
 
 
 def test_copying_step_logs_replaces_no_file(full: Serving, tmp_path: Path) -> None:
     (tmp_path / "sim-trace").mkdir()
-    done = call_muster("evaluate", "fast-car", "--race", "-o", str(tmp_path), home=full.home)
-    assert done.returncode == 2 and "sim-trace exists; name another directory" in done.stderr
+    said = refusal(full, "evaluate", "fast-car", "--race", "-o", str(tmp_path))
+    assert "sim-trace exists; name another directory" in said
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "submit job_specs/racer.yaml --set train.config.track=ovall",
+        "submit job_specs/racer.yaml --set 'train.config.track=[chicane, ovall]'",
+        "submit job_specs/racer.yaml --set train.config.track=ovall --dry-run",
+        "clone racer --name other --set train.config.track=ovall",
+        "clone racer --name other --set train.config.track=ovall --dry-run",
+    ],
+)
+def test_a_training_on_an_unknown_track_is_told_the_nearest_name(full: Serving, line: str) -> None:
+    assert refusal(full, *shlex.split(line)) == f"muster: train.config.track: track ovall does not exist; {NAMED}\n"
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "rsl_rl"])
+def test_what_learns_numbers_alone_takes_no_choices(full: Serving, algorithm: str) -> None:
+    changes = (f"train.config.action_space={CHOICES}", f"train.algorithm={algorithm}", "train.ppo={}")
+    for dry in ((), ("--dry-run",)):
+        told = refusal(full, "submit", "job_specs/racer.yaml", *(f"--set={each}" for each in changes), *dry)
+        assert f"train.{algorithm}: " in told and "choices; use ppo" in told
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (f"action_space={CHOICES}", "ranges of 2 actions, and the clone would have 3 actions to choose from"),
+        ("waypoints=5", "8, and the clone would have 5"),
+        ("obstacles=[{distance: 3.0}]", "none, and the clone would have some"),
+        ("lidar={sectors: 4}", "none, and the clone would have one of 4 numbers"),
+    ],
+)
+def test_a_clone_whose_network_would_have_another_size_is_refused(full: Serving, change: str, said: str) -> None:
+    for dry in ((), ("--dry-run",)):
+        told = refusal(full, "clone", "racer", "--name", "other", "--set", f"train.config.{change}", *dry)
+        assert f"train.config.{change.partition('=')[0]}: {said}" in told and "leave the setting as it is" in told
+
+
+def test_a_clone_can_be_tried_without_one(full: Serving, store: Store) -> None:
+    before = len(jobs_of(full.client)), sorted(path.name for path in (store.path / "runs").iterdir())
+    changes = ("--set", "train.config.track=chicane", "--set", "train.config.rewards.off_track=-20")
+    shown = full.muster("clone", "racer", "--name", "faster", *changes, "--dry-run")
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.startswith("faster on the local engine, queue default; nothing was started\n")
+    plan = json.loads(full.muster("clone", "racer", "--name", "faster", *changes, "--dry-run", "--json").stdout)
+    assert '"track":"chicane"' in plan["nodes"][0]["environment"]["MUSTER_SPEC"]
+    assert (len(jobs_of(full.client)), sorted(path.name for path in (store.path / "runs").iterdir())) == before
+    assert "exists already" in refusal(full, "clone", "racer", "--name", "racer", "--dry-run", code=1)
+
+
+def test_a_job_is_submitted_under_another_name(full: Serving) -> None:
+    submit = ("submit", "job_specs/racer.yaml", "--name")
+    done = full.muster(*submit, "second", "--json", "--set", "resources.cpus=1")
+    assert done.returncode == 0, done.stderr
+    submitted = json.loads(done.stdout)
+    assert submitted["jobName"] == "second" and full.detail(submitted["jobId"])["spec"]["name"] == "second"
+    full.client.batch("TerminateJob", jobId=submitted["jobId"], reason="seen")
+    twice = refusal(full, *submit, "second", "--set", "name=third")
+    assert twice == "muster: --set name=third: --name second names the job; give one of them\n"
+    assert "--set: name: " in refusal(full, *submit, "a b")

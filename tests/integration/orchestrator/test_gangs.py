@@ -16,26 +16,19 @@ import pytest
 
 from orchestrator.api.batch import rules
 from orchestrator.api.native import continuing
-from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
-from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
-from tests.support.orchestrator.jobs import await_status, detail
-from tests.support.processes import parent, processes_of, processes_of_job
+from tests.support.definitions import container, multinode
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
+from tests.support.processes import parent, processes_of
 
 NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
-
-PRINT_CONTRACT = """
-import os, json
-names = [n for n in os.environ if n.startswith(('AWS_', 'MASTER_', 'NODE_', 'NNODES', 'RANK', 'WORLD', 'MUSTER_'))]
-print(json.dumps({n: os.environ[n] for n in names}))
-"""
 
 FAIL_ON_CHILD_ONCE = """
 import os, sys, time
@@ -47,35 +40,9 @@ print('attempt', os.environ['AWS_BATCH_JOB_ATTEMPT'], 'done')
 """
 
 
-def test_every_node_gets_the_contract_of_aws_and_of_torch(shared_server: Serving) -> None:
-    job = shared_server.gang(PRINT_CONTRACT + MAIN_LAST, nodes=3)
-    shared_server.wait(job)
-    nodes = [json.loads(shared_server.log(job, node=k, rank=k)[0]) for k in range(3)]
-    main, first, second = nodes
-    address = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
-    assert address not in main and first[address] == second[address] == main["MASTER_ADDR"]
-    assert [node["AWS_BATCH_JOB_ID"] for node in nodes] == [f"{job}#0", f"{job}#1", f"{job}#2"]
-    assert {node["MASTER_PORT"] for node in nodes} == {main["MASTER_PORT"]}
-    assert [node["RANK"] for node in nodes] == ["0", "1", "2"] and {node["WORLD_SIZE"] for node in nodes} == {"3"}
-    assert len({node["MUSTER_ADDRESS"] for node in nodes}) == 3
-    assert main["MUSTER_ADDRESS"] == main["MASTER_ADDR"]
-    for name in ("AWS_BATCH_CE_NAME", "AWS_BATCH_JQ_NAME", "AWS_EXECUTION_ENV", "MUSTER_STORE", "MUSTER_EPOCH"):
-        assert all(node[name] for node in nodes)
-
-
-def test_through_the_batch_api_a_childs_death_changes_nothing(shared_server: Serving) -> None:
-    script = "import os, sys; time.sleep(1.5) if os.environ['RANK'] == '0' else sys.exit(3)"
-    job = shared_server.gang(MAIN_LAST + script, nodes=2)
-    detail = shared_server.wait(job)
-    assert detail["status"] == "SUCCEEDED"
-    assert detail["attempts"][0]["nodes"][1]["exitCode"] == 3
-
-
-def test_the_main_nodes_end_ends_the_job_and_its_children(shared_server: Serving) -> None:
-    job = shared_server.gang("import os, time; time.sleep(0 if os.environ['RANK'] == '0' else 300)", nodes=3)
-    detail = shared_server.wait(job, timeout=20)
-    assert detail["status"] == "SUCCEEDED"
-    assert not processes_of_job(job)
+def until(gate: Path) -> str:
+    """A line of a script that imports ``time``: wait until there is a file."""
+    return f"while not __import__('os').path.exists({str(gate)!r}): time.sleep(0.02)"
 
 
 def test_a_native_jobs_child_failure_restarts_the_whole_gang(shared_server: Serving) -> None:
@@ -83,10 +50,8 @@ def test_a_native_jobs_child_failure_restarts_the_whole_gang(shared_server: Serv
     detail = shared_server.wait(job)
     assert detail["status"] == "SUCCEEDED"
     first, second = detail["attempts"]
-    assert (
-        first["ending"] == "failed"
-        and "node 1: rank 1 exited with code 1: RuntimeError: child trouble" in first["statusReason"]
-    )
+    assert first["ending"] == "failed"
+    assert "node 1: rank 1 exited with code 1: RuntimeError: child trouble" in first["statusReason"]
     assert second["epoch"] > first["epoch"] and second["number"] == 2
     assert "attempt 2 done" in shared_server.log(job, attempt=2)
 
@@ -115,19 +80,6 @@ def test_leaving_on_request_requeues_without_spending_an_attempt(shared_server: 
     assert [attempt["spent"] for attempt in detail["attempts"]] == [False, True]
 
 
-def test_a_job_that_outlives_its_timeout_is_ended_and_not_tried_again(server: Serving) -> None:
-    job = server.gang("import time; time.sleep(300)", timeout=60, attempts=3)
-    server.wait(job, "RUNNING")
-    # the clock that counts is the attempt's start: set it back instead of waiting a minute
-    import sqlite3
-
-    with sqlite3.connect(server.home / "muster.db") as database:
-        database.execute("UPDATE attempts SET running_since = running_since - 59000")
-    detail = server.wait(job, timeout=30)
-    assert detail["status"] == "FAILED" and detail["statusReason"] == "Job attempt duration exceeded timeout"
-    assert len(detail["attempts"]) == 1
-
-
 def test_a_job_waits_for_room_and_says_why(server: Serving) -> None:
     first = server.gang("import time; time.sleep(300)", nodes=3, cpus="1", name="big")
     server.wait(first, "RUNNING")
@@ -150,23 +102,9 @@ def test_a_job_waits_for_room_and_says_why(server: Serving) -> None:
 
 
 def test_a_program_that_can_not_start_fails_with_the_reason(shared_server: Serving) -> None:
-    job = shared_server.gang("pass")
-    shared_server.wait(job)
-    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
-    container = {"image": "muster", "command": ["no-such-program"], "resourceRequirements": needs}
-    registered = shared_server.client.batch(
-        "RegisterJobDefinition",
-        jobDefinitionName="nothing",
-        type="multinode",
-        nodeProperties={
-            "numNodes": 1,
-            "mainNode": 0,
-            "nodeRangeProperties": [{"targetNodes": "0", "container": container}],
-        },
-    )
-    job = shared_server.client.batch(
-        "SubmitJob", jobName="nothing", jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
-    )
+    client = shared_server.client
+    client.batch("RegisterJobDefinition", **multinode("nothing", container(["no-such-program"])))
+    job = client.batch("SubmitJob", jobName="nothing", jobQueue="default", jobDefinition="nothing")
     detail = shared_server.wait(job["jobId"])
     assert detail["status"] == "FAILED"
     assert "can't start 'no-such-program'" in detail["attempts"][0]["nodes"][0]["reason"]
@@ -185,9 +123,9 @@ def test_a_killed_supervisor_of_a_native_gang_costs_one_attempt_and_leaves_no_or
     assert not first & set(processes_of(server.home))
 
 
-def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) -> None:
-    script = "import time\nfor i in range(60): print('tick', i); time.sleep(0.1)"
-    job = server.gang(script, nodes=2)
+def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving, tmp_path: Path) -> None:
+    script = f"import time\nfor i in range(60):\n  print('tick', i)\n  if i == 30:\n    {until(tmp_path / 'gate')}"
+    job = server.gang(script + MAIN_LAST, nodes=2)
     server.wait(job, "RUNNING")
     follower = subprocess.Popen(
         [MUSTER, "logs", job, "-f", "--json"],
@@ -197,13 +135,13 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) ->
     )
     assert follower.stdout is not None
     first = follower.stdout.readline()
-    before = set(
-        wait_for(lambda: len(found := processes_of(server.home)) == 6 and found, what="two shims, supervisors, ranks")
-    )
+    both = lambda: len(found := processes_of(server.home)) == 6 and found  # noqa: E731
+    before = set(wait_for(both, what="two shims, supervisors, ranks"))
     server.kill()
     time.sleep(0.3)
     assert set(processes_of(server.home)) == before
     server.start()
+    (tmp_path / "gate").touch()
     detail = server.wait(job)
     assert detail["status"] == "SUCCEEDED" and len(detail["attempts"]) == 1
     assert [line for line in server.log(job, rank=1)] == [f"tick {i}" for i in range(60)]
@@ -212,29 +150,33 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) ->
         assert [line["text"] for line in followed if line["rank"] == rank] == [f"tick {i}" for i in range(60)]
 
 
-def test_a_gang_that_ends_while_no_controller_runs_is_judged_by_its_outcomes(server: Serving) -> None:
-    failing = server.gang("import time; time.sleep(2); raise ValueError('late')", name="late")
+def test_a_gang_that_ends_while_no_controller_runs_is_judged_by_its_outcomes(server: Serving, tmp_path: Path) -> None:
+    failing = server.gang(f"import time\n{until(tmp_path / 'gate')}\nraise ValueError('late')", name="late")
     server.wait(failing, "RUNNING")
     server.kill()
+    (tmp_path / "gate").touch()
     wait_for(lambda: not processes_of(server.home), what="the gang's end")
     server.start()
     detail = server.wait(failing)
     assert detail["status"] == "FAILED" and "ValueError: late" in detail["attempts"][0]["nodes"][0]["reason"]
 
 
-def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_server: Serving) -> None:
-    job = shared_server.gang("import time\nfor i in range(5): print('line', i); time.sleep(0.3)")
-    arrivals = [(time.monotonic(), line["text"]) for line in shared_server.client.logs(job, follow=True)]
-    texts = [text for _, text in arrivals]
-    assert texts == [f"line {i}" for i in range(5)] + ["node 0 ended: done"]
-    assert arrivals[4][0] - arrivals[0][0] > 0.8, "the lines came all at once: nothing was followed"
+def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_server: Serving, tmp_path: Path) -> None:
+    lines = "\n".join(f"print('line {i}')\n{until(tmp_path / str(i))}" for i in range(3))
+    job = shared_server.gang(f"import time\n{lines}")
+    texts = []
+    for line in shared_server.client.logs(job, follow=True):
+        texts.append(line["text"])
+        (tmp_path / texts[-1].removeprefix("line ")).touch()  # the next one is printed once this one has come
+    assert texts == [f"line {i}" for i in range(3)] + ["node 0 ended: done"]
 
 
-def test_two_jobs_can_not_write_one_run(server: Serving) -> None:
-
-    server.gang("import time; time.sleep(300)", env={"MUSTER_RUN": "shared-run"})
+def test_two_jobs_can_not_write_one_run(shared_server: Serving) -> None:
+    first = shared_server.gang(FOREVER, env={"MUSTER_RUN": "shared-run"})
     with pytest.raises(ApiError, match="run shared-run is being written by job test"):
-        server.gang("pass", env={"MUSTER_RUN": "shared-run"})
+        shared_server.gang("pass", env={"MUSTER_RUN": "shared-run"})
+    shared_server.client.batch("TerminateJob", jobId=first, reason="seen")
+    shared_server.wait(first)
 
 
 def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
@@ -249,68 +191,103 @@ def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
         stop(engine, handle, grace)
 
     monkeypatch.setattr(LocalEngine, "stop", stop_if_allowed)
-    server = Server(tmp_path, port=0, cpus=2)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            job = submit_gang(client, "import time; time.sleep(600)")
-            await_status(client, job, "RUNNING")
-            client.batch("TerminateJob", jobId=job, reason="enough")
-            wait_for(lambda: len(asked) > 2, 30, "another try")
-            said = "attempt 1 can't be stopped: not authorized to perform TerminateJob; trying again"
-            found = detail(client, job)
-            assert (found["status"], found["statusReason"]) == ("RUNNING", said)
-            allowed.set()
-            assert await_status(client, job, "FAILED")["statusReason"] == "enough"
-    finally:
-        server.close()
+    with serving(tmp_path) as client:
+        job = submit_gang(client, FOREVER)
+        await_status(client, job, "RUNNING")
+        client.batch("TerminateJob", jobId=job, reason="enough")
+        wait_for(lambda: len(asked) > 2, 30, "another try")
+        said = "attempt 1 can't be stopped: not authorized to perform TerminateJob; trying again"
+        found = detail(client, job)
+        assert (found["status"], found["statusReason"]) == ("RUNNING", said)
+        allowed.set()
+        assert await_status(client, job, "FAILED")["statusReason"] == "enough"
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {said}"]
     assert processes_of(tmp_path) == []
 
 
-@pytest.fixture
-def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def test_a_job_is_read_once_for_its_definition_and_once_with_its_overrides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
     """The number of nodes of each document that is read for its gang, in order."""
-    found: list[int] = []
 
     def counting(node_properties: Mapping[str, Any]) -> GangSpec:
-        found.append(node_properties["numNodes"])
+        read.append(node_properties["numNodes"])
         return gang_needs(node_properties)
 
     for module in (rules, gangs, continuing):
         monkeypatch.setattr(module, "gang_needs", counting)
-    return found
-
-
-def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(tmp_path: Path, read: list[int]) -> None:
-    server = Server(tmp_path, port=0, cpus=2)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            job = submit_gang(client, "import time; time.sleep(1)" + MAIN_LAST, nodes=2, env=NATIVE)
-            await_status(client, job, "SUCCEEDED")
-            assert len(detail(client, job)["attempts"][0]["nodes"]) == 2
-    finally:
-        server.close()
-    assert read == [2, 2], "when the definition is registered, and when the job is submitted with its overrides"
-
-
-def test_a_job_that_resumes_a_run_is_read_once_for_its_definition_and_once_with_its_overrides(
-    tmp_path: Path, read: list[int]
-) -> None:
     spec = validate({"name": "say", "command": ["echo", "here"], "resources": {"cpus": 0.1, "memory": 64}}, "job.yaml")
-    server = Server(tmp_path, port=0, cpus=2)
-    server.start()
+    with serving(tmp_path) as client:
+        job = submit_gang(client, "pass" + MAIN_LAST, nodes=2, env=NATIVE)
+        await_status(client, job, "SUCCEEDED")
+        assert len(detail(client, job)["attempts"][0]["nodes"]) == 2 and read == [2, 2], "from submission to end"
+        registered = client.batch("RegisterJobDefinition", **compile_definition(spec, str(tmp_path)))
+        submitted = client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"]))
+        run = await_status(client, submitted["jobId"], "SUCCEEDED")["run"]
+        read.clear()
+        resumed = client.post(f"/api/runs/{run}/resume", {})["jobId"]
+        await_status(client, resumed, "SUCCEEDED")
+        client.batch("DescribeJobs", jobs=[resumed, f"{resumed}#0"])
+        client.batch("ListJobs", multiNodeJobId=resumed, jobStatus="SUCCEEDED")
+    assert read == [1, 1]
+
+
+STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); {FOREVER}"
+ASLEEP = f"import os; print('pid', os.getpid(), os.getppid(), flush=True); {FOREVER}"
+
+
+def test_how_a_gang_ended_is_recorded_for_each_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("orchestrator.control.attempts.GRACE", 1.0)
+    with serving(tmp_path) as client:
+
+        def lines(job: str) -> dict[int, str]:
+            return {line["node"]: line["text"] for line in client.logs(job) if line["rank"] is not None}
+
+        stubborn = submit_gang(client, STUBBORN, nodes=2)
+        asleep = submit_gang(client, ASLEEP, nodes=2, env=NATIVE)
+        wait_for(lambda: len(lines(stubborn)) == 2, 60, "two nodes")
+        client.batch("TerminateJob", jobId=stubborn, reason="enough")
+        found = await_status(client, stubborn, "FAILED")
+        killed = [f"rank {rank} did not leave within 1 s of SIGTERM and was killed" for rank in (0, 1)]
+        assert found["statusReason"] == "enough"
+        assert [node["reason"] for node in found["attempts"][0]["nodes"]] == killed
+
+        # node 1's supervisor is asked to leave, and rank 0 is killed: node 1 was first, and is not the cause
+        told = wait_for(lambda: len(found := lines(asleep)) == 2 and found, 60, "two nodes")
+        os.kill(int(told[1].split()[2]), signal.SIGTERM)
+        wait_for(lambda: len(processes_of(tmp_path)) == 3, 60, "node 1's end")
+        assert detail(client, asleep)["status"] == "RUNNING"
+        os.kill(int(told[0].split()[1]), signal.SIGKILL)
+        assert await_status(client, asleep, "FAILED")["statusReason"].startswith(
+            "main node: rank 0 was killed by SIGKILL"
+        )
+
+
+IGNORED = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGCHLD, signal.SIGALRM)
+SHOWS_IGNORED = """
+import os, re
+for pid in os.getpid(), os.getppid():
+    print(int(re.search("SigIgn:\\s+(\\w+)", open(f"/proc/{pid}/status").read())[1], 16), flush=True)
+raise SystemExit(7)
+"""
+"""Of the rank and of its supervisor, as bits."""
+
+
+def test_a_job_has_the_default_signals_whatever_its_server_was_started_to_ignore(tmp_path: Path) -> None:
+    """``nohup`` ignores SIGHUP, and a shell SIGINT and SIGQUIT for what it runs in the background; children inherit that."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in IGNORED}
     try:
-        with Client(server.url) as client:
-            registered = client.batch("RegisterJobDefinition", **compile_definition(spec, str(tmp_path)))
-            submitted = client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"]))
-            run = await_status(client, submitted["jobId"], "SUCCEEDED")["run"]
-            read.clear()
-            resumed = client.post(f"/api/runs/{run}/resume", {})["jobId"]
-            await_status(client, resumed, "SUCCEEDED")
-            client.batch("DescribeJobs", jobs=[resumed, f"{resumed}#0"])
-            client.batch("ListJobs", multiNodeJobId=resumed, jobStatus="SUCCEEDED")
+        server = Serving(tmp_path / "home", "--cpus", "2")
+    finally:
+        for number, action in before.items():
+            signal.signal(number, action)
+    try:
+        server.process.send_signal(signal.SIGHUP)
+        job = server.gang(SHOWS_IGNORED)
+        assert server.wait(job)["attempts"][0]["nodes"][0]["exitCode"] == 7
+        by_python = 1 << signal.SIGPIPE - 1 | 1 << signal.SIGXFSZ - 1
+        assert [text for text in server.log(job) if text.isdecimal()] == [str(by_python)] * 2
+        assert server.process.poll() is None
     finally:
         server.close()
-    assert read == [1, 1]

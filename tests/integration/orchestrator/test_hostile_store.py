@@ -24,7 +24,7 @@ from shared_store.layout import Run
 from shared_store.log_files import LogWriter
 from shared_store.logs import LogFollower, format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
-from tests.conftest import run_muster, submit_gang, wait_for
+from tests.conftest import call_muster, submit_gang, wait_for
 
 SPEC = {"name": "a", "train": {"task": "Cartpole", "worlds": 4, "iterations": 2}}
 NODES = {
@@ -73,9 +73,8 @@ def refused(answer: httpx.Response) -> str:
 
 def test_a_list_of_runs_shows_those_that_are_damaged_with_their_problem(http: httpx.Client, runs: Path) -> None:
     shown = {each["run"]: each.get("problem") for each in http.get("/api/runs").json()}
-    assert {f"d-{name}" for name in (*DAMAGED, "directory", "pipe", "link")} < shown.keys() and shown[
-        "a-good"
-    ] is shown["z-good"] is None
+    assert {f"d-{name}" for name in (*DAMAGED, "directory", "pipe", "link")} < shown.keys()
+    assert shown["a-good"] is shown["z-good"] is None
     assert all("run.json" in problem for name, problem in shown.items() if name.startswith("d-"))
 
 
@@ -113,7 +112,7 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
     assert http.get("/api/runs/checkpointed").json()["evaluation"] is None
 
 
-def test_no_change_of_a_run_and_no_spec_in_the_store_makes_an_answer_long(
+def test_no_change_of_a_run_and_no_stored_spec_makes_an_answer_long(
     inside: Server, http: httpx.Client, runs: Path
 ) -> None:
     bomb = ", ".join(
@@ -179,7 +178,7 @@ def damaged_home(home: Path) -> Path:
 
 def test_a_damaged_page_of_the_database_is_reported_in_one_line_at_the_start(tmp_path: Path) -> None:
     path = damaged_home(tmp_path)
-    served = run_muster("serve", "--port", "0", home=tmp_path)
+    served = call_muster("serve", "--port", "0", home=tmp_path)
     assert served.returncode == 1 and served.stderr.count("\n") == 1, served.stderr
     assert f"{path} is damaged" in served.stderr and f"`sqlite3 {path} .recover`" in served.stderr
 

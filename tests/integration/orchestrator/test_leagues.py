@@ -20,7 +20,8 @@ from shared_store.evaluations import evaluation_name
 from shared_store.files import write_json
 from shared_store.layout import Store
 from shared_store.models import Model
-from tests.conftest import Serving, call_muster
+from tests.conftest import Serving
+from tests.support.orchestrator.jobs import FOREVER
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.shared_store.leagues import CONFIG, league, race, summary
 
@@ -42,7 +43,7 @@ class Paddock:
         for job in self.jobs:
             assert self.server.wait(job)["status"] == "SUCCEEDED"
         self.ended = time.time()
-        self.server.wait(self.server.gang("import time; time.sleep(3600)", cpus="1", name="blocker"), "RUNNING")
+        self.server.wait(self.server.gang(FOREVER, cpus="1", name="blocker"), "RUNNING")
 
     def model(self, checkpoint: Checkpoint, task: str) -> Model:
         run = self.store.run("racer")
@@ -61,7 +62,7 @@ class Paddock:
         return named
 
     def muster(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return call_muster("league", *arguments, home=self.server.home)
+        return self.server.muster("league", *arguments)
 
     def done(self, *arguments: str) -> str:
         ended = self.muster(*arguments)
@@ -76,9 +77,8 @@ class Paddock:
     def races(self) -> list[dict[str, Any]]:
         """The jobs of races."""
         wanted = [{"name": "JOB_NAME", "values": ["race-*"]}]
-        found: list[dict[str, Any]] = self.server.client.batch("ListJobs", jobQueue="default", filters=wanted)[
-            "jobSummaryList"
-        ]
+        listed = self.server.client.batch("ListJobs", jobQueue="default", filters=wanted)
+        found: list[dict[str, Any]] = listed["jobSummaryList"]
         return found
 
     def rows(self, league: str, *options: str) -> list[dict[str, Any]]:
@@ -101,9 +101,8 @@ def test_a_league_is_created_once_listed_and_shown(paddock: Paddock) -> None:
     league = leagues.find(paddock.store, "grand").definition()
     assert (league.track, league.rules.laps, league.rules.off_track_penalty) == (("oval", "random:7"), 4, 2.0)
     assert league.closes == 32_472_144_000.0 and league.owner.startswith("user ")
-    assert "grand exists already, and a league is never changed" in paddock.refused(
-        "create", "grand", "--track", "oval"
-    )
+    said = paddock.refused("create", "grand", "--track", "oval")
+    assert "grand exists already, and a league is never changed" in said
     (row,) = [each for each in paddock.done("list").splitlines() if each.startswith("grand ")]
     assert row.split()[:6] == ["grand", "oval,", "random:7", "4", "best", "0"]
     assert paddock.done("show", "grand") == told
@@ -111,58 +110,31 @@ def test_a_league_is_created_once_listed_and_shown(paddock: Paddock) -> None:
 
 
 REFUSED = {
-    ("create", "x", "--track", "ovel"): "track ovel does not exist; did you mean oval?",
-    ("create", "a/b", "--track", "oval"): "league name 'a/b': use letters, digits",
-    ("create", "x"): "--track is missing",
-    (
-        "create",
-        "x",
-        "--track",
-        "oval",
-        "--ranking",
-        "totl",
-    ): "--ranking totl: there is no such ranking; did you mean total?",
-    ("create", "x", "--track", "oval", "--laps", "0"): "--laps: expected a value greater than or equal to 1",
-    (
-        "create",
-        "x",
-        "--track",
-        "oval",
-        "--closes",
-        "2020-01-01T00:00Z",
-    ): "2020-01-01 00:00:00 UTC is past: no race could",
-    ("create", "x", "--track", "oval", "--opens", "soon"): "--opens soon: expected a time such as 2026-12-24T18:00",
-    (
-        "create",
-        "x",
-        "--track",
-        "oval",
-        "--opens",
-        "2030-01-02",
-        "--closes",
-        "2030-01-01",
-    ): "would close before it opens",
-    ("show", "cpu"): "league cpu does not exist",
-    ("show", "cup", "7"): "league cup: entry 7 does not exist",
-    ("submit", "cup", "fats"): "model fats does not exist; did you mean fast?",
-    ("submit", "cup", "fast@9"): "model fast has no version 9; there are: 1, 2, 3, 4",
-    ("submit", "cup", "fast@x"): "fast@x: expected a version after @, such as fast@1",
-    (
-        "submit",
-        "cup",
-        "fast@3",
-    ): "model fast@3 is of task Cartpole; a league takes models of the racer's installed tasks",
-    ("submit", "cup", "fast@4"): "model fast@4 is of task my_tasks:Rocket; a league takes models of the racer's",
-    ("submit", "cup", "fast@1", "--as", "\x1b[31m"): "use letters, digits, spaces",
-    ("submit", "cup", "fast@1", "--evaluation", "nothing"): "job nothing does not exist",
-    ("submit", "cup", "fast@1", "--evaluation", "blocker"): "is RUNNING: only a race that has SUCCEEDED is entered",
-    ("submit", "cup", "fast@1", "--evaluation", "x", "--detach"): "leave one of them out",
-    ("submit", "past", "fast@1"): "league past closed at 2020-01-01 00:00:00 UTC",
-    ("submit", "future", "fast@1"): "league future opens at 2999-01-01 00:00:00 UTC",
-    ("disqualify", "cup", "9", "--reason", "x"): "league cup: entry 9 does not exist",
-    ("disqualify", "cup", "9"): "--reason is missing",
-    ("table", "cup", "-o", "cup.pdf"): "unknown ending; use one of .csv, .png",
-    ("tabel", "cup"): "did you mean table?",
+    "create x --track ovel": "track ovel does not exist; did you mean oval?",
+    "create a/b --track oval": "league name 'a/b': use letters, digits",
+    "create x": "--track is missing",
+    "create x --track oval --ranking totl": "--ranking totl: there is no such ranking; did you mean total?",
+    "create x --track oval --laps 0": "--laps: expected a value greater than or equal to 1",
+    "create x --track oval --closes 2020-01-01T00:00Z": "2020-01-01 00:00:00 UTC is past: no race could",
+    "create x --track oval --opens soon": "--opens soon: expected a time such as 2026-12-24T18:00",
+    "create x --track oval --opens 2030-01-02 --closes 2030-01-01": "would close before it opens",
+    "show cpu": "league cpu does not exist",
+    "show cup 7": "league cup: entry 7 does not exist",
+    "submit cup fats": "model fats does not exist; did you mean fast?",
+    "submit cup fast@9": "model fast has no version 9; there are: 1, 2, 3, 4",
+    "submit cup fast@x": "fast@x: expected a version after @, such as fast@1",
+    "submit cup fast@3": "model fast@3 is of task Cartpole; a league takes models of the racer's installed tasks",
+    "submit cup fast@4": "model fast@4 is of task my_tasks:Rocket; a league takes models of the racer's",
+    "submit cup fast@1 --as \x1b[31m": "use letters, digits, spaces",
+    "submit cup fast@1 --evaluation nothing": "job nothing does not exist",
+    "submit cup fast@1 --evaluation blocker": "is RUNNING: only a race that has SUCCEEDED is entered",
+    "submit cup fast@1 --evaluation x --detach": "leave one of them out",
+    "submit past fast@1": "league past closed at 2020-01-01 00:00:00 UTC",
+    "submit future fast@1": "league future opens at 2999-01-01 00:00:00 UTC",
+    "disqualify cup 9 --reason x": "league cup: entry 9 does not exist",
+    "disqualify cup 9": "--reason is missing",
+    "table cup -o cup.pdf": "unknown ending; use one of .csv, .png",
+    "tabel cup": "did you mean table?",
 }
 
 
@@ -174,10 +146,10 @@ def cups(paddock: Paddock) -> Paddock:
     return paddock
 
 
-@pytest.mark.parametrize("arguments", REFUSED)
-def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, arguments: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("line", REFUSED)
+def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, line: str) -> None:
     before = cups.races()
-    assert REFUSED[arguments] in cups.refused(*arguments)
+    assert REFUSED[line] in cups.refused(*line.split(" "))
     assert cups.races() == before
     assert "x" not in leagues.names(cups.store)
 
@@ -185,7 +157,7 @@ def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, arguments: tupl
 def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     cups.done("create", "long", "--track", "oval", "--laps", "5", "--continuous", "--seed", "11", "--seconds", "60")
     told = cups.done("submit", "long", "fast@2", "--as", "ada", "--detach")
-    job = json.loads(call_muster("list", "--json", home=cups.server.home).stdout)[0]["jobId"]
+    job = json.loads(cups.server.muster("list", "--json").stdout)[0]["jobId"]
     assert told.splitlines() == [
         f"submitted the race of fast@2 as {job}",
         f"enter it after it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
@@ -196,9 +168,8 @@ def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     assert (section["run"], section["checkpoint"], section["trials"], section["seed"]) == ("racer", 12, 5, 11)
     assert (section["track"], section["continuous"], section["seconds"]) == (["oval"], True, 60.0)
     assert section["config"] == leagues.CAR
-    assert "is RUNNABLE: only a race that has SUCCEEDED" in cups.refused(
-        "submit", "long", "fast@2", "--evaluation", job
-    )
+    said = cups.refused("submit", "long", "fast@2", "--evaluation", job)
+    assert "is RUNNABLE: only a race that has SUCCEEDED" in said
     cups.server.client.batch("TerminateJob", jobId=job, reason="seen")
 
 
@@ -235,16 +206,11 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
     with table.open() as file:
         first, second = csv.DictReader(file)
     assert (first["racer"], first["time"], second["rank"], second["model"]) == ("Bob B.", "36.75", "2", "fast@1")
-    assert (
-        cups.done("disqualify", "spring", "2", "--reason", "not a car")
-        == "entry 2 of spring is disqualified: not a car\n"
-    )
+    told = cups.done("disqualify", "spring", "2", "--reason", "not a car")
+    assert told == "entry 2 of spring is disqualified: not a car\n"
     assert "entry 2 is disqualified already" in cups.refused("disqualify", "spring", "2", "--reason", "no")
-    rows = cups.rows("spring")
-    assert [(each["rank"], each["entry"], each["status"]) for each in rows] == [
-        (1, 1, "ranked"),
-        (None, 2, "disqualified"),
-    ]
+    rows = [(each["rank"], each["entry"], each["status"]) for each in cups.rows("spring")]
+    assert rows == [(1, 1, "ranked"), (None, 2, "disqualified")]
     shown = cups.done("show", "spring", "2")
     assert "disqualified: not a car" in shown and "0:12.500" in shown and f"job {fast}" in shown
     assert cups.done("verify", "spring").splitlines() == [
@@ -265,11 +231,7 @@ def test_an_evaluation_that_is_not_of_the_league_s_race_is_not_entered(cups: Pad
         (race([12.0] * 3), {"seed": 5}, "its seed is 5, the league's 1"),
         (race([12.0] * 3, continuous=True), {}, "its rules have continuous True, the league's False"),
         (race([12.0] * 2), {}, "its rules have laps 2, the league's 3"),
-        (
-            {"rules": race([12.0] * 3)["rules"], "trials": [{}] * 3},
-            {},
-            "race.trials.0: expected trial 1 with its status",
-        ),
+        ({**race([12.0] * 3), "trials": [{}] * 3}, {}, "race.trials.0: expected trial 1 with its status"),
         (race([12.0] * 3), {"race": None}, "it is no race"),
     ):
         assert said in refused(cups.raced(2, driven, **changes))
@@ -283,9 +245,8 @@ def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_close
     assert "league ended closed at" in cups.refused("submit", "ended", "fast@1")
     assert "rank 1" in cups.done("submit", "ended", "fast@1", "--evaluation", job)
     leagues.create(cups.store, league("missed", seed=1, closes=cups.ended - 3600))
-    assert f"and job test ({job[:8]}) was not submitted in between" in cups.refused(
-        "submit", "missed", "fast@1", "--evaluation", job
-    )
+    said = cups.refused("submit", "missed", "fast@1", "--evaluation", job)
+    assert f"and job test ({job[:8]}) was not submitted in between" in said
 
 
 def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
@@ -298,32 +259,26 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     path.write_bytes(path.read_bytes().replace(b"12.0", b"10.0"))
     rows = cups.rows("honest")
     assert [(row["rank"], row["entry"], row["status"]) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
-    verified = cups.muster("verify", "honest")
-    assert (
-        verified.returncode == 1
-        and "entry 1: the content of entry.json was altered (SHA-256 differs)\n" in verified.stdout
-    )
+
+    def verified(*more: str) -> str:
+        told = cups.muster("verify", "honest", *more)
+        assert told.returncode == 1
+        return told.stdout
+
+    altered = "entry 1: the content of entry.json was altered (SHA-256 differs)\n"
+    assert verified() == f"{altered}entry 2: the entry and its model are unchanged\n"
     shown = cups.muster("show", "honest", "1")
-    assert (
-        shown.returncode == 1 and shown.stdout == "entry 1: the content of entry.json was altered (SHA-256 differs)\n"
-    )
-    assert cups.muster("show", "honest", "2").returncode == 0
-    listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
+    assert (shown.returncode, shown.stdout) == (1, altered)
+    listed = json.loads(verified("--json"))
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert (
-        "entry 2: the entry and its model are unchanged" in verified.stdout
-        and cups.muster("verify", "honest", "2").returncode == 0
-    )
+    for command in ("show", "verify"):
+        assert cups.muster(command, "honest", "2").returncode == 0
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
     onnx.write_bytes(b"Weights")
-    verified = cups.muster("verify", "honest", "2", "--rerun")
-    assert (
-        verified.returncode == 1
-        and "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
-        in verified.stdout
-    )
+    said = "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
+    assert said in verified("2", "--rerun")
     before = cups.races()
     assert "model fast@2: the content of bundle/policy.onnx was altered" in cups.refused("submit", "honest", "fast@2")
     onnx.write_bytes(b"weights")
@@ -334,17 +289,15 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     os.rename(weights.parent, weights.parent.with_name("away"))
     said = "checkpoint 00000012-e1 of run racer, which a race loads, is gone; register one that is there"
     assert said in cups.refused("submit", "honest", "fast@2")
-    verified = cups.muster("verify", "honest", "2", "--rerun")
-    assert verified.returncode == 1 and f"entry 2: model fast@2: {said}" in verified.stdout
+    assert f"entry 2: model fast@2: {said}" in verified("2", "--rerun")
     os.rename(weights.parent.with_name("away"), weights.parent)
     assert cups.races() == before, "nothing was started"
 
     rules = leagues.find(cups.store, "honest").path / "definition" / "league.json"
     rules.chmod(0o644)
     rules.write_bytes(rules.read_bytes().replace(b'"seed": 1', b'"seed": 2'))
+    said = "league honest: the content of league.json was altered"
     for ask in (("table", "honest"), ("show", "honest"), ("submit", "honest", "fast@1")):
-        assert "league honest: the content of league.json was altered" in cups.refused(*ask)
+        assert said in cups.refused(*ask)
     (told,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
-    assert "league honest: the content of league.json was altered" in told[
-        "problem"
-    ] and "league honest: the content of league.json was altered" in cups.done("list")
+    assert said in told["problem"] and said in cups.done("list")

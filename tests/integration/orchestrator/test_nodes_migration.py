@@ -16,15 +16,13 @@ from typing import Any
 import pytest
 from sqlalchemy import create_engine, select, text
 
-from orchestrator.client import Client
 from orchestrator.domain.hosts import Placement
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
 from orchestrator.persistence.session import Database
-from orchestrator.server import Server
 from shared_store.epoch import Claim, take_epoch
 from shared_store.layout import Store
 from tests.support.orchestrator.databases import migrate
-from tests.support.orchestrator.jobs import await_status, detail
+from tests.support.orchestrator.jobs import await_status, detail, serving
 
 DUMP = Path(__file__).parents[2] / "support" / "orchestrator" / "schema_0008.sql"
 BEFORE = {
@@ -146,29 +144,21 @@ def test_jobs_in_every_state_continue_where_the_older_controller_left_them(old: 
         run = store.run(f"{name}-{jobs[name][:8]}")
         run.create({"run": run.name, "queue": "default"})
         take_epoch(run, 0, Claim("killed", jobs[name], 1))
-    server = Server(tmp_path / "home", port=0, cpus=2, database=old)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            for name in ("submitted", "pending", "runnable", "starting", "running"):
-                ended = await_status(client, jobs[name], "SUCCEEDED", "FAILED")
-                assert ended["status"] == "SUCCEEDED", f"{name}: {ended['statusReason']}"
-            lost, again = detail(client, jobs["running"])["attempts"]
-            assert (lost["ending"], again["ending"]) == ("failed", "succeeded"), "its processes were gone"
-            assert [node["exitCode"] for node in again["nodes"]] == [0, 0]
-            [begun] = detail(client, jobs["starting"])["attempts"]
-            assert begun["ending"] == "succeeded", "the attempt that was recorded, launched now"
-            assert [each["status"] for each in (detail(client, jobs[n]) for n in ("done", "failed", "array"))] == [
-                "SUCCEEDED",
-                "FAILED",
-                "SUCCEEDED",
-            ]
-            [done] = detail(client, jobs["done"])["attempts"]
-            assert done["computeEnvironment"] == "local"
-            answered = [{key: value for key, value in node.items() if key != "log"} for node in done["nodes"]]
-            assert answered == [{**node, "progress": None, "running": False} for node in before[jobs["done"], 1]]
-    finally:
-        server.close()
+    with serving(tmp_path / "home", database=old) as client:
+        for name in ("submitted", "pending", "runnable", "starting", "running"):
+            ended = await_status(client, jobs[name], "SUCCEEDED", "FAILED")
+            assert ended["status"] == "SUCCEEDED", f"{name}: {ended['statusReason']}"
+        lost, again = detail(client, jobs["running"])["attempts"]
+        assert (lost["ending"], again["ending"]) == ("failed", "succeeded"), "its processes were gone"
+        assert [node["exitCode"] for node in again["nodes"]] == [0, 0]
+        [begun] = detail(client, jobs["starting"])["attempts"]
+        assert begun["ending"] == "succeeded", "the attempt that was recorded, launched now"
+        over = [detail(client, jobs[name])["status"] for name in ("done", "failed", "array")]
+        assert over == ["SUCCEEDED", "FAILED", "SUCCEEDED"]
+        [done] = detail(client, jobs["done"])["attempts"]
+        assert done["computeEnvironment"] == "local"
+        answered = [{key: value for key, value in node.items() if key != "log"} for node in done["nodes"]]
+        assert answered == [{**node, "progress": None, "running": False} for node in before[jobs["done"], 1]]
 
 
 def test_a_text_that_no_column_can_hold_is_written_out() -> None:

@@ -18,33 +18,36 @@ from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
 from shared_store.files import write_json
-from tests.conftest import Serving, run_muster, wait_for
+from tests.conftest import Serving, wait_for
+from tests.support.definitions import container, multinode
+from tests.support.orchestrator.jobs import jobs_of, serving
 
 SPEC = "job_specs/cartpole.yaml"
 
 
-def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(server: Serving, tmp_path: Path) -> None:
-    shown = server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=0.1")
+def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(shared_server: Serving) -> None:
+    before = jobs_of(shared_server.client)
+    shown = shared_server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=0.1")
     assert shown.returncode == 0, shown.stderr
     lines = shown.stdout.splitlines()
     assert lines[0] == "cartpole on the local engine, queue default; nothing was started"
     assert len(lines) == 5 and all("python -P -m worker.train" in line for line in lines[2:])
-    plan = json.loads(server.muster("submit", SPEC, "--dry-run", "--json", "--set", "resources.cpus=0.1").stdout)
+    plan = json.loads(shared_server.muster("submit", SPEC, "--dry-run", "--json", "--set", "resources.cpus=0.1").stdout)
     assert [node["rank"] for node in plan["nodes"]] == [0, 1, 2]
     told = plan["nodes"][1]["environment"]
     assert told["MASTER_ADDR"] == plan["nodes"][0]["address"] != plan["nodes"][1]["address"]
     assert (told["AWS_BATCH_JOB_NODE_INDEX"], told["NNODES"]) == ("1", "3")
     assert plan["registerJobDefinition"]["nodeProperties"]["numNodes"] == 3
-    assert server.client.batch("DescribeJobDefinitions")["jobDefinitions"] == []
-    assert server.client.batch("ListJobs", jobQueue="default")["jobSummaryList"] == []
+    named = plan["registerJobDefinition"]["jobDefinitionName"]
+    assert shared_server.client.batch("DescribeJobDefinitions", jobDefinitionName=named)["jobDefinitions"] == []
+    assert jobs_of(shared_server.client) == before
 
 
-def test_the_whole_command_is_printed_on_any_width_of_terminal(server: Serving) -> None:
+def test_the_whole_command_is_printed_on_any_width_of_terminal(shared_server: Serving, tmp_path: Path) -> None:
     whole = "python -P my_train.py " + " ".join(f"--option-{number}=value" for number in range(12))
-    (server.home / "job.yaml").write_text(
-        f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n"
-    )
-    narrow = run_muster("submit", str(server.home / "job.yaml"), "--dry-run", home=server.home, COLUMNS="80")
+    spec = tmp_path / "job.yaml"
+    spec.write_text(f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n")
+    narrow = shared_server.muster("submit", str(spec), "--dry-run", COLUMNS="80")
     assert narrow.stdout.splitlines()[2].rstrip().endswith(whole), narrow.stdout
 
 
@@ -58,16 +61,11 @@ def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(LocalEngine, "plan", noted)
     train = {"task": "Cartpole", "worlds": 4, "iterations": 1}
     spec = validate({"name": "same", "priority": 7, "timeout": "1h", "stall_timeout": "3m", "train": train}, "test")
-    server = Server(tmp_path, port=0, cpus=2)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            client.post("/api/plan", {"definition": compile_definition(spec, "/nowhere")})
-            client.batch("RegisterJobDefinition", **compile_definition(spec, "/nowhere"))
-            client.batch("SubmitJob", **compile_submission(spec, "same"))
-            wait_for(lambda: len(given) == 2, 30, "the launch")
-    finally:
-        server.close()
+    with serving(tmp_path) as client:
+        client.post("/api/plan", {"definition": compile_definition(spec, "/nowhere")})
+        client.batch("RegisterJobDefinition", **compile_definition(spec, "/nowhere"))
+        client.batch("SubmitJob", **compile_submission(spec, "same"))
+        wait_for(lambda: len(given) == 2, 30, "the launch")
     planned, submitted = given
     assert (planned.priority, planned.stall_timeout, planned.timeout) == (7, 180.0, 3600)
     assert planned.bus == submitted.bus and planned.bus_token == "…", "the password is not for who only looks"
@@ -75,8 +73,8 @@ def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: 
     assert planned == replace(submitted, **{name: getattr(planned, name) for name in own})
 
 
-def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:
-    refused = server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=900")
+def test_a_job_that_fits_nowhere_has_no_plan(shared_server: Serving) -> None:
+    refused = shared_server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=900")
     assert refused.returncode == 2 and refused.stderr.count("\n") == 1
     assert "each node needs 900 CPUs" in refused.stderr
 
@@ -85,32 +83,27 @@ def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:
     "definition",
     [{}, {"jobDefinitionName": "a", "type": "container"}, {"jobDefinitionName": "a", "type": "multinode"}, {"type": 3}],
 )
-def test_properties_that_describe_no_gang_are_refused(server: Serving, definition: dict) -> None:
+def test_properties_that_describe_no_gang_are_refused(shared_server: Serving, definition: dict) -> None:
     with pytest.raises(ApiError) as refusal:
-        server.client.post("/api/plan", {"definition": definition})
+        shared_server.client.post("/api/plan", {"definition": definition})
     assert refusal.value.status == 400 and "\n" not in str(refusal.value)
 
 
-def test_an_image_that_would_not_be_run_is_passed_over_or_refused_as_the_compute_environment_says(
-    server: Serving,
-) -> None:
-    batch = server.client.batch
+def test_an_image_that_would_not_run_is_refused_where_the_compute_environment_says(shared_server: Serving) -> None:
+    batch = shared_server.client.batch
     tags = {"muster:images": "refuse"}
     batch("CreateComputeEnvironment", computeEnvironmentName="strict", type="UNMANAGED", tags=tags)
     order = [{"order": 1, "computeEnvironment": "strict"}]
     batch("CreateJobQueue", jobQueueName="strict", priority=1, computeEnvironmentOrder=order)
-    container = {"image": "busybox", "command": ["true"]}
-    container["resourceRequirements"] = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
-    definition = {"jobDefinitionName": "foreign", "type": "multinode", "nodeProperties": properties}
-    assert not server.client.post("/api/plan", {"definition": definition})["images"]
+    definition = multinode("foreign", container(image="busybox"))
+    assert not shared_server.client.post("/api/plan", {"definition": definition})["images"]
     with pytest.raises(ApiError, match="image busybox: the local engine runs commands in its nodes' own environment"):
-        server.client.post("/api/plan", {"definition": definition, "queue": "strict"})
+        shared_server.client.post("/api/plan", {"definition": definition, "queue": "strict"})
     batch("RegisterJobDefinition", **definition)
     passed = batch("SubmitJob", jobName="a", jobQueue="default", jobDefinition="foreign")["jobId"]
     refused = batch("SubmitJob", jobName="b", jobQueue="strict", jobDefinition="foreign")["jobId"]
-    assert server.wait(passed)["status"] == "SUCCEEDED"
-    assert "image busybox: the local engine" in server.wait(refused)["statusReason"]
+    assert shared_server.wait(passed)["status"] == "SUCCEEDED"
+    assert "image busybox: the local engine" in shared_server.wait(refused)["statusReason"]
 
 
 def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment_allows(inside: Server) -> None:

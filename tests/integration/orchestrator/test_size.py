@@ -19,6 +19,7 @@ from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from shared_store.layout import Store
 from tests.conftest import wait_for
+from tests.support.definitions import container, multinode, single
 from tests.support.orchestrator.rows import job
 
 OVERSIZED = {
@@ -32,7 +33,6 @@ OVERSIZED = {
     "a number of the request is too large": ("createschedulingpolicy", '{"name": "a", "fairsharePolicy": 1e999}'),
 }
 """Operation and body by what is said of them."""
-RESOURCES = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
 LARGE = [{"name": f"A{number}", "value": "x" * 200} for number in range(90)]
 
 
@@ -55,15 +55,12 @@ def call(http: httpx.Client, operation: str, **request: Any) -> dict[str, Any]:
 
 
 def large_array(http: httpx.Client, queue: str, size: int, **request: Any) -> str:
-    container = {"image": "any", "command": ["true"], "environment": LARGE, "resourceRequirements": RESOURCES}
-    call(http, "RegisterJobDefinition", jobDefinitionName="large", type="container", containerProperties=container)
+    call(http, "RegisterJobDefinition", **single("large", container(environment=LARGE)))
     submission = {"jobName": "large", "jobQueue": queue, "jobDefinition": "large", "arrayProperties": {"size": size}}
     return str(call(http, "SubmitJob", **submission, **request)["jobId"])
 
 
-def test_an_array_stores_its_definition_once_and_each_child_shows_it(
-    inside: Server, http: httpx.Client, waiting: str
-) -> None:
+def test_an_array_stores_its_definition_once_for_all_children(inside: Server, http: httpx.Client, waiting: str) -> None:
     array = large_array(http, waiting, 3_000, parameters={"a": "b"}, tags={"c": "d"})
     with inside.reconciler.database.session() as session:
         copies = select(func.count(Job.own_node_properties), func.count()).where(Job.parent == array)
@@ -86,9 +83,7 @@ def test_an_array_stores_its_definition_once_and_each_child_shows_it(
     assert [(each["status"], each["statusReason"]) for each in ended] == [("FAILED", "enough")] * 2
 
 
-def test_the_children_of_an_array_wait_for_each_other_and_for_others_as_asked(
-    inside: Server, http: httpx.Client, waiting: str
-) -> None:
+def test_children_of_an_array_wait_for_each_other_as_asked(inside: Server, http: httpx.Client, waiting: str) -> None:
     first = large_array(http, waiting, 3, dependsOn=[{"type": "SEQUENTIAL"}])
     second = large_array(http, waiting, 3, dependsOn=[{"type": "N_TO_N", "jobId": first}])
 
@@ -132,18 +127,13 @@ def test_metrics_come_in_pages_and_no_plan_is_longer_than_a_limit(inside: Server
     assert http.get("/api/runs/long/metrics?max=20000").status_code == 400
 
     resources = [{"type": "VCPU", "value": "0.001"}, {"type": "MEMORY", "value": "4"}]
-    container = {"image": "muster", "command": ["true"], "environment": LARGE, "resourceRequirements": resources}
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": 1000, "mainNode": 0, "nodeRangeProperties": ranges}
-    definition = {"jobDefinitionName": "wide", "type": "multinode", "nodeProperties": properties}
+    definition = multinode("wide", container(environment=LARGE, resourceRequirements=resources), 1000)
     answer = http.post("/api/plan", json={"queue": "default", "definition": definition})
     assert answer.status_code == 400 and "MiB of variables, more than 4" in answer.json()["message"]
 
 
 def test_references_to_a_parameter_can_t_make_a_command_larger_than_the_limit(http: httpx.Client, waiting: str) -> None:
-    command = ["echo", "Ref::a " * 3_200]
-    container = {"image": "any", "command": command, "resourceRequirements": RESOURCES}
-    call(http, "RegisterJobDefinition", jobDefinitionName="refs", type="container", containerProperties=container)
+    call(http, "RegisterJobDefinition", **single("refs", container(["echo", "Ref::a " * 3_200])))
     submission = {"jobName": "refs", "jobQueue": waiting, "jobDefinition": "refs"}
     refused = http.post("/v1/submitjob", json={**submission, "parameters": {"a": "x" * 28_000}})
     assert refused.status_code == 400 and len(refused.content) < 1_000

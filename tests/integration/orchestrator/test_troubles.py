@@ -31,7 +31,7 @@ from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
 from tests.conftest import submit_gang, wait_for
-from tests.support.orchestrator.jobs import FOREVER, await_status, detail
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.orchestrator.rows import job
 from tests.support.processes import end_all, processes_of, processes_of_job
 
@@ -43,26 +43,13 @@ def home(tmp_path: Path) -> Iterator[Path]:
     end_all(tmp_path)
 
 
-@contextlib.contextmanager
-def serving(home: Path) -> Iterator[Client]:
-    server = Server(home, port=0, cpus=2)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            yield client
-    finally:
-        server.close()
-
-
 def change(home: Path, statement: str, *values: str) -> list[Any]:
     """Run a statement on the database behind the controller's back."""
     with contextlib.closing(sqlite3.connect(home / "muster.db", timeout=30)) as database, database:
         return list(database.execute(statement, values))
 
 
-def test_a_damaged_row_is_named_once_and_stops_no_other_job_also_after_a_restart(
-    home: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_row_is_named_once_and_stops_no_other_job(home: Path, caplog: pytest.LogCaptureFixture) -> None:
     with serving(home) as client:
         running = submit_gang(client, FOREVER, name="running")
         await_status(client, running, "RUNNING")
@@ -99,7 +86,7 @@ def ended(inside: Server) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("value", ["{broken", "null", "[]"])
-def test_a_damaged_row_answers_for_itself_alone(
+def test_a_damaged_row_harms_itself_alone(
     inside: Server, http: httpx.Client, ended: tuple[str, str], value: str
 ) -> None:
     broken, whole = ended
@@ -154,9 +141,7 @@ def status_reason(home: Path, job_id: str) -> str:
     return str(reason)
 
 
-def test_a_start_that_fails_stops_no_other_start_and_is_tried_again(
-    home: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_start_that_fails_stops_no_other_and_is_tried_again(home: Path, caplog: pytest.LogCaptureFixture) -> None:
     with serving(home) as client:
         blocked = home / "store" / "runs" / "blocked"
         blocked.parent.mkdir(exist_ok=True)
@@ -220,9 +205,7 @@ def test_without_its_database_the_controller_says_so_and_accepts_nothing_until_i
     assert sum(said in record.getMessage() for record in caplog.records) == 1
 
 
-def test_gangs_of_a_database_that_was_deleted_are_named_at_the_next_start_with_how_to_end_them(
-    home: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_gangs_of_a_deleted_database_are_named_at_the_next_start(home: Path, caplog: pytest.LogCaptureFixture) -> None:
     with serving(home) as client:
         known = submit_gang(client, FOREVER)
         await_status(client, known, "RUNNING")
@@ -308,9 +291,7 @@ def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Pat
     assert stopped, "while the machines were looked at"
 
 
-def test_a_hanging_volume_is_named_starts_nothing_and_delays_no_request(
-    inside: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hanging_volume_is_named_and_delays_no_request(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     look, answers = os.statvfs, threading.Event()
 
     def hanging(path: Any) -> os.statvfs_result:

@@ -9,8 +9,8 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from subprocess import CompletedProcess
 
 import pytest
 from sqlalchemy import select
@@ -19,7 +19,7 @@ from orchestrator.client import Client
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, WebhookDelivery
 from orchestrator.server import Server
-from tests.conftest import Serving, call_muster, submit_gang
+from tests.conftest import Serving, submit_gang
 from tests.support.orchestrator import rows
 from tests.support.orchestrator.receiver import SECRET, Receiver, receiving, write_webhooks
 from tests.support.processes import end_all
@@ -44,9 +44,8 @@ def told(tmp_path_factory: pytest.TempPathFactory, listening: Receiver) -> Itera
     """A controller that tells the receiver of every end."""
     home = tmp_path_factory.mktemp("told")
     file = write_webhooks(home / "hooks.json", chat={"url": listening.url, "link": "https://muster.example/"})
-    server = Serving(home / "home", "--cpus", "2", "--webhooks", file)
-    yield server
-    server.close()
+    with Serving(home / "home", "--cpus", "2", "--webhooks", file) as server:
+        yield server
 
 
 def is_signed(headers: dict[str, str], body: bytes) -> bool:
@@ -84,9 +83,7 @@ def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(told: S
         assert message["timestamp"] == data["stoppedAt"] > data["startedAt"] >= data["createdAt"]
 
 
-def test_a_message_is_tried_again_by_the_next_controller_with_the_same_id_and_body(
-    told: Serving, receiver: Receiver
-) -> None:
+def test_a_message_is_tried_again_by_the_next_controller_unchanged(told: Serving, receiver: Receiver) -> None:
     receiver.answers = [500]
     job = told.gang("print(1)")
     wait_for(lambda: receiver.of(job), 20, "a first try")
@@ -111,9 +108,7 @@ def test_a_slow_or_unreachable_receiver_delays_no_job(told: Serving, receiver: R
 
 
 def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serving, receiver: Receiver) -> None:
-    def command(*arguments: str) -> CompletedProcess[str]:
-        return call_muster("webhooks", *arguments, home=told.home)
-
+    command = partial(told.muster, "webhooks")
     sent = command("test", "chat")
     ((headers, body),) = receiver.messages
     place = f"http://127.0.0.1:{receiver.server_port}"
@@ -175,7 +170,7 @@ def test_a_receiver_that_answers_a_byte_at_a_time_is_left_after_the_deadline_of_
         assert dripping.drip.wait(30), "the connection is closed, not kept"
 
 
-def test_an_unknown_queue_is_named_at_the_start_with_the_nearest(
+def test_an_unknown_queue_is_told_with_the_nearest_at_the_start(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = write_webhooks(

@@ -29,7 +29,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 from muster_policy.graph import Node, open_session
 from muster_policy.messages import EMPTY, JOINT_STATE, RESET, TWIST, Messages
 from muster_policy.wire import parse_token, read_attachment
-from tests.conftest import REPOSITORY, wait_for
+from tests.conftest import PATIENCE, REPOSITORY, wait_for
 from tests.support.policy_node import write_bundle
 from tests.unit.policy_node.walker import JOINTS, contract, term
 
@@ -64,7 +64,7 @@ class Running:
     def end(self) -> int:
         """SIGTERM, as systemd would; the exit status."""
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(30)
+        return self.process.wait(30 * PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +176,7 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
         running.process.kill()
 
 
-def test_messages_of_the_node_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachment(
+def test_messages_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachment(
     running: Running,
 ) -> None:
     got: list[zenoh.Sample] = []
@@ -242,11 +242,11 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
     assert running.process.poll() is None
 
 
-def test_a_silent_robot_is_reported_a_reset_starts_an_episode_and_the_end_undeclares_everything(
+def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares_all(
     running: Running,
 ) -> None:
     wait_for(lambda: "/joint_states is silent for" in running.said(), 20, "the watchdog")
-    gone = threading.Event()
+    gone, there = threading.Event(), threading.Event()
     with open_session(running.endpoint, None) as session:
         node = Node(session, MESSAGES, name="operator")
         said: list[str] = []
@@ -272,13 +272,13 @@ def test_a_silent_robot_is_reported_a_reset_starts_an_episode_and_the_end_undecl
         reset.publish(MESSAGES.make(EMPTY, structure_needs_at_least_one_member=0))
 
         def told(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.DELETE and "/NN/%/%/muster_policy" in str(sample.key_expr):
-                gone.set()
+            if "/NN/%/%/muster_policy" in str(sample.key_expr):
+                (gone if sample.kind == zenoh.SampleKind.DELETE else there).set()
 
         session.liveliness().declare_subscriber(
             "@ros2_lv/**", zenoh.handlers.Callback(told, indirect=False), history=True
         )
-        time.sleep(0.2)
+        assert there.wait(30)
         assert running.end() == 0
         assert gone.wait(10)
         assert " 1 resets," in running.said().splitlines()[-1], running.said()

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from shared_store.logs import parse_line
-from tests.conftest import wait_for
+from tests.conftest import PATIENCE, wait_for
 from tests.support.faults.full_disk import small_volume
 from tests.support.worker.node import Node, Nodes
 
@@ -30,17 +30,13 @@ from tests.support.worker.node import Node, Nodes
 def test_the_output_of_all_ranks_is_merged_with_rank_and_stream(node: Nodes) -> None:
     n = node(node_index=1, node_count=2, ranks_per_node=2)
     assert n.shell('echo "to out"; echo "to err" >&2') == 0
-    assert sorted(n.lines()[:-1]) == [  # type: ignore[type-var]
-        (2, "e", "to err"),
-        (2, "o", "to out"),
-        (3, "e", "to err"),
-        (3, "o", "to out"),
-    ]
+    said = {(rank, *each) for rank in (2, 3) for each in (("e", "to err"), ("o", "to out"))}
+    assert set(n.lines()[:-1]) == said and len(n.lines()) == 5
     assert n.lines()[-1] == (None, "o", "node 1 ended: done")
     outcome = n.ended()
     assert (outcome.node, outcome.epoch, outcome.exit_code, outcome.reason) == (1, 1, 0, "done")
     assert (outcome.signal, outcome.error) == (None, None)
-    assert time.time() - 20 < outcome.started < outcome.ended <= time.time()
+    assert time.time() - 20 * PATIENCE < outcome.started < outcome.ended <= time.time()
 
 
 def test_lines_are_in_the_log_while_the_rank_still_runs(node: Nodes) -> None:
@@ -66,17 +62,12 @@ def test_a_line_of_any_length_is_kept_whole_or_cut_but_never_lost(node: Nodes) -
     assert "".join(output[after + 1 :]) == "y" * 70_000
 
 
-def test_bytes_that_are_no_text_are_replaced(node: Nodes) -> None:
+@pytest.mark.parametrize("locale", ["C.UTF-8", "C", "POSIX"])
+def test_bytes_that_are_no_text_are_replaced_whatever_the_locale(node: Nodes, locale: str) -> None:
     n = node()
-    assert n.shell(r"printf 'a\377\376b\ngr\303\274n\n\000\n'") == 0
+    script = r"printf 'a\377\376b\ngr\303\274n\n\000\n'"
+    assert n.shell(script, LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0") == 0
     assert n.output() == ["a\ufffd\ufffdb", "grün", "\0"]
-
-
-@pytest.mark.parametrize("locale", ["C", "POSIX"])
-def test_a_locale_without_unicode_does_not_stop_the_node(node: Nodes, locale: str) -> None:
-    n = node()
-    assert n.shell(r"printf 'gr\303\274n\n'", LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0") == 0
-    assert n.output() == ["grün"]
 
 
 def test_of_a_progress_bar_the_last_state_is_kept(node: Nodes) -> None:
@@ -106,6 +97,9 @@ def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> N
 def test_the_exit_code_is_the_ranks_even_if_nothing_can_be_written(node: Nodes) -> None:
     n = node()
     (n.run.path / "outcomes").write_text("a file where a directory should be")
+    assert n.shell("exit 6") == 6
+    assert n.stderr.read_text() == "outcome of node 0 can't be written: Not a directory\n"
+    n.stderr.unlink()
     n.stderr.symlink_to("/dev/full")
     with full_volume(n.run.log("job", 1, 0).parent):
         assert n.python("print('x')\nraise SystemExit(5)") == 5
@@ -140,13 +134,6 @@ def test_a_flooded_log_keeps_both_ends_and_counts_the_middle(node: Nodes) -> Non
     assert gap.startswith(f"… {60_000 - len(output):,} lines (")
     assert "the error" in n.output() and n.lines()[-1][2].startswith("node 0 ended")
     assert sum(path.stat().st_size for path in n.run.logs("job", 1).iterdir()) <= 1 << 20
-
-
-def test_a_store_that_refuses_the_outcome_does_not_change_the_exit_code(node: Nodes) -> None:
-    n = node()
-    (n.run.path / "outcomes").write_text("a file where a directory should be")
-    assert n.shell("exit 6") == 6
-    assert n.stderr.read_text() == "outcome of node 0 can't be written: Not a directory\n"
 
 
 # -- environment ------------------------------------------------------------------------------------------------------
@@ -232,24 +219,21 @@ def test_a_command_that_can_not_be_started_is_reported_with_a_remedy(node: Nodes
     assert n.lines() == [(None, "e", reason)]
 
 
+BY_ENGINE = "a node is started by one of Muster's engines"
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"MUSTER_JOB_ID": None}, "MUSTER_JOB_ID is missing; a node is started by one of Muster's engines"),
-        ({"MUSTER_STORE": None}, "MUSTER_STORE is missing; a node is started by one of Muster's engines"),
-        (
-            {"MUSTER_EPOCH": "x"},
-            "MUSTER_EPOCH is 'x', not a whole number; a node is started by one of Muster's engines",
-        ),
-        (
-            {"MUSTER_GRACE_SECONDS": "x"},
-            "MUSTER_GRACE_SECONDS is 'x', not a number; a node is started by one of Muster's engines",
-        ),
+        ({"MUSTER_JOB_ID": None}, f"MUSTER_JOB_ID is missing; {BY_ENGINE}"),
+        ({"MUSTER_STORE": None}, f"MUSTER_STORE is missing; {BY_ENGINE}"),
+        ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not a whole number; {BY_ENGINE}"),
+        ({"MUSTER_GRACE_SECONDS": "x"}, f"MUSTER_GRACE_SECONDS is 'x', not a number; {BY_ENGINE}"),
         ({"MUSTER_RUN": "../x"}, "run name '../x': use letters, digits, '.', '_' and '-' only, at most 128 of them"),
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
     ],
 )
-def test_a_broken_contract_is_reported_in_one_line(
+def test_a_broken_contract_is_told_in_a_line(
     node: Nodes, tmp_path: Path, change: dict[str, str | None], said: str
 ) -> None:
     n = node()
@@ -267,10 +251,8 @@ def test_a_damaged_epoch_file_is_reported_in_one_line(node: Nodes) -> None:
     n = node()
     (n.run.path / "EPOCH").write_text("")
     assert n.call("true") == 2
-    assert (
-        n.stderr.read_text()
-        == f"muster supervisor: {n.run.path}/EPOCH: expected a whole number of at most 15 digits, found ''\n"
-    )
+    said = f"muster supervisor: {n.run.path}/EPOCH: expected a whole number of at most 15 digits, found ''\n"
+    assert n.stderr.read_text() == said
 
 
 def test_a_store_that_is_not_the_controllers_is_reported_before_any_start(node: Nodes, tmp_path: Path) -> None:
@@ -287,13 +269,13 @@ def test_a_store_that_is_not_the_controllers_is_reported_before_any_start(node: 
 @pytest.mark.parametrize("arguments", [[], ["--"], ["sleep", "60"]])
 def test_a_wrong_call_prints_the_usage(arguments: list[str]) -> None:
     command = [sys.executable, "-P", "-m", "worker.supervisor", *arguments]
-    called = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    called = subprocess.run(command, capture_output=True, text=True, timeout=20 * PATIENCE)
     assert (called.returncode, called.stderr) == (2, "usage: python -m worker.supervisor -- COMMAND [ARG …]\n")
 
 
 def test_the_supervisor_imports_no_torch() -> None:
     script = "import sys, worker.supervisor; print([name for name in ('torch', 'warp', 'newton', 'orchestrator') if name in sys.modules])"
-    called = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, timeout=20)
+    called = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True)
     assert called.stdout == "[]\n"
 
 

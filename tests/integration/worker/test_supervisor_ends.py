@@ -36,36 +36,32 @@ def test_an_exception_is_reported_with_its_traceback(node: Nodes) -> None:
     assert n.lines()[-1] == (None, "o", f"node 0 ended: {outcome.reason}")
 
 
-def test_of_several_tracebacks_the_last_one_counts(node: Nodes) -> None:
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ("echo first >&2; echo 'fatal: no such device' >&2; echo >&2; echo out", "fatal: no such device"),
+        (
+            f"{sys.executable} -c 'import traceback\ntry: {{}}[1]\nexcept KeyError: traceback.print_exc()\nraise OSError(2)'",
+            "OSError: 2",
+        ),
+        ("true", None),
+    ],
+)
+def test_the_last_traceback_or_line_on_standard_error_is_the_error(node: Nodes, said: str, message: str | None) -> None:
     n = node()
-    script = "import traceback\ntry: {}['handled']\nexcept KeyError: traceback.print_exc()\nraise OSError('fatal')"
-    assert n.python(script) == 1
-    assert n.ended().error.message == "OSError: fatal"  # type: ignore[union-attr]
-
-
-def test_without_a_traceback_the_last_line_on_standard_error_is_the_error(node: Nodes) -> None:
-    n = node()
-    assert n.shell("echo first >&2; echo 'fatal: no such device' >&2; echo >&2; echo out; exit 9") == 9
+    assert n.shell(f"{said}; exit 9") == 9
     outcome = n.ended()
-    assert outcome.reason == "rank 0 exited with code 9: fatal: no such device"
-    assert (outcome.error.message, outcome.error.traceback) == ("fatal: no such device", "")  # type: ignore[union-attr]
+    assert outcome.reason == "rank 0 exited with code 9" + (f": {message}" if message else "")
+    assert (outcome.error and outcome.error.message) == message
 
 
-def test_a_silent_failure_is_reported_by_its_code(node: Nodes) -> None:
-    n = node()
-    assert n.shell("exit 9") == 9
-    assert (n.ended().reason, n.ended().error) == ("rank 0 exited with code 9", None)
+EXTRA = {"py_callstack": "Traceback …", "timestamp": "1234"}
 
 
 @pytest.mark.parametrize(
     ("content", "message", "traceback", "when"),
     [
-        (
-            {"message": {"message": "CUDA broke", "extraInfo": {"py_callstack": "Traceback …", "timestamp": "1234"}}},
-            "CUDA broke",
-            "Traceback …",
-            1234.0,
-        ),
+        ({"message": {"message": "CUDA broke", "extraInfo": EXTRA}}, "CUDA broke", "Traceback …", 1234.0),
         ({"message": "just a text"}, "just a text", "", None),
         ({"message": 3}, "on stderr", "", None),
         ({"message": {"message": "m", "extraInfo": {"timestamp": "soon"}}}, "on stderr", "", None),
@@ -97,9 +93,7 @@ def test_the_error_file_of_torchrun_is_honoured_if_it_holds_an_error(
         ("file.close(); os.remove(path); os.mkfifo(path)", "not a regular file"),
     ],
 )
-def test_an_error_file_that_can_not_be_used_costs_neither_the_exit_code_nor_time(
-    node: Nodes, write: str, problem: str
-) -> None:
+def test_an_unusable_error_file_costs_neither_the_exit_code_nor_time(node: Nodes, write: str, problem: str) -> None:
     n = node()
     begin = "import os, sys; path = os.environ['TORCHELASTIC_ERROR_FILE']; file = open(path, 'w'); "
     assert n.python(f"{begin}{write}; sys.exit(7)") == 7
@@ -110,17 +104,8 @@ def test_an_error_file_that_can_not_be_used_costs_neither_the_exit_code_nor_time
 
 def test_no_message_on_the_progress_pipe_ends_the_supervisor(node: Nodes) -> None:
     n = node(stall_timeout=600.0)
-    lines = [
-        "[1]",
-        "1",
-        "null",
-        '"x"',
-        "{",
-        "[" * 50_000,
-        '{"iteration": []}',
-        '{"iteration": 1e400}',
-        '{"said": {"a": 1}}',
-    ]
+    objects = ('{"iteration": []}', '{"iteration": 1e400}', '{"said": {"a": 1}}')
+    lines = ["[1]", "1", "null", '"x"', "{", "[" * 50_000, *objects]
     script = (
         "import os, resource\nfd = int(os.environ['MUSTER_PROGRESS_FD'])\nos.set_blocking(fd, True)\n"
         "def say(text):\n"
@@ -165,9 +150,7 @@ def test_a_rank_killed_by_a_signal_is_reported_by_the_signal_s_name(node: Nodes,
 
 def test_when_one_rank_fails_the_others_are_ended_and_the_first_failure_is_the_reason(node: Nodes) -> None:
     n = node(ranks_per_node=3)
-    started = time.monotonic()
-    assert n.shell("if [ $RANK = 1 ]; then sleep 0.3; echo broken >&2; exit 3; fi; exec sleep 60") == 3
-    assert time.monotonic() - started < 5
+    assert n.shell("if [ $RANK = 1 ]; then sleep 0.3; echo broken >&2; exit 3; fi; exec sleep 600") == 3
     outcome = n.ended()
     assert outcome.reason == "rank 1 exited with code 3: broken"
     assert outcome.error.rank == 1  # type: ignore[union-attr]
@@ -179,6 +162,7 @@ def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node
     asked.wait_for_output("ready")
     asked.process.terminate()
     assert (asked.wait(), asked.ended().asked) == (143, True)
+    assert asked.ended().reason == "rank 0 was killed by SIGTERM"
     failed = node(attempt=2)
     assert (failed.shell("exit 3"), failed.ended().asked) == (3, False)
     gang = node(attempt=3, ranks_per_node=3)
@@ -206,16 +190,11 @@ def test_a_rank_that_ignores_the_failure_of_another_is_killed(node: Nodes) -> No
     assert n.ended().reason == "rank 0 exited with code 3"
 
 
-def test_one_rank_that_is_done_does_not_end_the_others(node: Nodes) -> None:
+def test_one_rank_that_is_done_or_closes_its_output_ends_no_other(node: Nodes) -> None:
     n = node(ranks_per_node=2)
-    assert n.shell("if [ $RANK = 0 ]; then exit 0; fi; sleep 0.5; echo still here") == 0
+    script = "if [ $RANK = 0 ]; then exit 0; fi; sleep 0.5; echo still here; exec >&- 2>&-; sleep 0.3; exit 4"
+    assert n.shell(script) == 4
     assert n.output() == ["still here"]
-
-
-def test_a_rank_that_closes_its_output_is_still_waited_for(node: Nodes) -> None:
-    n = node()
-    assert n.shell("echo before; exec >&- 2>&-; sleep 0.3; exit 4") == 4
-    assert n.output() == ["before"]
 
 
 # -- being asked to leave ---------------------------------------------------------------------------------------------
@@ -248,7 +227,7 @@ def test_a_rank_that_does_not_exit_within_the_grace_time_is_killed(node: Nodes) 
     asked = time.monotonic()
     n.process.terminate()
     assert n.wait() == 137
-    assert 0.5 < time.monotonic() - asked < 4
+    assert time.monotonic() - asked > 0.5
     outcome = n.ended()
     assert outcome.reason == "rank 0 did not leave within 0.6 s of SIGTERM and was killed"
     assert outcome.signal == "SIGKILL"
@@ -259,19 +238,10 @@ def test_asking_again_does_not_prolong_the_grace(node: Nodes) -> None:
     n.start("sh", "-c", STAYS)
     n.wait_for_output("ready")
     asked = time.monotonic()
-    while n.process.poll() is None and time.monotonic() - asked < 10:
+    while n.process.poll() is None and time.monotonic() - asked < 10 * PATIENCE:
         n.process.terminate()
         time.sleep(0.1)
-    assert time.monotonic() - asked < 5
-
-
-def test_a_program_without_a_handler_ends_by_the_request(node: Nodes) -> None:
-    n = node()
-    n.start("sh", "-c", "echo ready; exec sleep 60")
-    n.wait_for_output("ready")
-    n.process.terminate()
-    assert n.wait() == 143
-    assert n.ended().reason == "rank 0 was killed by SIGTERM"
+    assert n.process.poll() is not None
 
 
 def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node: Nodes) -> None:
@@ -296,14 +266,8 @@ def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node
 def test_a_job_s_variables_take_effect_in_its_ranks_and_not_in_its_supervisor(node: Nodes, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "queue.py").write_text("MINE = True\n")
-    job = {
-        "PYTHONPATH": str(tmp_path / "mine"),
-        "PYTHONHOME": "/nowhere",
-        "LD_LIBRARY_PATH": "/nowhere",
-        "TMPDIR": "/nowhere",
-        "RANK": "99",
-        "MUSTER_EPOCH": "99",
-    }
+    nowhere = dict.fromkeys(("PYTHONHOME", "LD_LIBRARY_PATH", "TMPDIR"), "/nowhere")
+    job = {"PYTHONPATH": str(tmp_path / "mine"), **nowhere, "RANK": "99", "MUSTER_EPOCH": "99"}
     n = node()
     script = "echo $PYTHONPATH $PYTHONHOME $LD_LIBRARY_PATH $TMPDIR $RANK $MUSTER_EPOCH; env | grep -c MUSTER_RANK_ENV_"
     assert n.shell(script, **sealed(job, n.contract.to_env())) == 1, "grep found none"
@@ -315,11 +279,8 @@ def test_a_job_s_variables_take_effect_in_its_ranks_and_not_in_its_supervisor(no
 
 def test_descendants_in_sessions_and_environments_of_their_own_do_not_survive(node: Nodes) -> None:
     n = node()
-    script = (
-        'setsid sh -c "echo \\$\\$; exec sleep 600" & '
-        '(env -i setsid sh -c "echo \\$\\$; exec sleep 600" &) ; sleep 0.5; exit 0'
-    )
-    assert n.shell(script) == 0
+    escape = 'setsid sh -c "echo \\$\\$; exec sleep 600" &'
+    assert n.shell(f"{escape} (env -i {escape}) ; sleep 0.5; exit 0") == 0
     pids = [int(text) for text in n.output()]
     assert len(pids) == 2
     assert not any(alive(pid) for pid in pids), "they were ended before the supervisor left"

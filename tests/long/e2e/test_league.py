@@ -13,7 +13,7 @@ SMALL = ("train.iterations=30", "checkpoint.every=30", "train.config.track=oval"
 
 def test_a_racer_is_trained_registered_raced_ranked_and_verified(server: Serving) -> None:
     def done(*arguments: str) -> str:
-        ended = server.muster(*arguments, timeout=300)
+        ended = server.muster_process(*arguments, timeout=300)
         assert ended.returncode == 0, ended.stdout + ended.stderr
         return ended.stdout
 

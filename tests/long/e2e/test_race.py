@@ -34,7 +34,7 @@ def raced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Serving, s
 
 
 def race(server: Serving, run: str, *options: str) -> dict[str, Any]:
-    done = server.muster("evaluate", run, "--race", *options, "--json", timeout=300)
+    done = server.muster_process("evaluate", run, "--race", *options, "--json", timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     summary: dict[str, Any] = json.loads(done.stdout)
     return summary
@@ -66,7 +66,9 @@ def test_a_race_has_the_same_lap_times_again_and_its_step_logs_are_copied(
 def test_a_race_is_printed_as_a_table_and_does_not_choose_the_best_checkpoint(raced: tuple[Serving, str]) -> None:
     server, run = raced
     before = server.client.get(f"/api/runs/{run}/checkpoints")
-    done = server.muster("evaluate", f"{run}@2", "--race", "--trials", "1", "--set", "race.seconds=2", timeout=300)
+    done = server.muster_process(
+        "evaluate", f"{run}@2", "--race", "--trials", "1", "--set", "race.seconds=2", timeout=300
+    )
     assert done.returncode == 0 and "TRIAL       TIME COMPLETED STATUS" in done.stdout, done.stdout + done.stderr
     assert "checkpoint 00000002-e1" in done.stdout
     after = server.client.get(f"/api/runs/{run}/checkpoints")
@@ -76,6 +78,6 @@ def test_a_race_is_printed_as_a_table_and_does_not_choose_the_best_checkpoint(ra
 
 def test_of_an_unknown_track_the_nearest_name_is_told(raced: tuple[Serving, str]) -> None:
     server, run = raced
-    done = server.muster("evaluate", run, "--race", "--track", "chicaine", timeout=300)
+    done = server.muster_process("evaluate", run, "--race", "--track", "chicaine", timeout=300)
     said = done.stdout + done.stderr
     assert (done.returncode, said) == (2, "muster: race.track: track chicaine does not exist; did you mean chicane?\n")

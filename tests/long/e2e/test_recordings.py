@@ -42,7 +42,7 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     wait_for(lambda: list_checkpoints(run), timeout=300, what="the first checkpoint")
 
     live = tmp_path / "live.mcap"
-    done = server.muster("record", job, "-o", str(live), "--worlds", "2", "--episodes", "2", timeout=180)
+    done = server.muster_process("record", job, "-o", str(live), "--worlds", "2", "--episodes", "2", timeout=180)
     assert done.returncode == 0, done.stderr
     waiting, loading, *_ = [line for line in done.stderr.splitlines() if "Warp" not in line]
     assert (
@@ -57,10 +57,10 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     with live.open("rb") as file:
         assert any(b"iteration" in message.data for _, _, message in make_reader(file).iter_messages("/rosout"))
 
-    stopped = server.muster("stop", job, timeout=180)
+    stopped = server.muster_process("stop", job, timeout=180)
     assert stopped.returncode == 0, stopped.stderr
     file = tmp_path / "policy.mcap"
-    done = server.muster(
+    done = server.muster_process(
         "record", f"{run.name}@latest", "-o", str(file), "--worlds", "2", "--episodes", "1", timeout=180
     )
     assert done.returncode == 0, done.stderr + done.stdout
@@ -82,7 +82,7 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
 
     picture = tmp_path / "policy.png"
     size = ["--size", "96x64", "--worlds", "1", "--seconds", "0.5"]
-    done = server.muster("render", job, "-o", str(picture), *size, timeout=300)
+    done = server.muster_process("render", job, "-o", str(picture), *size, timeout=300)
     assert done.returncode == 0, done.stderr + done.stdout
     assert Image.open(picture).size == (3 * 96 + 4, 2 * 64 + 2)
     assert not list(run.recordings.iterdir()), "what was brought to the user is not kept twice"
@@ -114,9 +114,11 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     }
     for arguments, words in refused.items():
         recovers = "--recover" in arguments  # in a process of the command's, whose words are not caught here
-        done = server.muster(*arguments) if recovers else call_muster(*arguments, home=server.home)
+        done = server.muster_process(*arguments) if recovers else call_muster(*arguments, home=server.home)
         assert done.returncode in (1, 2) and words in done.stderr, (arguments, done.stderr)
         assert len(done.stderr.strip().splitlines()) == 1
     assert kept == (file.read_bytes(), picture.read_bytes()) and not drawn.stat().st_size
-    done = server.muster("render", job, "-o", str(picture), "--overwrite", *size[:-2], "--seconds", "0.2", timeout=300)
+    done = server.muster_process(
+        "render", job, "-o", str(picture), "--overwrite", *size[:-2], "--seconds", "0.2", timeout=300
+    )
     assert done.returncode == 0 and picture.read_bytes() != kept[1], done.stderr

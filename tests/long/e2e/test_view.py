@@ -159,7 +159,7 @@ def test_only_loopback_is_listened_on_and_no_rank_has_rerun_in_its_memory(
 
 
 def test_a_training_has_one_reader_and_a_second_one_is_told_in_one_line(view: View, server: Serving, job: str) -> None:
-    done = server.muster("view", job)
+    done = server.muster_process("view", job)
     (line,) = done.stderr.strip().splitlines()
     assert done.returncode == 1 and "is being recorded or viewed already, by process" in line
 
@@ -201,7 +201,7 @@ def test_the_view_goes_on_with_the_next_attempt_and_says_where_its_server_is_gon
 def test_a_checkpoint_s_policy_acts_until_its_episodes_are_over(server: Serving, job: str, tmp_path: Path) -> None:
     server.muster("stop", job)
     run = run_of(server, job)
-    done = server.muster("view", f"{run.name}@best", "--worlds", "2", "--episodes", "2", timeout=180)
+    done = server.muster_process("view", f"{run.name}@best", "--worlds", "2", "--episodes", "2", timeout=180)
     assert done.returncode == 0, done.stderr
     found = re.search(r"viewed: (\d+) frames", done.stdout)
     assert found and int(found[1]) > 2
@@ -230,6 +230,6 @@ def test_what_can_t_be_viewed_is_refused_in_one_line(server: Serving, job: str, 
         ("view", str(tmp_path / "text.rrd"), "--episodes", "1"): "only the policy of a RUN takes it",
     }
     for arguments, words in refused.items():
-        done = server.muster(*arguments)
+        done = server.muster_process(*arguments)
         assert done.returncode in (1, 2) and words in done.stderr, (arguments, done.stderr)
         assert len(done.stderr.strip().splitlines()) == 1, done.stderr

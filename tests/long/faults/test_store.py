@@ -95,7 +95,7 @@ def test_slow_writes_do_not_hold_up_training(server: Serving) -> None:
     [writer] = gang_members(server.home, "writer")
     writer.strike(signal.SIGSTOP)  # a volume that takes for ever, as the writer sees it
     answers: list[str] = []
-    asking = threading.Thread(target=lambda: answers.append(server.muster("checkpoint", job["id"]).stdout))
+    asking = threading.Thread(target=lambda: answers.append(server.muster_process("checkpoint", job["id"]).stdout))
     asking.start()
     reached = raw_iterations(server, job["run"])[-1]
     wait_for(lambda: raw_iterations(server, job["run"])[-1] > reached + 30, 30, "progress while the writer waits")

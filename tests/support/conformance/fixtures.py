@@ -1,4 +1,4 @@
-"""What ``make fuzz`` writes down."""
+"""A server as AWS's clients see it; what ``make fuzz`` writes down."""
 
 from __future__ import annotations
 
@@ -7,10 +7,29 @@ import platform
 from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, Serving
+
+if TYPE_CHECKING:
+    from tests.support.conformance.aws import Batch
+
+
+@pytest.fixture(scope="module")
+def batch(shared_server: Serving) -> Batch:
+    from tests.support.conformance.aws import Batch  # boto3, for those that use it
+
+    return Batch(shared_server)
+
+
+@pytest.fixture(scope="module")
+def parked(batch: Batch, request: pytest.FixtureRequest) -> Iterator[str]:
+    """A queue whose jobs never start, so that they can be looked at for as long as it takes; ``queues-parked`` in test_queues.py."""
+    name = f"{request.module.__name__.rpartition('test_')[2].replace('_', '-')}-parked"
+    yield batch.queue(name, batch.compute_environment(name, state="DISABLED"))
+    batch.remove([name], [name])
 
 
 @pytest.fixture(scope="session")

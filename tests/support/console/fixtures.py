@@ -1,8 +1,10 @@
-"""A server with keys, and a person at it."""
+"""A server with keys, and persons at it: with and without a real browser."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -10,6 +12,12 @@ from orchestrator.client import Client
 from orchestrator.keys import Key, KeyStore
 from tests.conftest import Serving
 from tests.support.console.visitor import Visitor
+from tests.support.definitions import container, multinode
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+    from tests.support.console.person import People
 
 
 class Console:
@@ -31,14 +39,7 @@ class Console:
 
     def register(self, name: str, cpus: str = "4", command: Sequence[str] = ("true",)) -> str:
         """A definition, which by default needs more than the machine has, so that its jobs wait; returns its ARN."""
-        needs = [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "16"}]
-        container = {"image": "muster", "command": list(command), "resourceRequirements": needs}
-        properties = {
-            "numNodes": 1,
-            "mainNode": 0,
-            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
-        }
-        definition = {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
+        definition = multinode(name, container(command, cpus))
         return str(self.client.batch("RegisterJobDefinition", **definition)["jobDefinitionArn"])
 
     def submit(self, definition: str, name: str, queue: str = "default") -> str:
@@ -59,8 +60,35 @@ def secret_of(key: Key) -> str:
 @pytest.fixture(scope="module")
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
     """A server for the tests of one file."""
-    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "1")
-    console = Console(server)
-    yield console
-    console.close()
-    server.close()
+    with Serving(tmp_path_factory.mktemp("home"), "--cpus", "1") as server:
+        console = Console(server)
+        yield console
+        console.close()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    """The system's Chromium. Not for longer: while Playwright runs, nothing else on this thread can have an event loop."""
+    program = shutil.which("chromium")
+    if program is None:
+        pytest.skip("CHROMIUM IS NOT INSTALLED (apt-get install chromium): NO PAGE OF THE CONSOLE HAS BEEN LOOKED AT")
+    from playwright.sync_api import expect, sync_playwright
+
+    from tests.support.console.person import WAIT
+
+    expect.set_options(timeout=WAIT)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def people(chromium: Browser) -> Iterator[People]:
+    """Opens browsers of persons: ``people(url, key)``. In the end none of their pages may have complained or asked anybody else."""
+    from tests.support.console.person import People
+
+    people = People(chromium)
+    yield people
+    people.close()
+    people.check()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import Serving, wait_for
+from tests.support.definitions import container, multinode
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 
 WAIT = "echo ready; exec sleep 600"
@@ -34,29 +35,12 @@ class Site:
     def submit(self, script: str, nodes: int, attempts: int = 1, cpus: str = "0.25", **env: str) -> str:
         """A native gang of ``sh -c script``; returns the job id."""
         environment = {"MUSTER_ON_CHILD_FAILURE": "restart", **self.environment, **env}
-        container = {
-            "image": "muster",
-            "command": ["sh", "-c", script],
-            "environment": [{"name": name, "value": value} for name, value in environment.items()],
-            "resourceRequirements": [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "128"}],
-            **self.container,
-        }
-        properties = {
-            "numNodes": nodes,
-            "mainNode": 0,
-            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
-        }
-        registered = self.serving.client.batch(
-            "RegisterJobDefinition",
-            jobDefinitionName="suite",
-            type="multinode",
-            nodeProperties=properties,
-            retryStrategy={"attempts": attempts},
-        )
-        submitted = self.serving.client.batch(
-            "SubmitJob", jobName="suite", jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
-        )
-        return str(submitted["jobId"])
+        memory = [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "128"}]
+        needs = container(["sh", "-c", script], env=environment, **{"resourceRequirements": memory, **self.container})
+        definition = multinode("suite", needs, nodes, retryStrategy={"attempts": attempts})
+        registered = self.serving.client.batch("RegisterJobDefinition", **definition)["jobDefinitionArn"]
+        job = {"jobName": "suite", "jobQueue": "default", "jobDefinition": registered}
+        return str(self.serving.client.batch("SubmitJob", **job)["jobId"])
 
     def printed(self, job: str, attempt: int | None = None) -> list[str]:
         """What the job's ranks printed."""
@@ -75,8 +59,8 @@ def local(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
 @contextlib.contextmanager
 def docker(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
     request.getfixturevalue("docker_client")
-    container = {"image": SUPERVISED, **host_files()}
-    yield from _served("docker", home, "--cpus", "8", container=container, environment={"PATH": PATH})
+    image = {"image": SUPERVISED, **host_files()}
+    yield from _served("docker", home, "--cpus", "8", container=image, environment={"PATH": PATH})
 
 
 @contextlib.contextmanager
@@ -101,29 +85,19 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             patch.setenv(name, "any")
-        aws = Serving(home / "aws", "--cpus", "8")
-        try:
+        with Serving(home / "aws", "--cpus", "8") as aws:
             settings = {"store": str(home / "volume"), "poll": 0.1, "quiet": 1.0, "store_is_shared": False}
             told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url}
             (home / "home").mkdir()
             save_config(home / "home", AwsConfig(**told, **settings))
             yield from _served("aws-batch", home / "home", volume=home / "volume")
-        finally:
-            aws.close()
 
 
 def _served(engine: str, home: Path, *options: str, volume: Path | None = None, **needs: Any) -> Iterator[Site]:
-    serving = Serving(home, "--engine", engine, *options)
-    try:
+    with Serving(home, "--engine", engine, *options) as serving:
         yield Site(engine, serving, volume or home / "store", **needs)
-    finally:
-        serving.close()
 
 
 SITES: dict[str, Callable[..., Any]] = {
-    "local": local,
-    "docker": docker,
-    "ray": ray,
-    "slurm": slurm,
-    "aws-batch": aws_batch,
+    **{"local": local, "docker": docker, "ray": ray, "slurm": slurm, "aws-batch": aws_batch}
 }

@@ -1,4 +1,4 @@
-"""A controller with its server in the test's own process, where a test may look inside; databases on SQLite and PostgreSQL."""
+"""Controllers: in the test's own process, where it may look inside; without room for another job; databases of both kinds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import httpx
 import pytest
 
 from orchestrator.server import Server
+from tests.conftest import Serving
 from tests.support.orchestrator import postgres
+from tests.support.orchestrator.jobs import FOREVER
 
 
 @pytest.fixture(scope="session")
@@ -42,3 +44,11 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'muster.db'}"
     return str(request.getfixturevalue("postgresql").new_database())
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    """A server whose only CPU is taken: what is submitted waits."""
+    with Serving(tmp_path_factory.mktemp("home"), "--cpus", "1") as server:
+        server.wait(server.gang(FOREVER, cpus="1", name="blocker"), "RUNNING")
+        yield server

@@ -2,12 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from orchestrator.client import Client
+from orchestrator.server import Server
+from tests.conftest import Serving
 from tests.support.waiting import wait_for
 
 FOREVER = "import time; time.sleep(600)"
+
+
+@contextlib.contextmanager
+def serving(home: Path, **options: Any) -> Iterator[Client]:
+    """A client of a controller in this process, of two CPUs by default."""
+    server = Server(home, **{"cpus": 2, **options})
+    server.start()
+    try:
+        with Client(server.url) as client:
+            yield client
+    finally:
+        server.close()
+
+
+def jobs_of(client: Client, queue: str = "default") -> list[dict[str, Any]]:
+    """All jobs of a queue, whatever their state."""
+    filters = [{"name": "AFTER_CREATED_AT", "values": ["0"]}]
+    found: list[dict[str, Any]] = client.batch("ListJobs", jobQueue=queue, filters=filters)["jobSummaryList"]
+    return found
 
 
 def detail(client: Client, job_id: str) -> dict[str, Any]:
@@ -22,3 +47,16 @@ def await_status(client: Client, job_id: str, *wanted: str) -> dict[str, Any]:
 
     found: dict[str, Any] = wait_for(there, 30, f"job {job_id} {wanted}")
     return found
+
+
+def refusal(server: Serving, *arguments: str, code: int = 2) -> str:
+    """The one line with which a command is refused; neither a job nor a run nor a hidden copy is left."""
+
+    def there() -> tuple[list[str], list[str]]:
+        return [each["jobId"] for each in jobs_of(server.client)], sorted(os.listdir(server.home / "store" / "runs"))
+
+    before = there()
+    done = server.muster(*arguments)
+    assert done.returncode == code and len(done.stderr.splitlines()) == 1, (done.returncode, done.stdout, done.stderr)
+    assert there() == before
+    return done.stderr

@@ -14,7 +14,7 @@ from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Run, Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
-from tests.conftest import wait_for
+from tests.conftest import PATIENCE, wait_for
 
 ENVIRONMENT = {
     name: value
@@ -58,7 +58,7 @@ class Node:
                 stderr=stderr,
             )
 
-    def wait(self, timeout: float = 20) -> int:
+    def wait(self, timeout: float = 20 * PATIENCE) -> int:
         return self.process.wait(timeout)
 
     def call(self, *command: str, **env: str) -> int:

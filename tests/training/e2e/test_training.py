@@ -115,7 +115,7 @@ def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Servin
 
 @long
 def test_ant_trains_on_two_nodes(server: Serving) -> None:
-    done = server.muster(
+    done = server.muster_process(
         "submit", "job_specs/ant.yaml", "-f", "--set", "train.iterations=2", "--set", "train.worlds=8", timeout=500
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,26 +1,30 @@
-"""A controller with an engine that hangs: it starts, and jobs of its other engines run."""
+"""A controller with an engine that hangs, or that queues and places gangs by itself: what it is handed, and what is told of it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import httpx
 import pytest
 
 from orchestrator import server as servers
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
+from orchestrator.domain.hosts import Host, Limit, Queued
+from orchestrator.domain.resources import Resources
 from orchestrator.engines import registry
 from orchestrator.engines.api import Engine, Handle, NotYet, Setting
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.toolkit.stopping import stop_within
-from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 from tests.conftest import submit_gang, wait_for
-from tests.support.orchestrator.jobs import await_status, detail
+from tests.support.definitions import container, multinode
+from tests.support.orchestrator.jobs import await_status, detail, serving
 
 
 class Hanging(FakeEngine):
@@ -54,14 +58,9 @@ def client(hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(servers, "make_engine", make)
     monkeypatch.setattr(registry, "START", 0.2)
-    server = Server(tmp_path, port=0, cpus=2, engines=("local", "fake"))
-    server.start()
-    try:
-        with Client(server.url) as client:
-            yield client
-    finally:
+    with serving(tmp_path, engines=("local", "fake")) as client:
+        yield client
         hanging.answers.set()
-        server.close()
 
 
 def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(client: Client, hanging: Hanging) -> None:
@@ -83,9 +82,7 @@ def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(clie
         client.post("/api/plan", large)
 
 
-def test_a_stop_that_is_never_answered_is_the_reason_of_the_job_and_is_tried_again(
-    client: Client, hanging: Hanging
-) -> None:
+def test_a_stop_that_is_not_answered_is_the_job_s_reason_and_tried_again(client: Client, hanging: Hanging) -> None:
     hanging.answers.set()
     job = submit_gang(client, "pass", queue="fake")
     await_status(client, job, "RUNNING")
@@ -99,3 +96,58 @@ def test_a_stop_that_is_never_answered_is_the_reason_of_the_job_and_is_tried_aga
     hanging.deaf = False
     await_status(client, job, "FAILED")
     assert detail(client, job)["statusReason"] == "enough"
+
+
+# -- an engine that queues --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def engine() -> FakeEngine:
+    return FakeEngine(capacity=Queued(Limit("fake/q", Resources(8.0, 2, 8192))))
+
+
+@pytest.fixture
+def queued(engine: FakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
+    monkeypatch.setattr(servers, "make_engine", lambda name, setting: engine)
+    with serving(tmp_path, cpus=None, engines=("fake",)) as client:
+        yield client
+
+
+def test_gangs_are_handed_over_although_others_run_there(queued: Client, engine: FakeEngine) -> None:
+    jobs = [submit_gang(queued, "pass", nodes=2, cpus="3", name=f"job-{number}") for number in range(3)]
+    for job in jobs:
+        await_status(queued, job, "RUNNING")
+    hosts = {placement.host for plan in engine.cluster.launched for placement in plan.gang.placements}
+    assert len(engine.cluster.launched) == 3 and hosts == {"fake/q"}
+
+
+def test_a_node_is_on_the_host_that_the_engine_tells_later(queued: Client, engine: FakeEngine) -> None:
+    job = submit_gang(queued, "pass", nodes=2)
+    [attempt] = await_status(queued, job, "RUNNING")["attempts"]
+    assert attempt["computeEnvironment"] == "fake" and [node["host"] for node in attempt["nodes"]] == ["fake/q"] * 2
+    [nodes] = engine.cluster.gangs.values()
+    nodes[1] = replace(nodes[1], host="fake/m7")
+    hosts = lambda: [node["host"] for node in detail(queued, job)["attempts"][0]["nodes"]]  # noqa: E731
+    wait_for(lambda: hosts() == ["fake/q", "fake/m7"], 20, "the host")
+
+
+def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_called_a_host(queued: Client) -> None:
+    limit = "queue fake/q gives a gang at most 8 CPUs, 2 GPUs, 8 GiB"
+    for nodes, cpus, needs in (
+        (1, "12", "each node needs 12 CPUs, 0 GPUs, 16 MiB"),
+        (3, "3", "needs 3 nodes with 9 CPUs, 0 GPUs, 48 MiB in all"),
+    ):
+        with pytest.raises(ApiError) as refused:
+            queued.post("/api/plan", {"definition": multinode("a", container(cpus=cpus), nodes)})
+        assert str(refused.value).endswith(f"{needs}; {limit}")
+
+
+def test_its_limit_is_told_apart_from_hosts(queued: Client, engine: FakeEngine) -> None:
+    told = queued.get("/api/capacity")
+    assert told["hosts"] == []
+    assert told["queued"] == {"fake": {"queue": "fake/q", "cpus": 8.0, "gpus": 2, "memory": 8192}}
+    metrics = httpx.get(f"{queued.url}/metrics").text
+    assert 'muster_cpus{engine="fake"} 8.0' in metrics and "muster_hosts{" not in metrics
+    engine.offered = Queued([Host("fake/a", 4.0, (), 1024, single=True)])
+    told = queued.get("/api/capacity")
+    assert [host["name"] for host in told["hosts"]] == ["fake/a"] and told["queued"] == {"fake": None}
