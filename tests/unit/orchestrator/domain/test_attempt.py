@@ -255,14 +255,8 @@ def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
 
 
 EVENTS = (
-    Due(),
-    Launched("handle"),
-    LaunchDelayed("why", False),
-    LaunchRefused("why"),
-    Preempted("why"),
-    seen(),
-    StopDelayed("why"),
-    Gone(T, MAIN_LAST, ""),
+    *(Due(), Launched("handle"), LaunchDelayed("why", False), LaunchRefused("why"), Preempted("why"), seen()),
+    *(StopDelayed("why"), Gone(T, MAIN_LAST, "")),
 )
 
 

@@ -99,11 +99,8 @@ def test_across_shares_only_one_that_would_be_served_first_preempts() -> None:
     # behind a job that never fits, for which 120 are charged, it comes later
     huge = job("huge", gang(node(2, 2)), share="s", priority=9)
     for waiting, mine, its, expected in (
-        ([ant], 10.0, 20.0, "cart"),
-        ([ant], 20.0, 10.0, ""),
-        ([ant], 10.0, 10.0, "cart"),
-        ([huge, ant], 10.0, 129.0, ""),
-        ([huge, ant], 10.0, 131.0, "cart"),
+        *(([ant], 10.0, 20.0, "cart"), ([ant], 20.0, 10.0, ""), ([ant], 10.0, 10.0, "cart")),
+        *(([huge, ant], 10.0, 129.0, ""), ([huge, ant], 10.0, 131.0, "cart")),
     ):
         usage = {("default", "s"): mine, ("default", "t"): its}
         assert Pass([host()], waiting, held, queues, usage=usage).preempted == expected
