@@ -38,16 +38,7 @@ LAYERS = {
 }
 """What each room of the orchestrator may import beside itself."""
 ADAPTERS = {
-    "alembic",
-    "boto3",
-    "botocore",
-    "docker",
-    "fastapi",
-    "httpx",
-    "ray",
-    "sqlalchemy",
-    "starlette",
-    "uvicorn",
+    *("alembic", "boto3", "botocore", "docker", "fastapi", "httpx", "ray", "sqlalchemy", "starlette", "uvicorn"),
     "zenoh",
 }
 PURE = ("domain", "spec", "scheduling")

@@ -201,12 +201,7 @@ class Call:
 
 
 _CONTENT_TYPES = (
-    "application/json",
-    "application/x-amz-json-1.1",
-    "text/plain",
-    "",
-    "application/json; charset=utf-7",
-    "é",
+    *("application/json", "application/x-amz-json-1.1", "text/plain", "", "application/json; charset=utf-7", "é"),
 )
 _ODD_HEADERS: tuple[dict[str, str], ...] = (
     {"X-Muster-Idempotency-Key": "again"},
@@ -318,25 +313,11 @@ def stray_calls(draw: st.DrawFn) -> Call:
     """Paths that lead nowhere, or somewhere in an odd way."""
     method = draw(st.sampled_from(("GET", "POST", "PUT", "DELETE", "PATCH", "HEAD", "OPTIONS", "TRACE", "BREW")))
     known = (
-        "/",
-        "/v1/",
-        "/v1",
-        "/v1/tags/",
-        "/v1//submitjob",
-        "/v1/tags",
-        "/v1/..",
-        "/%2e%2e/",
-        "//",
-        "/api",
-        "/api/",
-        "*",
+        *("/", "/v1/", "/v1", "/v1/tags/", "/v1//submitjob", "/v1/tags", "/v1/..", "/%2e%2e/", "//", "/api"),
+        *("/api/", "*"),
     )
     more = (
-        "/api/jobs/%00",
-        "/api/jobs/%ff",
-        "/api/jobs/..%2f..",
-        "/api/runs/%2e%2e",
-        "/api/jobs/<gang>%23",
+        *("/api/jobs/%00", "/api/jobs/%ff", "/api/jobs/..%2f..", "/api/runs/%2e%2e", "/api/jobs/<gang>%23"),
         "/healthz/",
     )
     native = ("/api/jobs/<gang>/logs?node=-1", "/api/jobs/<gang>/logs?attempt=99999999999999999999", "/api/runs/<run>")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import Decisions
+from orchestrator.scheduling.decide import decide
 from orchestrator.scheduling.snapshot import (
     ComputeEnvironment,
     FairShare,
@@ -22,6 +23,9 @@ from orchestrator.scheduling.snapshot import (
 NOW = 1_800_000_000_000
 """2027-01-15 08:00:00 UTC [ms]."""
 FAIR = FairShare(600, 0, {})
+CAPACITY = "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
+MAXIMUM = "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE"
+REQUIREMENT = "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT"
 
 
 def host(name: str = "a", cpus: float = 4, gpus: int = 0, memory: int = 8192) -> Host:
@@ -38,7 +42,7 @@ def gang(*nodes: Resources, minimum: int | None = None) -> Shape:
 
 def job(
     name: str,
-    shape: Shape | None = None,
+    shape: Shape | float = 1,
     *,
     queue: str = "default",
     priority: int = 0,
@@ -47,17 +51,15 @@ def job(
     runnable: int = 0,
     timeout: int | None = None,
 ) -> Waiting:
-    """A job of one node with one CPU, where nothing else is said; ``age`` and ``runnable`` in seconds."""
+    """A job; a number as its shape: one node with so many CPUs. ``age`` and ``runnable`` in seconds."""
+    whole = shape if isinstance(shape, Shape) else gang(node(shape))
     created, since = NOW - 1000 * age, NOW - 1000 * runnable
-    return Waiting(f"{name}-0123456789", name, queue, shape or gang(node()), priority, share, created, since, timeout)
+    return Waiting(f"{name}-0123456789", name, queue, whole, priority, share, created, since, timeout)
 
 
 def line(*jobs: Waiting) -> list[Waiting]:
     """The jobs as if created one after the other."""
-    return [
-        Waiting(j.job, j.name, j.queue, j.shape, j.priority, j.share, NOW - 1000 + i, j.since, j.timeout)
-        for i, j in enumerate(jobs)
-    ]
+    return [replace(each, created_at=NOW - 1000 + i) for i, each in enumerate(jobs)]
 
 
 def running(
@@ -66,26 +68,16 @@ def running(
     queue: str = "default",
     share: str | None = None,
     priority: int = 0,
-    compute_environment: str = "all",
-    for_seconds: int = 100,
+    environment: str = "all",
+    for_seconds: int | None = 100,
     timeout: int | None = None,
     preemptible: bool = False,
     ending: bool = False,
 ) -> Running:
-    started = NOW - 1000 * for_seconds
-    return Running(
-        f"{name}-0123456789",
-        name,
-        queue,
-        share,
-        priority,
-        compute_environment,
-        placements,
-        started,
-        timeout,
-        preemptible,
-        ending,
-    )
+    """A gang; ``for_seconds``: None while it starts."""
+    since = None if for_seconds is None else NOW - 1000 * for_seconds
+    job = f"{name}-0123456789"
+    return Running(job, name, queue, share, priority, environment, placements, since, timeout, preemptible, ending)
 
 
 def on(name: str, cpus: float = 0, gpus: Iterable[int] = (), memory: int = 0) -> Placement:
@@ -95,38 +87,49 @@ def on(name: str, cpus: float = 0, gpus: Iterable[int] = (), memory: int = 0) ->
 def queue(
     name: str = "default",
     priority: int = 1,
-    compute_environments: tuple[str, ...] = ("all",),
+    environments: tuple[str, ...] = ("all",),
     policy: FairShare | None = None,
     limits: tuple[TimeLimit, ...] = (),
 ) -> Queue:
-    return Queue(name, priority, compute_environments, policy, limits)
+    return Queue(name, priority, environments, policy, limits)
 
 
-def compute_environment(
+def environment(
     name: str = "all", hosts: tuple[str, ...] | None = None, enabled: bool = True, max_cpus: float | None = None
 ) -> ComputeEnvironment:
     return ComputeEnvironment(name, enabled, hosts, max_cpus)
 
 
-def snapshot(
-    hosts: Sequence[Host],
-    waiting: Sequence[Waiting],
-    held: Sequence[Running] = (),
-    queues: Sequence[Queue] = (),
-    compute_environments: Sequence[ComputeEnvironment] = (),
-    usage: Mapping[tuple[str, str], float] | None = None,
-    leading: Mapping[str, Leading] | None = None,
-) -> Snapshot:
-    return Snapshot(
-        now=NOW,
-        hosts=hosts,
-        compute_environments={each.name: each for each in compute_environments or [compute_environment()]},
-        queues={each.name: each for each in queues or [queue()]},
-        waiting=waiting,
-        running=held,
-        usage=usage or {},
-        leading=leading or {},
-    )
+class Pass:
+    """A pass of the scheduler, and what it decided, in short."""
+
+    def __init__(
+        self,
+        hosts: Sequence[Host],
+        waiting: Sequence[Waiting] = (),
+        held: Sequence[Running] = (),
+        queues: Sequence[Queue] = (),
+        environments: Sequence[ComputeEnvironment] = (),
+        usage: Mapping[tuple[str, str], float] | None = None,
+        leading: Mapping[str, Leading] | None = None,
+    ) -> None:
+        known = {each.name: each for each in environments or [environment()]}
+        lines = {each.name: each for each in queues or [queue()]}
+        snapshot = Snapshot(NOW, hosts, known, lines, waiting, held, usage or {}, leading or {})
+        self.decisions = decide(snapshot)
+        self.starts, self.preempts = self.decisions.starts, self.decisions.preempts
+        self.cancels = self.decisions.cancels
+        self.started = " ".join(f"{_short(each.job)}:{_hosts(each.placements)}" for each in self.starts)
+        """Each started job with its hosts, in the order in which they were decided."""
+        self.preempted = " ".join(_short(each.job) for each in self.preempts)
+        self.cancelled = " ".join(_short(each.job) for each in self.cancels)
+
+    def waits(self, queue: str = "default") -> str:
+        """The jobs that still wait, in the order of their queue."""
+        return " ".join(_short(each) for each in self.decisions.report.order(queue))
+
+    def reason(self, name: str) -> str:
+        return self.decisions.report.reason(f"{name}-0123456789")
 
 
 def leads(name: str, reason: str, seconds: int, queue: str = "default") -> dict[str, Leading]:
@@ -134,17 +137,27 @@ def leads(name: str, reason: str, seconds: int, queue: str = "default") -> dict[
     return {queue: Leading(f"{name}-0123456789", reason, NOW - 1000 * seconds)}
 
 
-def names(jobs: Iterable[str]) -> str:
-    return " ".join(each.removesuffix("-0123456789") for each in jobs)
+def needs(cpus: float, gpus: int = 0, nodes: int = 1, least: str = "") -> str:
+    """A reason's words for what a gang needs in all, with 100 MiB a node."""
+    words = f"{nodes} node{'s' * (nodes > 1)} with {cpus} CPU{'s' * (cpus != 1)}, {gpus} GPU{'s' * (gpus != 1)}"
+    return f"needs {least}{words}, {100 * nodes} MiB in all"
 
 
-def started(decisions: Decisions) -> str:
-    """Each started job with its hosts, in the order in which they were decided."""
-    return " ".join(
-        f"{names([start.job])}:{'+'.join(placement.host for placement in start.placements)}"
-        for start in decisions.starts
+def seats(each: Resources, hosts: Iterable[Host]) -> int:
+    """How many such nodes fit: reckoned by division, apart from the scheduler."""
+    return sum(
+        min(
+            int((free.cpus + 1e-9) // each.cpus),
+            len(free.gpus) // each.gpus if each.gpus else 99,
+            free.memory // each.memory,
+        )
+        for free in hosts
     )
 
 
-def reason(decisions: Decisions, name: str) -> str:
-    return decisions.report.reason(f"{name}-0123456789")
+def _short(job: str) -> str:
+    return job.removesuffix("-0123456789")
+
+
+def _hosts(placements: Iterable[Placement]) -> str:
+    return "+".join(each.host for each in placements)

@@ -105,17 +105,19 @@ def test_a_policy_that_acts_otherwise_than_it_was_trained_is_refused(tmp_path: P
         Policy(opened).self_test(opened.parity)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda found: found.update(format=9), "has format 9, this node reads up to 3; upgrade muster-policy"),
-        (lambda found: found.pop("actions"), "actions is missing; export the policy again"),
-        (lambda found: found.update(control_hz=0), "control_hz is 0; export the policy again"),
-        (lambda found: found.update(groups=7), "it is no policy contract"),
-        (lambda found: found["groups"][0].update(shape=[3]), "the terms of policy have 2 numbers, its shape is [3]"),
-    ],
-)
-def test_a_contract_that_can_t_be_read_is_refused(bundle: Path, change: Callable[[dict], None], said: str) -> None:
+UNREADABLE = {
+    "has format 9, this node reads up to 3; upgrade muster-policy": lambda found: found.update(format=9),
+    "actions is missing; export the policy again": lambda found: found.pop("actions"),
+    "control_hz is 0; export the policy again": lambda found: found.update(control_hz=0),
+    "it is no policy contract": lambda found: found.update(groups=7),
+    "the terms of policy have 2 numbers, its shape is [3]": lambda found: found["groups"][0].update(shape=[3]),
+}
+
+
+@pytest.mark.parametrize("said", UNREADABLE)
+def test_a_contract_that_can_t_be_read_is_refused(bundle: Path, said: str) -> None:
+    change = UNREADABLE[said]
+
     def edit(path: Path) -> None:
         document = json.loads((path / "contract.json").read_text())
         change(document)
@@ -143,28 +145,24 @@ def test_a_policy_of_other_inputs_than_the_contract_s_is_refused(bundle: Path, t
         Policy(open_bundle(bundle))
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--remap", "imu"), "--remap imu: expected TOPIC:=NAME, such as imu:=/imu/data"),
-        (("--remap", "imu:=/x"), "--remap imu: the node has no such topic; it has joint_commands, joint_states"),
-        (
-            ("--remap", "joint_states:=/a/*"),
-            "--remap /a/*: a name of ROS has letters, digits and _ between its slashes",
-        ),
-        (("--namespace", "/left arm"), "--namespace /left arm: a name of ROS has letters"),
-        (("--name", "a/b"), "--name a/b: a node's name has no slash; give --namespace besides"),
-        (("--controller", "2nd"), "--controller 2nd: a name of ROS has letters"),
-        (("--domain", "233"), "domain 233: expected 0 to 232"),
-        (("--listen", "nonsense"), "--listen nonsense: Zenoh can't open it"),
-        (("--joints", "JOINTS"), "line 2: the policy has no joint kne; did you mean knee?"),
-        (("--joints", "TWICE"), "knee and wheel of the policy are both motor of the robot; give each its own"),
-        (("--joints", "/no/such"), "--joints /no/such: it can't be read (No such file or directory)"),
-    ],
-)
-def test_wrong_use_is_one_line(
-    bundle: Path, tmp_path: Path, options: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+MISUSE = {
+    "--remap imu: expected TOPIC:=NAME, such as imu:=/imu/data": ("--remap", "imu"),
+    "--remap imu: the node has no such topic; it has joint_commands, joint_states": ("--remap", "imu:=/x"),
+    "--remap /a/*: a name of ROS has letters, digits and _ between its slashes": ("--remap", "joint_states:=/a/*"),
+    "--namespace /left arm: a name of ROS has letters": ("--namespace", "/left arm"),
+    "--name a/b: a node's name has no slash; give --namespace besides": ("--name", "a/b"),
+    "--controller 2nd: a name of ROS has letters": ("--controller", "2nd"),
+    "domain 233: expected 0 to 232": ("--domain", "233"),
+    "--listen nonsense: Zenoh can't open it": ("--listen", "nonsense"),
+    "line 2: the policy has no joint kne; did you mean knee?": ("--joints", "JOINTS"),
+    "knee and wheel of the policy are both motor of the robot; give each its own": ("--joints", "TWICE"),
+    "--joints /no/such: it can't be read (No such file or directory)": ("--joints", "/no/such"),
+}
+
+
+@pytest.mark.parametrize("said", MISUSE)
+def test_wrong_use_is_one_line(bundle: Path, tmp_path: Path, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    options = MISUSE[said]
     names = tmp_path / "names.txt"
     names.write_text("wheel = left_wheel  # of the robot\nkne = motor\n")
     twice = tmp_path / "twice.txt"
@@ -175,22 +173,18 @@ def test_wrong_use_is_one_line(
     assert said in line
 
 
-@pytest.mark.parametrize(
-    ("typed", "line"),
-    [
-        ("", "BUNDLE is missing; see: muster-policy --help"),
-        (
-            "x --strct-limits",
-            "--strct-limits: there is no such option; did you mean --strict-limits? see: muster-policy --help",
-        ),
-        ("x y", "y: more arguments than the command takes; see: muster-policy --help"),
-        ("x --domain ten", "--domain: expected a whole number, found ten; see: muster-policy --help"),
-        ("x --rate", "--rate: expected one argument; see: muster-policy --help"),
-    ],
-)
-def test_options_that_do_not_fit_are_one_line_without_the_usage(
-    typed: str, line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+UNFIT = {
+    "": "BUNDLE is missing; see: muster-policy --help",
+    "x --strct-limits": "--strct-limits: there is no such option; did you mean --strict-limits? see: muster-policy --help",
+    "x y": "y: more arguments than the command takes; see: muster-policy --help",
+    "x --domain ten": "--domain: expected a whole number, found ten; see: muster-policy --help",
+    "x --rate": "--rate: expected one argument; see: muster-policy --help",
+}
+
+
+@pytest.mark.parametrize("typed", UNFIT)
+def test_options_that_do_not_fit_are_one_line_without_the_usage(typed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    line = UNFIT[typed]
     with pytest.raises(SystemExit) as ended:
         main(typed.split())
     assert ended.value.code == 2 and capsys.readouterr().err == f"muster-policy: {line}\n"

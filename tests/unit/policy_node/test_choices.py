@@ -58,8 +58,7 @@ def test_a_choice_commands_its_targets() -> None:
 
 
 @pytest.mark.parametrize(
-    "contract",
-    [choosing((), ()), choosing(asked(0.5, 1.0), ()), choosing(asked(0.5, 1.0), asked(0.0, 1.0)[::-1])],
+    "contract", [choosing((), ()), choosing(asked(0.5, 1.0), ()), choosing(asked(0.5, 1.0), asked(0.0, 1.0)[::-1])]
 )
 def test_a_contract_that_does_not_say_what_a_choice_asks_for_is_refused(contract: Contract) -> None:
     with pytest.raises(

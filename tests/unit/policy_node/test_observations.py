@@ -14,7 +14,7 @@ from muster_policy.errors import Refused
 from muster_policy.inputs import Inputs
 from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWIST, Messages
 from muster_policy.observations import Observations
-from shared_store.policy_contract import Command, Contract, Frame, Group, Image, Term
+from shared_store.policy_contract import Command, Contract, Frame, Group, Image
 from tests.support.policy_node import for_node
 from tests.unit.policy_node.walker import HALF, JOINTS, TRUNK, UNIT, contract, term
 
@@ -55,9 +55,7 @@ def odometry(linear: tuple[float, ...], angular: tuple[float, ...]) -> Any:
         child_frame_id="trunk",
         pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
         twist=make(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=MESSAGES.twist(linear, angular),
-            covariance=np.zeros(36),
+            "geometry_msgs/msg/TwistWithCovariance", twist=MESSAGES.twist(linear, angular), covariance=np.zeros(36)
         ),
     )
 
@@ -140,12 +138,8 @@ def test_a_policy_never_goes_faster_than_commanded() -> None:
     assert command.command is not None
     now, ranges = command.arrived, command.command.ranges[1:]
     for ends, value, slow in (
-        ((0.5, 1.0), 0.0, True),
-        ((0.5, 1.0), -0.7, True),
-        ((0.5, 1.0), 0.6, False),
-        ((0.5, 1.0), 3.0, False),
-        ((-1.0, -0.5), -0.2, True),
-        ((-1.0, 1.0), 0.0, False),
+        *(((0.5, 1.0), 0.0, True), ((0.5, 1.0), -0.7, True), ((0.5, 1.0), 0.6, False), ((0.5, 1.0), 3.0, False)),
+        *(((-1.0, -0.5), -0.2, True), ((-1.0, 1.0), 0.0, False)),
     ):
         command.command = dataclasses.replace(command.command, ranges=(ends, *ranges))
         command.value = np.array([value, 0.0, 0.0])
@@ -191,21 +185,19 @@ def test_images_are_stacked_with_the_present_one_first() -> None:
     assert seen[0].tolist() == [[102, 105], [109, 112]] and seen[3].tolist() == red and seen.dtype == np.uint8
 
 
-@pytest.mark.parametrize(
-    ("message", "said"),
-    [
-        (
-            joints(("wheel", "Knee")),
-            "no joint is called knee; did you mean Knee? (--joints FILE gives the robot's names)",
-        ),
-        (joints(("wheel",)), "no joint is called knee; there are: wheel (--joints FILE gives the robot's names)"),
-        (joints(velocity=()), "0 velocities of 3 joints; the policy needs each joint's"),
-        (joints(position=(0.0, 0.0, np.nan)), "not finite: its positions"),
-        (joints(velocity=(np.inf, 0.0, 0.0)), "not finite: its velocities"),
-        (joints(("knee", "wheel", "knee")), "a joint is named twice"),
-    ],
-)
-def test_a_joint_state_that_can_t_be_used_is_ignored_with_one_line(message: Any, said: str) -> None:
+UNUSABLE = {
+    "no joint is called knee; did you mean Knee? (--joints FILE gives the robot's names)": joints(("wheel", "Knee")),
+    "no joint is called knee; there are: wheel (--joints FILE gives the robot's names)": joints(("wheel",)),
+    "0 velocities of 3 joints; the policy needs each joint's": joints(velocity=()),
+    "not finite: its positions": joints(position=(0.0, 0.0, np.nan)),
+    "not finite: its velocities": joints(velocity=(np.inf, 0.0, 0.0)),
+    "a joint is named twice": joints(("knee", "wheel", "knee")),
+}
+
+
+@pytest.mark.parametrize("said", UNUSABLE)
+def test_a_joint_state_that_can_t_be_used_is_ignored_with_one_line(said: str) -> None:
+    message = UNUSABLE[said]
     heard = Heard(contract())
     assert heard.hear("joint_states", message, JOINT_STATE) == [f"/joint_states: message ignored: {said}"]
     assert heard.hear("joint_states", message, JOINT_STATE) == [], "once"
@@ -248,22 +240,19 @@ def test_a_message_of_another_definition_is_ignored_with_one_line() -> None:
     assert line.endswith("give --distro as the robot has it")
 
 
-@pytest.mark.parametrize(
-    ("message", "said"),
-    [
-        (
-            imu(orientation_covariance=np.array([-1.0] + [0.0] * 8)),
-            "it has no orientation (orientation_covariance[0] is -1)",
-        ),
-        (imu((0.0, 0.0, 0.0, 0.0)), "its orientation is no rotation: a quaternion of length 0"),
-        (imu(angular=(0.0, np.nan, 0.0)), "not finite: its angular velocity"),
-        (
-            imu(angular_velocity_covariance=np.array([-1.0] + [0.0] * 8)),
-            "it has no angular velocity (angular_velocity_covariance[0] is -1)",
-        ),
-    ],
-)
-def test_an_imu_that_can_t_be_used_is_ignored_with_one_line(message: Any, said: str) -> None:
+UNUSABLE_IMU = {
+    "it has no orientation (orientation_covariance[0] is -1)": imu(orientation_covariance=np.array([-1.0] + [0.0] * 8)),
+    "its orientation is no rotation: a quaternion of length 0": imu((0.0, 0.0, 0.0, 0.0)),
+    "not finite: its angular velocity": imu(angular=(0.0, np.nan, 0.0)),
+    "it has no angular velocity (angular_velocity_covariance[0] is -1)": imu(
+        angular_velocity_covariance=np.array([-1.0] + [0.0] * 8)
+    ),
+}
+
+
+@pytest.mark.parametrize("said", UNUSABLE_IMU)
+def test_an_imu_that_can_t_be_used_is_ignored_with_one_line(said: str) -> None:
+    message = UNUSABLE_IMU[said]
     (line,) = Heard(contract()).hear("imu", message, IMU)
     assert line.startswith(f"/imu: message ignored: {said}")
 
@@ -277,52 +266,44 @@ def test_an_imu_without_orientation_suffices_for_a_policy_that_reads_none() -> N
 LEG = Frame("foot", "foot", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), False)
 
 
-@pytest.mark.parametrize(
-    ("terms", "said"),
-    [
-        (
-            (term("attitude", 0, 4, library=False),),
-            "attitude: attitude is no function of Muster's library",
-        ),
-        (
-            (term("scanned_height", 0, 2, sensors={"scan": "HeightScan, bodies trunk"}),),
-            "scanned_height: scanned_height (of HeightScan, bodies trunk) is in no message that the node reads",
-        ),
-        (
-            (term("joint_effort", 0, 2, **JOINTS),),
-            "joint_effort: joint_effort of joints is in no message that the node reads",
-        ),
-        (
-            (term("joint_offset", 0, 2, **JOINTS),),
-            "joint_offset: the contract has no default position of wheel, which no action drives",
-        ),
-        (
-            (term("root_height", 0, 1),),
-            "root_height: the contract does not say where root_height is measured; export the policy again",
-        ),
-        (
-            (term("imu_linear_velocity", 0, 3, frame=LEG),),
-            "imu_linear_velocity: imu_linear_velocity is measured on foot, the node knows the motion of the root alone",
-        ),
-        (
-            (term("projected_gravity", 0, 3, frame=TRUNK), term("imu_angular_velocity", 3, 3, frame=LEG)),
-            "projected_gravity: projected_gravity is of the root, and the inertial measurement unit is on foot",
-        ),
-        (
-            (term("imu_acceleration", 0, 3, frame=UNIT), term("imu_angular_velocity", 3, 3, frame=LEG)),
-            "it has several inertial measurement units (imu on trunk, foot on foot), the node reads one",
-        ),
-        (
-            (term("command_speed", 0, 1, kind="command", command="velocity"),),
-            "command_speed: command_speed of the command velocity is more than its numbers",
-        ),
-        (
-            (term("a", 0, 1, quantity="x", library=False), term("b", 1, 1, quantity="y", library=False)),
-            "a: x is no function of Muster's library; b: y is no function of Muster's library",
-        ),
-    ],
-)
-def test_a_policy_that_needs_an_unavailable_quantity_is_refused_in_one_line(terms: tuple[Term, ...], said: str) -> None:
+UNAVAILABLE = {
+    "attitude: attitude is no function of Muster's library": (term("attitude", 0, 4, library=False),),
+    "scanned_height: scanned_height (of HeightScan, bodies trunk) is in no message that the node reads": (
+        term("scanned_height", 0, 2, sensors={"scan": "HeightScan, bodies trunk"}),
+    ),
+    "joint_effort: joint_effort of joints is in no message that the node reads": (
+        term("joint_effort", 0, 2, **JOINTS),
+    ),
+    "joint_offset: the contract has no default position of wheel, which no action drives": (
+        term("joint_offset", 0, 2, **JOINTS),
+    ),
+    "root_height: the contract does not say where root_height is measured; export the policy again": (
+        term("root_height", 0, 1),
+    ),
+    "imu_linear_velocity: imu_linear_velocity is measured on foot, the node knows the motion of the root alone": (
+        term("imu_linear_velocity", 0, 3, frame=LEG),
+    ),
+    "projected_gravity: projected_gravity is of the root, and the inertial measurement unit is on foot": (
+        term("projected_gravity", 0, 3, frame=TRUNK),
+        term("imu_angular_velocity", 3, 3, frame=LEG),
+    ),
+    "it has several inertial measurement units (imu on trunk, foot on foot), the node reads one": (
+        term("imu_acceleration", 0, 3, frame=UNIT),
+        term("imu_angular_velocity", 3, 3, frame=LEG),
+    ),
+    "command_speed: command_speed of the command velocity is more than its numbers": (
+        term("command_speed", 0, 1, kind="command", command="velocity"),
+    ),
+    "a: x is no function of Muster's library; b: y is no function of Muster's library": (
+        term("a", 0, 1, quantity="x", library=False),
+        term("b", 1, 1, quantity="y", library=False),
+    ),
+}
+
+
+@pytest.mark.parametrize("said", UNAVAILABLE)
+def test_a_policy_that_needs_an_unavailable_quantity_is_refused_in_one_line(said: str) -> None:
+    terms = UNAVAILABLE[said]
     with pytest.raises(Refused) as caught:
         Observations(for_node(contract(*terms)))
     line = str(caught.value)

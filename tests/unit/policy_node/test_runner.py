@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -169,21 +168,22 @@ def test_each_kind_of_command_is_a_message_of_its_own_with_the_robot_s_names() -
     assert "knee" in table[0] and "stiffness 20, damping 1, effort up to 10" in table[0] and "left_wheel" in table[1]
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        (
-            {"discrete": True, "actions": (), "action_names": ("left", "right")},
-            "the policy does not say what its actions are: left, right",
-        ),
-        ({"actions": (), "action_names": ("knee",)}, "the policy does not say what its actions are: knee"),
-        (
-            {"actions": (Action("knee", "position", "rad", 1.0, 0.0, rule="It follows value slowly."),)},
-            "the command of knee has a rule that the node lacks: It follows value slowly.",
-        ),
-    ],
-)
-def test_a_policy_that_drives_no_joints_is_refused_in_one_line(changes: dict[str, Any], said: str) -> None:
+NO_JOINTS = {
+    "the policy does not say what its actions are: left, right": {
+        "discrete": True,
+        "actions": (),
+        "action_names": ("left", "right"),
+    },
+    "the policy does not say what its actions are: knee": {"actions": (), "action_names": ("knee",)},
+    "the command of knee has a rule that the node lacks: It follows value slowly.": {
+        "actions": (Action("knee", "position", "rad", 1.0, 0.0, rule="It follows value slowly."),)
+    },
+}
+
+
+@pytest.mark.parametrize("said", NO_JOINTS)
+def test_a_policy_that_drives_no_joints_is_refused_in_one_line(said: str) -> None:
+    changes = NO_JOINTS[said]
     with pytest.raises(Refused) as caught:
         Commands(for_node(contract(SPEED, LAST, **changes)))
     assert said in str(caught.value) and "\n" not in str(caught.value)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,11 @@ def names(run: Run) -> list[str]:
     return [checkpoint.name for checkpoint in list_checkpoints(run)]
 
 
+def newest(run: Run, **choice: Any) -> str:
+    found = newest_checkpoint(run, **choice)
+    return found.name if found else ""
+
+
 def commit_another(root: Path) -> None:
     commit(Run(root), 75, keep=2, reward=1.0)
 
@@ -65,11 +71,11 @@ def sweep_up(root: Path) -> None:
 
 
 def test_a_committed_checkpoint_lists_its_contents(run: Run) -> None:
-    checkpoint = commit(run, 25, epoch=3, world_size=2, worlds=64)
+    checkpoint = commit(run, 25, epoch=3, world_size=2, worlds=64, iteration=7, files={})
     assert (checkpoint.name, checkpoint.iteration, checkpoint.epoch) == ("00000025-e3", 25, 3)
     checkpoint.verify()
     manifest = checkpoint.manifest
-    assert (manifest["iteration"], manifest["epoch"], manifest["format"]) == (25, 3, FORMAT)
+    assert (manifest["iteration"], manifest["epoch"], manifest["format"]) == (25, 3, FORMAT), "its own entries stay"
     assert (manifest["world_size"], manifest["worlds"]) == (2, 64)
     content = (checkpoint.path / "rank-1.pt").read_bytes()
     assert manifest["files"]["rank-1.pt"] == {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
@@ -78,36 +84,24 @@ def test_a_committed_checkpoint_lists_its_contents(run: Run) -> None:
     assert (run.checkpoints / "LATEST").read_text() == "00000025-e3\n"
 
 
-def test_facts_can_not_replace_the_manifest_s_own_entries(run: Run) -> None:
-    assert commit(run, 25, iteration=7, files={}).manifest["iteration"] == 25
-
-
-def test_a_commit_killed_at_any_step_leaves_the_old_checkpoints_or_the_new_one_whole(run: Run, tmp_path: Path) -> None:
+def test_a_commit_killed_at_any_step_leaves_whole_checkpoints_and_the_next_attempt_commits_over_what_else_is_left(
+    run: Run, tmp_path: Path
+) -> None:
     commit(run, 25, reward=9.0)
     commit(run, 50, reward=2.0)
-    newest = []
+    found = []
     for left in killed_at_every_step(commit_another, run.path, tmp_path / "work"):
         crashed = Run(left)
         for checkpoint in list_checkpoints(crashed):
             checkpoint.verify()
         assert names(crashed)[:2] == ["00000025-e1", "00000050-e1"]  # the best and, of the two newest, the older
-        found = newest_checkpoint(crashed)
-        assert found
-        newest.append(found.name)
+        found.append(newest(crashed))
         assert (crashed.checkpoints / "LATEST").read_text().strip() in names(crashed)
-    assert newest == sorted(newest)
-    assert set(newest) == {"00000050-e1", "00000075-e1"}
-
-
-def test_the_next_attempt_commits_over_a_crash_s_leftovers(run: Run, tmp_path: Path) -> None:
-    commit(run, 25)
-    commit(run, 50)
-    for left in killed_at_every_step(commit_another, run.path, tmp_path / "work"):
-        crashed = Run(left)
         sweep(crashed)
         assert not [name for name in os.listdir(crashed.checkpoints) if name.startswith(".")]
         commit(crashed, 75, epoch=2).verify()
         assert names(crashed)[-1] == "00000075-e2"
+    assert found == sorted(found) and set(found) == {"00000050-e1", "00000075-e1"}
 
 
 def test_a_checkpoint_is_durable_before_it_gets_its_name(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,8 +141,7 @@ def test_a_commit_with_an_old_epoch_is_refused_and_publishes_nothing(run: Run) -
 
 
 def test_an_uncommitted_checkpoint_is_not_listed(run: Run) -> None:
-    assert list_checkpoints(run) == []
-    assert newest_checkpoint(run) is None
+    assert list_checkpoints(run) == [] and newest_checkpoint(run) is None
     CheckpointWriter(run, 25, 1)
     (run.checkpoints / "notes.txt").write_text("a person's")
     (run.checkpoints / "25-e1").mkdir()
@@ -168,17 +161,17 @@ def test_latest_is_only_a_hint(run: Run) -> None:
     commit(run, 25)
     commit(run, 50)
     (run.checkpoints / "LATEST").write_text("00000025-e1\n")
-    assert newest_checkpoint(run).name == "00000050-e1"  # type: ignore[union-attr]
+    assert newest(run) == "00000050-e1"
     (run.checkpoints / "LATEST").unlink()
-    assert newest_checkpoint(run).name == "00000050-e1"  # type: ignore[union-attr]
+    assert newest(run) == "00000050-e1"
 
 
 def test_a_chosen_checkpoint_stands_until_the_job_has_one_of_its_own(run: Run) -> None:
-    commit(run, 25, epoch=1)
-    commit(run, 50, epoch=1)
-    assert newest_checkpoint(run, chosen="00000025-e1", chosen_since=2).name == "00000025-e1"  # type: ignore[union-attr]
+    commit(run, 25)
+    commit(run, 50)
+    assert newest(run, chosen="00000025-e1", chosen_since=2) == "00000025-e1"
     commit(run, 30, epoch=2)
-    assert newest_checkpoint(run, chosen="00000025-e1", chosen_since=2).name == "00000030-e2"  # type: ignore[union-attr]
+    assert newest(run, chosen="00000025-e1", chosen_since=2) == "00000030-e2"
 
 
 def test_a_choice_that_is_missing_or_damaged_is_never_replaced_by_a_guess(run: Run) -> None:
@@ -194,9 +187,22 @@ def test_a_choice_that_is_missing_or_damaged_is_never_replaced_by_a_guess(run: R
 # -- damage -----------------------------------------------------------------------------------------------------------
 
 
-def edit_manifest(path: Path, **changes: Any) -> None:
-    manifest = json.loads((path / "manifest.json").read_text())
-    (path / "manifest.json").write_text(json.dumps({**manifest, **changes}))
+def edit(**changes: Any) -> Callable[[Path], Any]:
+    """Change entries of the manifest."""
+
+    def harm(path: Path) -> None:
+        manifest = json.loads((path / "manifest.json").read_text())
+        (path / "manifest.json").write_text(json.dumps({**manifest, **changes}))
+
+    return harm
+
+
+def cut(name: str, size: int) -> Callable[[Path], Any]:
+    return lambda path: os.truncate(path / name, size)
+
+
+def delete(name: str) -> Callable[[Path], Any]:
+    return lambda path: (path / name).unlink()
 
 
 def flip_a_bit(path: Path) -> None:
@@ -206,7 +212,7 @@ def flip_a_bit(path: Path) -> None:
 
 
 def replace_by_pipe(path: Path) -> None:
-    edit_manifest(path, files={"rank-0.pt": {"size": 0, "sha256": "0"}})
+    edit(files={"rank-0.pt": {"size": 0, "sha256": "0"}})(path)
     (path / "rank-0.pt").unlink()
     os.mkfifo(path / "rank-0.pt")
 
@@ -216,50 +222,35 @@ def replace_by_directory(path: Path) -> None:
     (path / "manifest.json").mkdir()
 
 
+def nest(path: Path) -> None:
+    (path / "manifest.json").write_text('{"files": ' + "[" * 5000 + "]" * 5000 + "}")
+
+
+ENTRY, UNREADABLE = "manifest.json has no size and digest of rank-0.pt", "manifest.json can't be read"
+ONE = {"size": 1, "sha256": "0"}
 DAMAGES = {
     "a bit flipped": (flip_a_bit, "the content of rank-1.pt was altered (SHA-256 differs)"),
-    "a file cut short": (
-        lambda path: os.truncate(path / "rank-1.pt", 10),
-        "rank-1.pt has 10 bytes, 1600 were written",
-    ),
-    "a file emptied": (lambda path: os.truncate(path / "learner.pt", 0), "learner.pt has 0 bytes, 1700 were written"),
-    "a file deleted": (lambda path: (path / "rank-0.pt").unlink(), "rank-0.pt is missing"),
-    "no manifest": (lambda path: (path / "manifest.json").unlink(), "manifest.json is missing or empty"),
-    "an empty manifest": (lambda path: os.truncate(path / "manifest.json", 0), "manifest.json can't be read"),
-    "half a manifest": (lambda path: os.truncate(path / "manifest.json", 40), "manifest.json can't be read"),
+    "a file cut short": (cut("rank-1.pt", 10), "rank-1.pt has 10 bytes, 1600 were written"),
+    "a file emptied": (cut("learner.pt", 0), "learner.pt has 0 bytes, 1700 were written"),
+    "a file deleted": (delete("rank-0.pt"), "rank-0.pt is missing"),
+    "a file that is a pipe": (replace_by_pipe, "rank-0.pt is not a regular file"),
+    "no manifest": (delete("manifest.json"), "manifest.json is missing or empty"),
+    "an empty manifest": (cut("manifest.json", 0), UNREADABLE),
+    "half a manifest": (cut("manifest.json", 40), UNREADABLE),
+    "a manifest nested deep": (nest, UNREADABLE),
+    "a manifest that is a directory": (replace_by_directory, UNREADABLE),
     "a manifest that leads elsewhere": (
-        lambda path: edit_manifest(path, files={"../../etc/passwd": {"size": 1, "sha256": "0"}}),
+        edit(files={"../../etc/passwd": ONE}),
         "manifest.json names '../../etc/passwd', which is no file of it",
     ),
-    "a manifest with a zero byte in a name": (
-        lambda path: edit_manifest(path, files={"a\0b": {"size": 1, "sha256": "0"}}),
-        r"manifest.json names 'a\x00b', which is no file of it",
-    ),
-    "a manifest with a size that is a text": (
-        lambda path: edit_manifest(path, files={"rank-0.pt": {"size": "x", "sha256": "0"}}),
-        "manifest.json has no size and digest of rank-0.pt",
-    ),
-    "a manifest with a reward that is a list": (
-        lambda path: edit_manifest(path, reward=[1]),
-        "manifest.json: reward is not a number",
-    ),
-    "a manifest nested deep": (
-        lambda path: (path / "manifest.json").write_text('{"files": ' + "[" * 5000 + "]" * 5000 + "}"),
-        "manifest.json can't be read",
-    ),
-    "a file that is a pipe": (replace_by_pipe, "rank-0.pt is not a regular file"),
-    "a manifest that is a directory": (replace_by_directory, "manifest.json can't be read"),
-    "a manifest without files": (lambda path: edit_manifest(path, files=None), "manifest.json is missing or empty"),
-    "a manifest with half an entry": (
-        lambda path: edit_manifest(path, files={"rank-0.pt": {"size": 1600}}),
-        "manifest.json has no size and digest of rank-0.pt",
-    ),
-    "a manifest with an entry that is none": (
-        lambda path: edit_manifest(path, files={"rank-0.pt": None}),
-        "manifest.json has no size and digest of rank-0.pt",
-    ),
+    "a zero byte in a name": (edit(files={"a\0b": ONE}), r"manifest.json names 'a\x00b', which is no file of it"),
+    "a size that is a text": (edit(files={"rank-0.pt": {"size": "x", "sha256": "0"}}), ENTRY),
+    "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
+    "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
+    "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
+    "a reward that is a list": (edit(reward=[1]), "manifest.json: reward is not a number"),
     "a newer format": (
-        lambda path: edit_manifest(path, format=FORMAT + 1),
+        edit(format=FORMAT + 1),
         f"has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster",
     ),
 }
@@ -271,20 +262,16 @@ def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: 
     commit(run, 25)
     harm(commit(run, 50).path)
     named: list[tuple[str, str]] = []
-    found = newest_checkpoint(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
-    assert found
-    assert found.name == "00000025-e1"
+    told = newest(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
     [(name, message)] = named
-    assert name == "00000050-e1"
+    assert (told, name) == ("00000025-e1", "00000050-e1")
     assert message.startswith(f"checkpoint 00000050-e1: {said}")
 
 
 def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(run: Run) -> None:
     for expected in ("00000050-e1.damaged", "00000050-e1.damaged-2", "00000050-e1.damaged-3"):
         moved = set_aside(commit(run, 50))
-        assert moved.name == expected
-        assert (moved / "rank-0.pt").exists()
-        assert list_checkpoints(run) == []
+        assert moved.name == expected and (moved / "rank-0.pt").exists() and list_checkpoints(run) == []
     commit(run, 50).verify()
 
 
@@ -300,6 +287,7 @@ def test_setting_aside_killed_at_any_step_loses_nothing(run: Run, tmp_path: Path
 
 
 def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
+    assert sweep(run) == []
     commit(run, 25)
     set_aside(commit(run, 50))
     CheckpointWriter(run, 75, 1)
@@ -312,54 +300,52 @@ def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
     assert sweep(run) == []
 
 
-def test_sweeping_a_run_without_checkpoints_is_nothing(run: Run) -> None:
-    assert sweep(run) == []
-
-
 def test_sweeping_killed_at_any_step_spares_committed_checkpoints(run: Run, tmp_path: Path) -> None:
     commit(run, 25)
     writer = CheckpointWriter(run, 50, 1)
     (writer.path / "rank-0.pt").write_bytes(b"half written")
     for left in killed_at_every_step(sweep_up, run.path, tmp_path / "work"):
         crashed = Run(left)
-        newest_checkpoint(crashed).verify()  # type: ignore[union-attr]
+        list_checkpoints(crashed)[-1].verify()
         sweep(crashed)
         assert sorted(os.listdir(crashed.checkpoints)) == ["00000025-e1", "LATEST"]
 
 
-def test_retention_keeps_the_newest_and_the_best(run: Run) -> None:
-    for iteration, reward in ((10, 3.0), (20, 9.0), (30, 1.0), (40, 2.0), (50, 4.0)):
-        commit(run, iteration, keep=2, reward=reward)
-    assert names(run) == ["00000020-e1", "00000040-e1", "00000050-e1"]
+NAN = float("nan")
+RETAINED: dict[str, tuple[list[dict[str, Any]], int | None, list[int]]] = {
+    "the newest and the best": ([{"reward": each} for each in (3.0, 9.0, 1.0, 2.0, 4.0)], 2, [20, 40, 50]),
+    "the best score, whatever the last iteration brought": (
+        [
+            {"score": score, "reward": reward}
+            for score, reward in ((None, 99.0), (9.0, 1.0), (3.0, 50.0), (2.0, 2.0), (4.0, 4.0))
+        ],
+        2,
+        [20, 40, 50],
+    ),
+    "all where all are to be kept": ([{}] * 4, None, [10, 20, 30, 40]),
+    **{
+        f"a reward of {reward} is never the best": (
+            [{"reward": each} for each in (reward, 5.0, *[reward] * 3)],
+            2,
+            [20, 40, 50],
+        )
+        for reward in (NAN, None, "high")
+    },
+}
 
 
-def test_the_best_is_the_one_with_the_best_score_whatever_its_last_iteration_brought(run: Run) -> None:
-    for iteration, score, reward in ((10, None, 99.0), (20, 9.0, 1.0), (30, 3.0, 50.0), (40, 2.0, 2.0), (50, 4.0, 4.0)):
-        commit(run, iteration, keep=2, score=score, reward=reward)
-    assert names(run) == ["00000020-e1", "00000040-e1", "00000050-e1"]
-
-
-def test_retention_deletes_nothing_where_all_are_to_be_kept(run: Run) -> None:
-    for iteration in (10, 20, 30, 40):
-        commit(run, iteration)
-    assert len(names(run)) == 4
+@pytest.mark.parametrize("case", RETAINED)
+def test_retention_keeps(run: Run, case: str) -> None:
+    facts, keep, kept = RETAINED[case]
+    for number, each in enumerate(facts, 1):
+        commit(run, 10 * number, keep=keep, **each)
+    assert names(run) == [f"{iteration:08d}-e1" for iteration in kept]
 
 
 def test_retention_never_deletes_the_newest(run: Run) -> None:
-    for iteration in (10, 20):
-        commit(run, iteration)
-    assert retain(run, 0) == ["00000010-e1"]
-    assert names(run) == ["00000020-e1"]
-
-
-@pytest.mark.parametrize("reward", [float("nan"), None, "high"])
-def test_a_reward_of_nan_is_never_the_best(run: Run, reward: object) -> None:
-    commit(run, 10, reward=reward)
-    commit(run, 20, reward=5.0)
-    for iteration in (30, 40, 50):
-        commit(run, iteration, reward=reward)
-    retain(run, 2)
-    assert names(run) == ["00000020-e1", "00000040-e1", "00000050-e1"]
+    commit(run, 10)
+    commit(run, 20)
+    assert retain(run, 0) == ["00000010-e1"] and names(run) == ["00000020-e1"]
 
 
 def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: Run) -> None:

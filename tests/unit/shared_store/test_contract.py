@@ -74,27 +74,18 @@ def test_aws_variables_are_exactly_those_of_aws_on_the_main_node() -> None:
     }
 
 
-def test_only_children_get_the_main_node_s_private_address() -> None:
-    name = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
-    for main in range(3):
-        told = [contract(node_index=i, main_index=main).to_env().get(name) for i in range(3)]
-        assert told == [None if index == main else "127.64.0.1" for index in range(3)]
-
-
-def test_every_node_has_torch_distributed_s_variables() -> None:
-    for index in range(3):
-        env = contract(node_index=index).to_env()
-        assert (env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"]) == ("127.64.0.1", "29500", "3")
-        assert env["NODE_RANK"] == str(index)
-
-
 @pytest.mark.parametrize(
     ("main", "ranks"), [(0, [0, 1, 2, 3]), (1, [1, 0, 2, 3]), (2, [1, 2, 0, 3]), (3, [1, 2, 3, 0])]
 )
-def test_rank_zero_is_on_the_main_node_whatever_its_index(main: int, ranks: list[int]) -> None:
+def test_rank_zero_is_on_the_main_node_whatever_its_index_and_the_others_get_its_address(
+    main: int, ranks: list[int]
+) -> None:
     nodes = [contract(node_index=i, node_count=4, main_index=main) for i in range(4)]
-    assert [node.node_rank for node in nodes] == ranks
-    assert [node.to_env()["NODE_RANK"] for node in nodes] == [str(rank) for rank in ranks]
+    given = [node.to_env() for node in nodes]
+    assert [node.node_rank for node in nodes] == ranks == [int(env["NODE_RANK"]) for env in given]
+    assert {(env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"]) for env in given} == {("127.64.0.1", "29500", "4")}
+    told = [env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") for env in given]
+    assert told == [None if index == main else "127.64.0.1" for index in range(4)]
 
 
 def test_our_own_variables_name_the_job_the_run_and_the_attempt() -> None:
@@ -112,38 +103,33 @@ def test_our_own_variables_name_the_job_the_run_and_the_attempt() -> None:
         "MUSTER_LOG_LIMIT": "1073741824",
         "MUSTER_ADDRESS": "127.64.0.2",
     }
-
-
-def test_the_world_is_all_ranks_of_all_nodes() -> None:
     assert contract(node_count=3, ranks_per_node=8).world_size == 24
 
 
-@pytest.mark.parametrize("name", ["MUSTER_JOB_ID", "MUSTER_RUN", "MUSTER_STORE", "MUSTER_EPOCH"])
-@pytest.mark.parametrize("how", ["absent", "empty"])
-def test_a_missing_variable_is_named(name: str, how: str) -> None:
-    env = contract().to_env()
-    if how == "absent":
-        del env[name]
-    else:
-        env[name] = ""
-    with pytest.raises(ContractError, match=f"^{name} is missing; a node is started by one of Muster's engines$"):
-        NodeContract.from_env(env)
+MISSING = "missing; a node is started by one of Muster's engines"
+WHOLE = ("AWS_BATCH_JOB_ATTEMPT", "AWS_BATCH_JOB_NODE_INDEX", "MASTER_PORT", "MUSTER_EPOCH")
+MALFORMED = [
+    *((name, {name: ""}, MISSING) for name in ("MUSTER_JOB_ID", "MUSTER_RUN", "MUSTER_STORE", "MUSTER_EPOCH")),
+    *(
+        (name, {name: v}, f"{v!r}, not a whole number; ")
+        for name in WHOLE
+        for v in ("two", "1.5", "--5", "²", "1_000", " 1")
+    ),
+    *(
+        (name, {name: v}, f"{v!r}, not a number; ")
+        for name in ("MUSTER_GRACE_SECONDS", "MUSTER_CPUS")
+        for v in ("soon", "", "nan", "inf", "-1")
+    ),
+]
 
 
-@pytest.mark.parametrize("value", ["two", "1.5", "--5", "²", "1_000", " 1"])
-@pytest.mark.parametrize("name", ["AWS_BATCH_JOB_ATTEMPT", "AWS_BATCH_JOB_NODE_INDEX", "MASTER_PORT", "MUSTER_EPOCH"])
-def test_a_malformed_whole_number_is_named_with_its_value(name: str, value: str) -> None:
-    with pytest.raises(ContractError) as caught:
-        NodeContract.from_env({**contract().to_env(), name: value})
-    assert str(caught.value).startswith(f"{name} is {value!r}, not a whole number; ")
-
-
-@pytest.mark.parametrize("value", ["soon", "", "nan", "inf", "-1"])
-@pytest.mark.parametrize("name", ["MUSTER_GRACE_SECONDS", "MUSTER_CPUS"])
-def test_a_malformed_number_is_named_with_its_value(name: str, value: str) -> None:
-    with pytest.raises(ContractError) as caught:
-        NodeContract.from_env({**contract().to_env(), name: value})
-    assert str(caught.value).startswith(f"{name} is {value!r}, not a number; ")
+@pytest.mark.parametrize(("name", "change", "said"), MALFORMED)
+def test_a_missing_or_malformed_variable_is_named_with_its_value(name: str, change: dict[str, str], said: str) -> None:
+    whole = contract().to_env()
+    for env in ({**whole, **change}, *([{k: v for k, v in whole.items() if k != name}] if said == MISSING else [])):
+        with pytest.raises(ContractError) as caught:
+            NodeContract.from_env(env)
+        assert str(caught.value).startswith(f"{name} is {said}")
 
 
 def test_optional_variables_have_defaults() -> None:
@@ -164,12 +150,7 @@ def test_a_job_s_variables_pass_the_supervisor_unread_and_never_replace_the_cont
     ours = contract().to_env()
     job = {"PYTHONPATH": "/mine", "LD_PRELOAD": "x.so", "PATH": "/mine/bin", "MUSTER_EPOCH": "99", "MINE": "\n="}
     supervisor = {"PATH": "/bin", "HOME": "/root", **sealed(job, ours)}
-    assert {name: supervisor.get(name) for name in ("PYTHONPATH", "LD_PRELOAD", "PATH", "MINE")} == {
-        "PYTHONPATH": None,
-        "LD_PRELOAD": None,
-        "PATH": "/bin",
-        "MINE": None,
-    }
+    assert [supervisor.get(name) for name in ("PYTHONPATH", "LD_PRELOAD", "PATH", "MINE")] == [None, None, "/bin", None]
     assert NodeContract.from_env(supervisor) == NodeContract.from_env(ours)
     assert rank_variables(supervisor) == {"HOME": "/root", **job, **ours}
     assert sealed_in_image(job, ours)["PATH"] == "/mine/bin", "where a container's Python is looked for"

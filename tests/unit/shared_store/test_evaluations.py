@@ -20,7 +20,6 @@ from shared_store.evaluations import (
 )
 from shared_store.files import write_json
 from shared_store.layout import Run, Store
-from shared_store.settings import merged
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 
 FIGURES: dict[str, Any] = {"mean_length": 9.0, "max_length": 10, "task": "Cartpole", "config": {}}
@@ -93,9 +92,8 @@ def test_retention_keeps_checkpoints_that_a_job_evaluated(run: Run) -> None:
     evaluate(run, "00000003-e1-1f2e3d4c", 1.0)
     add_checkpoint(Store(run.path.parent.parent), "taught", 12)
     assert retain(run, keep=1) == ["00000009-e1"]
-    assert [each.iteration for each in list_checkpoints(run)] == [3, 6, 12], (
-        "evaluated, of the greatest score, the newest"
-    )
+    left = [each.iteration for each in list_checkpoints(run)]
+    assert left == [3, 6, 12], "evaluated, of the greatest score, the newest"
 
 
 def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_still_to_be_evaluated(run: Run) -> None:
@@ -127,32 +125,17 @@ def test_one_line_tells_the_successes_of_a_task_that_declares_them_and_else_how_
 
 
 def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:
-    told = "\n".join(
-        lines({**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}})
-    )
+    few = {**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}}
+    told = "\n".join(lines(few))
     assert "3 episodes of Cartpole, checkpoint 00000003-e1" in told and "success" not in told
     config = {"randomize": {"friction": [0.4, 0.6]}, "curriculum": {}}
     share = {"share": 0.94, "low": 0.875, "high": 0.972}
-    whole = {
-        "checkpoint": "00000003-e1",
-        "episodes": 100,
-        "config": config,
-        "success": share,
-        "success_is": "it stands",
-    }
+    whole = {**few, "episodes": 100, "config": config, "success": share, "success_is": "it stands"}
     told = "\n".join(lines({**FIGURES, **whole}))
     assert "with config.randomize.friction: [0.4, 0.6]" in told and "config.curriculum: {}" in told
     assert " ".join(told.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
     term = {"mean": 1.0, "low": 0.5, "high": 1.5, "std": 0.1}
     rows = list(lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}}))
     heading = next(row for row in rows if row.endswith("std"))
-    assert {len(row) for row in rows if row.startswith(("reward", "metric", "return"))} == {len(heading)}, (
-        "columns stand"
-    )
-
-
-def test_changes_reach_into_sections_and_an_empty_section_replaces_one() -> None:
-    trained = {"rewards": {"alive": 1.0, "fall": -1.0}, "curriculum": {"level": [[0, 0.0]]}, "angle": 1.0}
-    changes = {"rewards": {"alive": 2.0}, "curriculum": {}, "angle": {"new": 1}}
-    assert merged(trained, changes) == {"rewards": {"alive": 2.0, "fall": -1.0}, "curriculum": {}, "angle": {"new": 1}}
-    assert trained["rewards"] == {"alive": 1.0, "fall": -1.0}
+    columns = {len(row) for row in rows if row.startswith(("reward", "metric", "return"))}
+    assert columns == {len(heading)}, "they stand"

@@ -24,21 +24,18 @@ def remove(root: Path) -> None:
     remove_tree(root / "tree")
 
 
-def test_a_process_killed_at_any_step_leaves_the_old_content_or_the_new_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("old", [OLD, None])
+def test_a_process_killed_at_any_step_leaves_the_old_content_or_the_new_one(tmp_path: Path, old: bytes | None) -> None:
     prepared = tmp_path / "prepared"
     prepared.mkdir()
-    (prepared / "file").write_bytes(OLD)
-    contents = [(left / "file").read_bytes() for left in killed_at_every_step(replace, prepared, tmp_path / "work")]
-    assert set(contents) == {OLD, NEW}
-    assert contents[0] == OLD
-    assert contents[-1] == NEW
-
-
-def test_a_killed_write_leaves_nothing_that_is_not_hidden(tmp_path: Path) -> None:
-    prepared = tmp_path / "prepared"
-    prepared.mkdir()
+    if old:
+        (prepared / "file").write_bytes(old)
+    found = list[bytes | None]()
     for left in killed_at_every_step(replace, prepared, tmp_path / "work"):
-        assert [name for name in os.listdir(left) if not name.startswith(".")] in ([], ["file"])
+        visible = [name for name in os.listdir(left) if not name.startswith(".")]
+        assert visible in ([], ["file"])
+        found.append((left / "file").read_bytes() if visible else None)
+    assert set(found) == {old, NEW} and (found[0], found[-1]) == (old, NEW)
 
 
 def test_content_is_durable_before_it_gets_its_name_and_the_name_before_the_call_returns(
@@ -67,11 +64,6 @@ def test_a_failed_write_leaves_the_old_content_and_no_other_file(
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_a_file_is_created_in_directories_that_do_not_exist_yet(tmp_path: Path) -> None:
-    write_atomic(tmp_path / "a" / "b" / "file", OLD)
-    assert (tmp_path / "a" / "b" / "file").read_bytes() == OLD
-
-
 def test_a_private_file_is_private_from_the_first_instant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     modes = []
     replace = os.replace
@@ -97,23 +89,21 @@ def test_a_directory_whose_removal_is_killed_is_complete_or_hidden(tmp_path: Pat
     tree.mkdir(parents=True)
     for name in "abc":
         (tree / name).write_text(name)
-    seen = [
-        sorted(os.listdir(left / "tree")) if (left / "tree").exists() else None
-        for left in killed_at_every_step(remove, tmp_path / "prepared", tmp_path / "work")
-    ]
-    assert seen[0] == ["a", "b", "c"]
-    assert seen[-1] is None
-    assert all(names in (["a", "b", "c"], None) for names in seen)
+    lefts = killed_at_every_step(remove, tmp_path / "prepared", tmp_path / "work")
+    seen = [sorted(os.listdir(left / "tree")) if (left / "tree").exists() else None for left in lefts]
+    assert (seen[0], seen[-1]) == (["a", "b", "c"], None) and all(names in (seen[0], None) for names in seen)
 
 
-def test_json_comes_back_as_it_was_written(tmp_path: Path) -> None:
-    value = {"text": "Größe ✓", "number": 1.5, "nothing": None, "list": [1, {"a": True}]}
-    write_json(tmp_path / "value.json", value)
-    assert read_json(tmp_path / "value.json") == value
-
-
-def test_a_missing_json_file_is_none(tmp_path: Path) -> None:
-    assert read_json(tmp_path / "value.json") is None
+def test_json_comes_back_as_it_was_written_from_directories_that_did_not_exist(tmp_path: Path) -> None:
+    path, value = (
+        tmp_path / "a" / "b.json",
+        {"text": "Größe ✓", "number": 1.5, "nothing": None, "list": [1, {"a": True}]},
+    )
+    assert read_json(path) is None
+    write_json(path, value)
+    assert read_json(path) == value
+    path.write_text('{"reward": NaN, "worst": -Infinity}')
+    assert read_json(path) == {"reward": None, "worst": None}, "numbers that JSON lacks"
 
 
 @pytest.mark.parametrize(
@@ -139,11 +129,6 @@ def test_json_that_is_no_regular_file_is_damaged_and_never_waited_for(tmp_path: 
         with pytest.raises(DamagedFile, match="not a regular file"):
             read_json(tmp_path / name)
     assert read_json(tmp_path / "other.json" / "below a file") is None
-
-
-def test_numbers_that_json_lacks_are_read_as_none(tmp_path: Path) -> None:
-    (tmp_path / "value.json").write_text('{"reward": NaN, "worst": -Infinity}')
-    assert read_json(tmp_path / "value.json") == {"reward": None, "worst": None}
 
 
 def test_syncing_a_missing_file_is_an_error(tmp_path: Path) -> None:

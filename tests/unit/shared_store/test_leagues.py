@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +17,7 @@ from shared_store.files import write_json
 from shared_store.layout import Store
 from shared_store.leagues import LeagueError, Rules, StoredLeague, UnknownLeague
 from shared_store.standings import table
+from tests.support.shared_store.at_once import at_once
 from tests.support.shared_store.leagues import CONFIG, entry, league, race, summary
 
 
@@ -30,11 +29,6 @@ def store(tmp_path: Path) -> Store:
 @pytest.fixture
 def cup(store: Store) -> StoredLeague:
     return leagues.create(store, league())
-
-
-def writable(path: Path) -> Path:
-    path.chmod(0o644)
-    return path
 
 
 def test_a_league_is_kept_as_it_was_created(store: Store) -> None:
@@ -49,10 +43,9 @@ def test_a_league_is_kept_as_it_was_created(store: Store) -> None:
 
 
 def test_a_league_is_never_changed(store: Store, cup: StoredLeague, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = r"^league cup exists already, and a league is never changed; choose another name$"
     for _ in range(2):
-        with pytest.raises(
-            LeagueError, match=r"^league cup exists already, and a league is never changed; choose another name$"
-        ):
+        with pytest.raises(LeagueError, match=said):
             leagues.create(store, league(seed=8))
         monkeypatch.setattr(leagues, "names", lambda store: [])  # it looked before the other one was done
     assert cup.definition().seed == 7
@@ -89,27 +82,9 @@ def test_entries_count_up_and_hold_the_submission(cup: StoredLeague) -> None:
     assert sorted(os.listdir(cup.path / "entries")) == ["1", "2", "3"], "nothing half made is left"
 
 
-def test_every_byte_of_an_entry_is_under_its_seal(cup: StoredLeague) -> None:
-    cup.enter(entry())
-    for name in ("entry.json", "manifest.json"):
-        path = writable(cup.path / "entries" / "1" / name)
-        content = path.read_bytes()
-        for place in range(len(content)):
-            path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
-            with pytest.raises(LeagueError, match=r"^league cup: entry 1: "):
-                cup.entry(1)
-        path.write_bytes(content)
-        assert cup.entry(1)["racer"] == "ada"
-
-
-def alter_definition(cup: StoredLeague) -> None:
-    path = writable(cup.path / "definition" / "league.json")
-    path.write_bytes(path.read_bytes().replace(b'"laps": 3', b'"laps": 1'))
-
-
-def alter_entry(cup: StoredLeague) -> None:
-    path = writable(cup.path / "entries" / "1" / "entry.json")
-    path.write_bytes(path.read_bytes().replace(b"12.5", b"11.5"))
+def alter(path: Path, old: bytes, new: bytes) -> None:
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes().replace(old, new))
 
 
 def reseal_elsewhere(cup: StoredLeague) -> None:
@@ -125,14 +100,16 @@ def link_entry(cup: StoredLeague) -> None:
     os.symlink(cup.store.path / "elsewhere", cup.path / "entries" / "1")
 
 
-def add_file(cup: StoredLeague) -> None:
-    (cup.path / "entries" / "1" / "notes.txt").write_text("added")
+ENTRY = Path("entries") / "1"
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (alter_entry, "entry 1: the content of entry.json was altered"),
+        (
+            lambda cup: alter(cup.path / ENTRY / "entry.json", b"12.5", b"11.5"),
+            "entry 1: the content of entry.json was altered",
+        ),
         (
             lambda cup: shutil.copytree(cup.path / "entries" / "2", cup.path / "entries" / "1", dirs_exist_ok=True),
             "entry 1 was not made as this entry of this league",
@@ -140,7 +117,7 @@ def add_file(cup: StoredLeague) -> None:
         (lambda cup: shutil.rmtree(cup.path / "entries" / "1"), "entry 1 is missing: it was deleted"),
         (reseal_elsewhere, "entry 1 was not made as this entry of this league"),
         (link_entry, "entry 1: .* links inside a run are not followed"),
-        (add_file, "entry 1: notes.txt was added"),
+        (lambda cup: (cup.path / ENTRY / "notes.txt").write_text("added"), "entry 1: notes.txt was added"),
     ],
 )
 def test_an_altered_entry_is_not_ranked_and_the_others_are(
@@ -149,22 +126,21 @@ def test_an_altered_entry_is_not_ranked_and_the_others_are(
     cup.enter(entry("ada", version=1))
     cup.enter(entry("bob", version=2, race=race([14.0, 14.0, 14.0])))
     for path in (cup.path / "entries").rglob("*.json"):
-        writable(path)
+        path.chmod(0o644)
     change(cup)
     with pytest.raises(LeagueError, match=f"^league cup: {said}"):
         cup.entry(1)
     rows = table(cup.contenders(), "total")
     assert [(row.rank, row.entry, row.status) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
     assert rows[1].racer == "-" and rows[1].time is None
-    assert (
-        rows[1].reason and "entry 1" not in rows[1].reason and "cup" not in rows[1].reason.partition(str(cup.path))[0]
-    )
+    told = rows[1].reason.partition(str(cup.path))[0]
+    assert rows[1].reason and "entry 1" not in rows[1].reason and "cup" not in told
     assert cup.enter(entry("cat", version=3))["entry"] == 3, "its number is not given again"
 
 
 def test_an_altered_league_has_no_ranking_and_accepts_no_entries(cup: StoredLeague) -> None:
     cup.enter(entry())
-    alter_definition(cup)
+    alter(cup.path / "definition" / "league.json", b'"laps": 3', b'"laps": 1')
     for ask in (cup.definition, cup.digest, lambda: cup.enter(entry(version=2))):
         with pytest.raises(LeagueError, match=r"^league cup: the content of league.json was altered"):
             ask()
@@ -209,12 +185,10 @@ def test_a_ruling_is_stored_beside_the_entry_and_made_only_once(cup: StoredLeagu
     with pytest.raises(LeagueError, match=r"^league cup: entry 1 is disqualified already$"):
         cup.disqualify(1, "twice", "user ada")
     assert [(row.status, row.reason) for row in table(cup.contenders(), "total")] == [("disqualified", "another car")]
-    path = writable(cup.path / "disqualified" / "1" / "ruling.json")
-    path.write_bytes(path.read_bytes().replace(b"another", b"no such"))
+    alter(cup.path / "disqualified" / "1" / "ruling.json", b"another", b"no such")
     (row,) = table(cup.contenders(), "total")
-    assert (
-        row.status == "disqualified" and "the ruling on entry 1: the content of ruling.json was altered" in row.reason
-    )
+    assert row.status == "disqualified"
+    assert "the ruling on entry 1: the content of ruling.json was altered" in row.reason
 
 
 def test_an_owner_has_a_limited_number_of_entries_and_a_unique_name(store: Store) -> None:
@@ -222,9 +196,8 @@ def test_an_owner_has_a_limited_number_of_entries_and_a_unique_name(store: Store
     cup.enter(entry("ada", version=1))
     with pytest.raises(LeagueError, match=r"^league cup: entry 1 has this evaluation already$"):
         cup.enter(entry("ada", version=1))
-    with pytest.raises(
-        LeagueError, match=r"^league cup: racer ada is another's, who made entry 1; choose another name$"
-    ):
+    said = r"^league cup: racer ada is another's, who made entry 1; choose another name$"
+    with pytest.raises(LeagueError, match=said):
         cup.enter(entry("ada", owner="user eve", version=2))
     cup.enter(entry("second ada", owner="user ada", version=3))
     with pytest.raises(LeagueError, match=r"^league cup: user ada has made 2 entries, as many as one may make$"):
@@ -232,41 +205,21 @@ def test_an_owner_has_a_limited_number_of_entries_and_a_unique_name(store: Store
     assert cup.enter(entry("bob", version=5))["entry"] == 3 and len(cup.numbers()) == 3
 
 
-ENTER = """
-import sys
-from shared_store import leagues
-from shared_store.layout import Store
-from tests.support.shared_store.leagues import entry
-cup = leagues.find(Store(sys.argv[1]), "cup")
-print("ready", flush=True)
-sys.stdin.readline()
-for version in range(5):
-    try:
-        print(cup.enter(entry(f"r{sys.argv[2]}", owner="user one", version=100 * int(sys.argv[2]) + version))["entry"], flush=True)
-    except leagues.LeagueError as error:
-        assert "as many as one may make" in str(error), error
-"""
+def enter_five(path: str, number: str) -> list[int]:
+    cup, given = leagues.find(Store(path), "cup"), list[int]()
+    for version in range(5):
+        try:
+            made = cup.enter(entry(f"r{number}", owner="user one", version=100 * int(number) + version))
+            given.append(made["entry"])
+        except LeagueError as error:
+            assert "as many as one may make" in str(error), error
+    return given
 
 
 def test_processes_that_enter_at_once_get_a_number_each_and_no_more_than_are_allowed(store: Store) -> None:
     leagues.create(store, league(most_entries=8))
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", ENTER, str(store.path), str(number)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for number in range(3)
-    ]
-    for process in processes:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    for process in processes:
-        assert process.stdin is not None
-        process.stdin.write("go\n")
-        process.stdin.flush()
-    given = [int(line) for process in processes for line in process.communicate(timeout=60)[0].split()]
-    assert sorted(given) == list(range(1, 9)) and all(process.returncode == 0 for process in processes)
+    given = at_once(enter_five, [(str(store.path), number) for number in "012"])
+    assert sorted(entry for each in given for entry in each) == list(range(1, 9))
 
 
 def test_a_league_is_open_from_its_first_moment_and_closed_from_its_last() -> None:

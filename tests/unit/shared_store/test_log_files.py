@@ -31,12 +31,20 @@ def numbers(texts: list[str]) -> list[int]:
     return [int(text[:8]) for text in texts if text[:8].isdigit()]
 
 
-def written(path: Path, count: int, step: int = 500) -> LogWriter:
-    writer = LogWriter(path, LIMIT)
-    for first in range(0, count, step):
-        data = lines_of(first, min(step, count - first))
+def more(writer: LogWriter, first: int, end: int, step: int = 500) -> LogWriter:
+    """Write these lines, some at a time."""
+    for each in range(first, end, step):
+        data = lines_of(each, min(step, end - each))
         assert writer.append(data) == len(data)
     return writer
+
+
+def written(path: Path, count: int) -> LogWriter:
+    return more(LogWriter(path, LIMIT), 0, count)
+
+
+def drained(run: Run) -> list[str]:
+    return [line.text for line in LogFollower(run, "job").drain()]
 
 
 @pytest.fixture
@@ -44,17 +52,14 @@ def run(tmp_path: Path) -> Run:
     return Run(tmp_path)
 
 
-def test_a_log_within_its_limit_is_one_file(run: Run) -> None:
-    written(run.log("job", 1, 0), 1000)
-    assert [segment.path.name for segment in segments_of(run.log("job", 1, 0))] == ["node-0.log"]
-
-
 def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) -> None:
     path, count = run.log("job", 1, 0), 50_000
-    assert written(path, count).lines == count
+    writer = written(path, 1000)
+    assert [segment.path.name for segment in segments_of(path)] == ["node-0.log"], "within its limit it is one file"
+    assert more(writer, 1000, count).lines == count
     size = sum(segment.path.stat().st_size for segment in segments_of(path))
     assert LIMIT * 0.9 < size <= LIMIT
-    texts = [line.text for line in LogFollower(run, "job").drain()]
+    texts = drained(run)
     kept = numbers(texts)
     assert len(texts) == len(kept) + 1
     gap = next(place for place, text in enumerate(texts) if text.startswith("…"))
@@ -84,8 +89,7 @@ def test_a_follower_that_falls_behind_learns_how_much_it_missed(run: Run) -> Non
     writer, follower = written(run.log("job", 1, 0), 6000), LogFollower(run, "job")
     before = [line.text for line in follower.drain()]
     position = follower.offsets["1/0"]
-    for first in range(6000, 50_000, 500):
-        writer.append(lines_of(first, 500))
+    more(writer, 6000, 50_000)
     after = [line.text for line in follower.drain()]
     tail = segments_of(run.log("job", 1, 0))[1]
     assert numbers(before) == list(range(6000))
@@ -103,14 +107,14 @@ def test_a_restarted_writer_continues_where_the_killed_one_stopped(run: Run) -> 
     assert again.lines == 9000
     again.append(lines_of(9000, 1000))
     assert again.lines == 10_000
-    assert numbers([line.text for line in LogFollower(run, "job").drain()])[-1000:] == list(range(9000, 10_000))
+    assert numbers(drained(run))[-1000:] == list(range(9000, 10_000))
 
 
 def test_a_line_longer_than_a_file_of_the_log_is_kept_whole(run: Run) -> None:
     writer = LogWriter(run.log("job", 1, 0), LIMIT)
     long = [format_line(START, 0, "o", f"{i} " + "y" * 300_000).encode() for i in range(6)]
     assert writer.append(b"".join(long)) == sum(map(len, long))
-    texts = [line.text for line in LogFollower(run, "job").drain()]
+    texts = drained(run)
     assert texts[0].startswith("0 ") and texts[-1] == "5 " + "y" * 300_000
 
 
@@ -157,26 +161,23 @@ def test_half_a_line_that_a_full_volume_took_is_taken_back(small: Run, monkeypat
 def test_no_log_fills_a_volume_and_on_a_full_one_its_end_is_still_kept(small: Run) -> None:
     writer = LogWriter(small.log("job", 1, 0), 1 << 30)
     volume = os.statvfs(small.path)
-    for first in range(0, 80_000, 500):
-        assert writer.append(lines_of(first, 500)) == len(lines_of(first, 500))
+    more(writer, 0, 80_000)
     assert os.statvfs(small.path).f_bavail > 0.7 * volume.f_bavail
     fill(small)
-    for first in range(80_000, 100_000, 500):
-        assert writer.append(lines_of(first, 500)) == len(lines_of(first, 500))
-    texts = [line.text for line in LogFollower(small, "job").drain()]
+    more(writer, 80_000, 100_000)
+    texts = drained(small)
     kept = numbers(texts)
     assert kept[0] == 0 and kept[-1] == 99_999 and sum("left out" in text for text in texts) == 1
 
 
 def test_lines_of_a_node_keep_their_order_when_its_clock_is_set_back(run: Run) -> None:
     clock = [START, START + 1, START - 86_400, START - 86_399, START + 2]
-    LogWriter(run.log("job", 1, 0)).append(
-        "".join(format_line(at, 0, "o", f"a{i}") for i, at in enumerate(clock)).encode()
-    )
+    lines = "".join(format_line(at, 0, "o", f"a{i}") for i, at in enumerate(clock))
+    LogWriter(run.log("job", 1, 0)).append(lines.encode())
     LogWriter(run.log("job", 1, 1)).append(format_line(START + 1.5, 1, "o", "b").encode())
-    lines = list(LogFollower(run, "job").drain())
-    assert [line.text for line in lines] == ["a0", "a1", "a2", "a3", "b", "a4"]
-    assert lines[2].time == timestamp(START - 86_400), "the time that the node wrote is shown"
+    merged = list(LogFollower(run, "job").drain())
+    assert [line.text for line in merged] == ["a0", "a1", "a2", "a3", "b", "a4"]
+    assert merged[2].time == timestamp(START - 86_400), "the time that the node wrote is shown"
 
 
 def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: Run) -> None:
@@ -214,21 +215,18 @@ def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_begin
 def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: Run) -> None:
     path = run.log("job", 1, 0)
     early, writer = LogFile(path, "stream"), LogWriter(path, LIMIT)
-    for first in range(0, 40_000, 500):
-        writer.append(lines_of(first, 500))
-        if first % 7000 == 0:
-            early.look()
+    for first in range(0, 40_000, 7000):
+        more(writer, first, min(first + 7000, 40_000))
+        early.look()
     late = LogFile(path, "stream").look()
     seen = list(early.look().forward())
     assert seen == list(late.forward()) == list(late.backward())[::-1]
     gap = next(event for event in seen if event.text.startswith("…"))
-    texts = [line.text for line in LogFollower(run, "job").drain()]
+    texts = drained(run)
     assert [event.text for event in seen] == texts
     inside = list(late.forward(start=gap.offset + 1000))
-    assert (
-        inside[0].text == gap.text
-        and numbers([event.text for event in inside])[0] == numbers(texts)[texts.index(gap.text)]
-    )
+    assert inside[0].text == gap.text
+    assert numbers([event.text for event in inside])[0] == numbers(texts)[texts.index(gap.text)]
     assert all(event.end == after.offset for event, after in pairwise(seen))
     for event in random.Random(1).sample(seen, 50):
         assert next(late.forward(start=event.offset)) == event
@@ -238,8 +236,7 @@ def test_a_view_survives_the_deletion_of_files_that_it_knows(run: Run) -> None:
     path = run.log("job", 1, 0)
     writer = written(path, 12_000)
     view = LogFile(path, "stream").look()
-    for first in range(12_000, 40_000, 500):
-        writer.append(lines_of(first, 500))
+    more(writer, 12_000, 40_000)
     assert numbers([event.text for event in view.forward()])[:3500] == list(range(3500))
 
 

@@ -42,12 +42,8 @@ def texts(lines: list[LogLine]) -> list[tuple[str, int, int, str]]:
     return [(line.time, line.attempt, line.node, line.text) for line in lines]
 
 
-@pytest.mark.parametrize("most", [7, 400, 10_000])
-@pytest.mark.parametrize("which", [{}, {"node": 1}, {"rank": 3}, {"attempt": 1}, {"node": 0, "rank": 0, "attempt": 2}])
-def test_going_back_window_by_window_gives_every_line_once_in_its_order(
-    run: Run, most: int, which: dict[str, int]
-) -> None:
-    chosen = Chosen(run, JOB, **which)
+def backwards(chosen: Chosen, most: int) -> list[LogLine]:
+    """All lines, window by window from the end."""
     place, found = chosen.end(), list[LogLine]()
     for _ in range(20_000):
         window = lines_before(chosen, place, most)
@@ -55,6 +51,15 @@ def test_going_back_window_by_window_gives_every_line_once_in_its_order(
         found, place = window.lines + found, window.first
         if not window.more:
             break
+    return found
+
+
+@pytest.mark.parametrize("most", [7, 400, 10_000])
+@pytest.mark.parametrize("which", [{}, {"node": 1}, {"rank": 3}, {"attempt": 1}, {"node": 0, "rank": 0, "attempt": 2}])
+def test_going_back_window_by_window_gives_every_line_once_in_its_order(
+    run: Run, most: int, which: dict[str, int]
+) -> None:
+    found = backwards(Chosen(run, JOB, **which), most)
     assert texts(found) == texts(list(LogFollower(run, JOB, **which).drain()))
 
 
@@ -93,13 +98,7 @@ def test_half_a_line_belongs_to_no_window_yet(run: Run) -> None:
 def test_a_window_says_where_lines_were_deleted_and_goes_on_before_them(tmp_path: Path) -> None:
     run = Run(tmp_path)
     write(run, 1, 0, [(i, 0, f"{i} " + "x" * 2000) for i in range(1500)], LEAST_LIMIT)
-    chosen = Chosen(run, JOB)
-    place, found = chosen.end(), list[LogLine]()
-    while True:
-        window = lines_before(chosen, place, 50)
-        found, place = window.lines + found, window.first
-        if not window.more:
-            break
+    found = backwards(Chosen(run, JOB), 50)
     missing = [i for i, line in enumerate(found) if "left out: the log reached its limit" in line.text]
     assert len(missing) == 1 and found[0].text.startswith("0 ") and found[-1].text.startswith("1499 ")
     numbers = [int(line.text.split()[0]) for line in found if line.rank == 0]
@@ -108,14 +107,10 @@ def test_a_window_says_where_lines_were_deleted_and_goes_on_before_them(tmp_path
 
 def test_a_line_that_is_longer_than_a_piece_is_in_a_window_like_any_other(tmp_path: Path) -> None:
     run = Run(tmp_path)
-    write(run, 1, 0, [(1, 0, "a"), (2, 0, "b" * 200_000), (3, 0, "c")])
     chosen = Chosen(run, JOB)
-    assert [line.text[0] for line in lines_before(chosen, chosen.end()).lines] == ["a", "b", "c"]
-
-
-def test_a_job_without_a_log_has_an_empty_window(tmp_path: Path) -> None:
-    chosen = Chosen(Run(tmp_path), JOB)
     assert chosen.end() == {} and lines_before(chosen, {}).lines == [] and search(chosen, "x", {}).is_over
+    write(run, 1, 0, [(1, 0, "a"), (2, 0, "b" * 200_000), (3, 0, "c")])
+    assert [line.text[0] for line in lines_before(chosen, chosen.end()).lines] == ["a", "b", "c"]
 
 
 def test_a_search_finds_every_line_with_the_text_and_goes_on_after_the_last_one(run: Run) -> None:

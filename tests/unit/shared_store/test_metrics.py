@@ -6,7 +6,6 @@ import tempfile
 import tracemalloc
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -15,6 +14,19 @@ from hypothesis import strategies as st
 from shared_store import metrics
 from shared_store.layout import Run
 from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics, sampled
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run(tmp_path)
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The lines that are parsed."""
+    genuine, found = metrics._record, list[bytes]()
+    monkeypatch.setattr(metrics, "_record", lambda line: found.append(line) or genuine(line))
+    return found
 
 
 def attempt(run: Run, epoch: int, resumed_from: int, last: int) -> None:
@@ -27,66 +39,48 @@ def history(run: Run) -> list[tuple[int, int]]:
     return [(record["iteration"], record["epoch"]) for record in read_metrics(run)]
 
 
-def test_a_run_without_metrics_has_an_empty_history(tmp_path: Path) -> None:
-    assert read_metrics(Run(tmp_path)) == []
+def test_a_written_record_is_read_at_once(run: Run) -> None:
+    assert read_metrics(run) == []
+    with MetricsWriter(run, 1, 0) as writer:
+        writer.write({"iteration": 1, "reward": 2.5, "episode_length": None})
+        assert read_metrics(run) == [{"iteration": 1, "reward": 2.5, "episode_length": None}]
+        with pytest.raises(ValueError):
+            writer.write({"iteration": 2, "reward": float("nan")})  # JSON lacks it
+    assert len(read_metrics(run)) == 1
 
 
-def test_a_written_record_is_read_at_once(tmp_path: Path) -> None:
-    writer = MetricsWriter(Run(tmp_path), 1, 0)
-    writer.write({"iteration": 1, "reward": 2.5, "episode_length": None})
-    assert read_metrics(Run(tmp_path)) == [{"iteration": 1, "reward": 2.5, "episode_length": None}]
-    writer.close()
-
-
-def test_for_an_iteration_seen_twice_the_later_epoch_counts(tmp_path: Path) -> None:
-    run = Run(tmp_path)
-    attempt(run, 9, 0, 4)
-    attempt(run, 10, 2, 6)
-    assert history(run) == [(1, 9), (2, 9), (3, 10), (4, 10), (5, 10), (6, 10)]
-
-
-def test_a_resume_drops_records_after_its_checkpoint(tmp_path: Path) -> None:
-    run = Run(tmp_path)
-    attempt(run, 1, 0, 10)
-    attempt(run, 2, 4, 6)
-    assert history(run) == [(1, 1), (2, 1), (3, 1), (4, 1), (5, 2), (6, 2)]
-
-
-def test_an_attempt_that_died_before_its_first_iteration_still_supersedes_old_records(tmp_path: Path) -> None:
-    run = Run(tmp_path)
-    attempt(run, 1, 0, 5)
-    attempt(run, 2, 3, 3)
-    assert history(run) == [(1, 1), (2, 1), (3, 1)]
-
-
-def test_only_iterations_after_the_given_one_are_returned(tmp_path: Path) -> None:
-    attempt(Run(tmp_path), 1, 0, 5)
-    assert [record["iteration"] for record in read_metrics(Run(tmp_path), after=3)] == [4, 5]
+@pytest.mark.parametrize(
+    ("attempts", "expected"),
+    [
+        ([(9, 0, 4), (10, 2, 6)], [(1, 9), (2, 9), (3, 10), (4, 10), (5, 10), (6, 10)]),
+        ([(1, 0, 10), (2, 4, 6)], [(1, 1), (2, 1), (3, 1), (4, 1), (5, 2), (6, 2)]),
+        ([(1, 0, 5), (2, 3, 3)], [(1, 1), (2, 1), (3, 1)]),  # it died before its first iteration
+    ],
+)
+def test_what_an_attempt_resumed_from_is_followed_by_its_own_records_alone(
+    run: Run, attempts: list[tuple[int, int, int]], expected: list[tuple[int, int]]
+) -> None:
+    for each in attempts:
+        attempt(run, *each)
+    assert history(run) == expected
+    assert [record["iteration"] for record in read_metrics(run, after=2)] == [i for i, _ in expected if i > 2]
 
 
 @pytest.mark.parametrize("torn", [b"{", b'{"iteration": 3, "epoch"', b'{"iteration": 3, "epoch": 1}', b"\0\0\0\0"])
-def test_a_last_line_that_a_crash_cut_short_is_passed_over(tmp_path: Path, torn: bytes) -> None:
-    run = Run(tmp_path)
+def test_a_last_line_that_a_crash_cut_short_is_passed_over(run: Run, torn: bytes) -> None:
     attempt(run, 1, 0, 2)
     with open(run.metrics / "metrics-e1.jsonl", "ab") as file:
         file.write(torn)
     assert history(run) == [(1, 1), (2, 1)]
 
 
-def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(run: Run) -> None:
     attempt(run, 1, 0, 1)
     with open(run.metrics / "metrics-e1.jsonl", "ab") as file:
         file.write(b'[]\nnot json\n{"note": 1}\n\n{"iteration": 2, "epoch": 1}\n')
     (run.metrics / "events.out.tfevents.1").write_bytes(b"\0")
     (run.metrics / "metrics-e1.jsonl.bak").write_bytes(b'{"iteration": 9, "epoch": 1}\n')
     assert history(run) == [(1, 1), (2, 1)]
-
-
-def test_a_number_that_is_not_finite_is_refused_because_json_lacks_it(tmp_path: Path) -> None:
-    with MetricsWriter(Run(tmp_path), 1, 0) as writer, pytest.raises(ValueError):
-        writer.write({"iteration": 1, "reward": float("nan")})
-    assert read_metrics(Run(tmp_path)) == []
 
 
 @settings(max_examples=40, deadline=None)
@@ -109,9 +103,7 @@ def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 9), st.booleans()), min_size=1, max_size=6))
-def test_a_cached_history_equals_a_newly_read_one_after_any_append(
-    attempts: list[tuple[int, int, bool]],
-) -> None:
+def test_a_cached_history_equals_a_newly_read_one_after_any_append(attempts: list[tuple[int, int, bool]]) -> None:
     with tempfile.TemporaryDirectory() as directory:
         run = Run(Path(directory))
         kept, expected = MetricsHistory(run), dict[int, int]()
@@ -128,20 +120,11 @@ def test_a_cached_history_equals_a_newly_read_one_after_any_append(
         assert (last and (last["iteration"], last["epoch"])) == max(expected.items(), default=None)
 
 
-def test_the_newest_record_of_a_long_history_is_read_without_the_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run, parsed = Run(tmp_path), []
-    genuine = metrics._record
-
-    def counting(line: bytes) -> dict[str, Any]:
-        parsed.append(line)
-        return genuine(line)
-
+def test_the_newest_record_of_a_long_history_is_read_without_the_rest(run: Run, parsed: list[bytes]) -> None:
     attempt(run, 1, 0, 20_000)
     history = MetricsHistory(run)
     assert len(history.after()) == 20_000
-    monkeypatch.setattr(metrics, "_record", counting)
+    parsed.clear()
     with open(run.metrics / "metrics-e1.jsonl", "a") as file:
         file.write('{"iteration": 20001, "epoch": 1}\n{"iteration": 20002, "epo')
     assert [record["iteration"] for record in history.after(20_000)] == [20_001]
@@ -150,8 +133,7 @@ def test_the_newest_record_of_a_long_history_is_read_without_the_rest(
     assert len(parsed) < 2000
 
 
-def test_a_history_whose_file_was_replaced_is_read_from_the_start(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+def test_a_history_whose_file_was_replaced_is_read_from_the_start(run: Run) -> None:
     attempt(run, 1, 0, 5)
     history = MetricsHistory(run)
     assert len(history.after()) == 5
@@ -160,8 +142,7 @@ def test_a_history_whose_file_was_replaced_is_read_from_the_start(tmp_path: Path
     assert [record["iteration"] for record in history.after()] == list(range(3, 10))
 
 
-def test_a_line_of_any_length_is_passed_over_in_little_memory_and_never_read_again(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+def test_a_line_of_any_length_is_passed_over_in_little_memory_and_never_read_again(run: Run) -> None:
     attempt(run, 1, 0, 2)
     path = run.metrics / "metrics-e1.jsonl"
     with open(path, "ab") as file:
@@ -183,19 +164,12 @@ def test_a_line_of_any_length_is_passed_over_in_little_memory_and_never_read_aga
     assert [record["iteration"] for record in read_metrics(run)] == [1, 2, 3]
 
 
-def test_a_page_of_a_long_history_is_read_without_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, parsed = Run(tmp_path), []
-    genuine = metrics._record
+def test_a_page_of_a_long_history_is_read_without_the_rest(run: Run, parsed: list[bytes]) -> None:
     attempt(run, 1, 0, 5000)
     attempt(run, 2, 2500, 6000)
     history = MetricsHistory(run)
     everything = history.after()
-
-    def counting(line: bytes) -> dict[str, Any]:
-        parsed.append(line)
-        return genuine(line)
-
-    monkeypatch.setattr(metrics, "_record", counting)
+    parsed.clear()
     for after in (0, 2400, 2499, 2500, 5990):
         page = [record for record in everything if record["iteration"] > after][:200]
         assert history.after(after, 200) == page
@@ -206,8 +180,7 @@ def points(run: Run, *arguments: int) -> list[tuple[int, int]]:
     return [(record["iteration"], record["epoch"]) for record in sampled(run, *arguments)]
 
 
-def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(run: Run) -> None:
     assert sampled(run) == []
     attempt(run, 1, 0, 0)
     assert sampled(run) == []
@@ -215,8 +188,7 @@ def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(tmp_pat
     assert points(run) == [(i, 2) for i in range(1, 8)]
 
 
-def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(run: Run) -> None:
     attempt(run, 1, 0, 20_000)
     found = [iteration for iteration, _ in points(run, 40)]
     assert len(found) == 40 and found[-1] == 20_000 and found == sorted(set(found))
@@ -226,8 +198,7 @@ def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_re
     assert points(run, 40)[-1] == (20_000, 1)
 
 
-def test_a_sample_has_nothing_of_an_abandoned_past_and_ends_with_the_epoch_that_is_asked_for(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+def test_a_sample_has_nothing_of_an_abandoned_past_and_ends_with_the_epoch_that_is_asked_for(run: Run) -> None:
     attempt(run, 1, 0, 3000)
     attempt(run, 2, 1000, 5000)
     found = points(run, 60)

@@ -18,10 +18,9 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store
 from shared_store.models import AlreadyRegistered, Model, ModelError
+from tests.support.shared_store.at_once import at_once
 
 PARENT = {"run": "base", "checkpoint": "00000002-e1", "iteration": 2}
-
-
 EVALUATED = {"mean_return": 800.0, "mean_length": 10.0, "max_length": 20, "episodes": 3, "time": 1.0}
 
 
@@ -81,9 +80,8 @@ def test_versions_count_up_and_existing_ones_stay(store: Store) -> None:
 def test_a_registered_checkpoint_is_registered_again_only_on_request(store: Store) -> None:
     run, checkpoint = exported(store)
     first = models.register(store, "ant", run, checkpoint, {}, again=False)
-    with pytest.raises(
-        AlreadyRegistered, match=r"^the same checkpoint is ant@1 already; --again registers it once more$"
-    ):
+    said = r"^the same checkpoint is ant@1 already; --again registers it once more$"
+    with pytest.raises(AlreadyRegistered, match=said):
         models.register(store, "ant", run, checkpoint, {}, again=False)
     assert os.listdir(store.models / "ant") == ["1"], "nothing is made"
     assert models.register(store, "other", run, checkpoint, {}, again=False).reference == "other@1"
@@ -94,37 +92,15 @@ def test_a_registered_checkpoint_is_registered_again_only_on_request(store: Stor
     first.verify()
 
 
-REGISTER = """
-import sys
-from shared_store import models
-from shared_store.checkpoints import Checkpoint
-from shared_store.layout import Store
-store = Store(sys.argv[1])
-run = store.run("ant")
-print("ready", flush=True)
-sys.stdin.readline()
-for _ in range(5):
-    checkpoint = Checkpoint(run.checkpoints / "00000004-e1", 4, 1)
-    print(models.register(store, "ant", run, checkpoint, {"registered_by": sys.argv[2]}).version, flush=True)
-"""
+def register_five(path: str, number: str) -> list[int]:
+    facts = {"registered_by": number}
+    return [register(Store(path), "ant", **facts).version for _ in range(5)]
 
 
 def test_processes_that_register_at_once_get_a_version_each(store: Store) -> None:
     exported(store)
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", REGISTER, str(store.path), str(number)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for number in range(4)
-    ]
-    for process in processes:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    outputs = [process.stdin.write("go\n") or process.stdin.flush() for process in processes if process.stdin]
-    outputs = [process.communicate(timeout=60)[0] for process in processes]
-    given = {int(line): str(number) for number, output in enumerate(outputs) for line in output.split()}
+    answers = at_once(register_five, [(str(store.path), number) for number in "0123"])
+    given = {version: str(number) for number, versions in enumerate(answers) for version in versions}
     assert sorted(given) == list(range(1, 21)), "twenty versions, none of them twice"
     for model in models.versions(store, "ant"):
         model.verify()
@@ -209,20 +185,17 @@ def test_a_refused_registration_leaves_nothing_behind(store: Store) -> None:
         models.find(store, "ant")
 
 
-def test_a_link_in_the_place_of_a_model_is_not_followed(store: Store, tmp_path: Path) -> None:
-    exported(store)
+def test_links_in_the_place_of_a_model_or_a_bundle_are_not_followed(store: Store, tmp_path: Path) -> None:
+    run, checkpoint = exported(store)
     store.models.mkdir()
     (tmp_path / "elsewhere").mkdir()
     os.symlink(tmp_path / "elsewhere", store.models / "ant")
     with pytest.raises(DamagedFile, match="a link"):
         register(store)
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-def test_a_link_in_the_place_of_a_bundle_is_not_followed(store: Store, tmp_path: Path) -> None:
-    run, checkpoint = exported(store)
-    os.rename(run.exports / checkpoint.name, tmp_path / "elsewhere")
-    os.symlink(tmp_path / "elsewhere", run.exports / checkpoint.name)
+    (store.models / "ant").unlink()
+    os.rename(run.exports / checkpoint.name, tmp_path / "bundle")
+    os.symlink(tmp_path / "bundle", run.exports / checkpoint.name)
     with pytest.raises(DamagedFile, match="a link"):
         register(store)
     assert models.model_names(store) == []

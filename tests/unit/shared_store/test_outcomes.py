@@ -34,31 +34,20 @@ def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(t
     assert outcome and outcome.error and outcome == bounded(outcome)
     assert outcome.reason == outcome.error.message
     assert outcome.reason.startswith("begin x") and outcome.reason.endswith("x … (9983690 characters left out)")
-    assert outcome.error.traceback.startswith("(9983690 characters left out) …") and outcome.error.traceback.endswith(
-        " end"
-    )
-    assert max(len(outcome.reason), len(outcome.error.traceback)) <= LONGEST_TEXT
+    traceback = outcome.error.traceback
+    assert traceback.startswith("(9983690 characters left out) …") and traceback.endswith(" end")
+    assert max(len(outcome.reason), len(traceback)) <= LONGEST_TEXT
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"exit_code": 10**30},
-        {"exit_code": -1},
-        {"exit_code": 256},
-        {"exit_code": "1"},
-        {"exit_code": True},
-        {"ended": -1e300},
-        {"ended": 1e300},
-        {"started": None},
-        {"reason": ["x"]},
-        {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
-        {"error": [1]},
-        {"error": "x"},
-        {"other": 1},
-        {"asked": 1},
-    ],
-)
+WRONG: list[dict[str, Any]] = [
+    *({"exit_code": each} for each in (10**30, -1, 256, "1", True)),
+    *({"ended": -1e300}, {"ended": 1e300}, {"started": None}, {"reason": ["x"]}),
+    {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
+    *({"error": [1]}, {"error": "x"}, {"other": 1}, {"asked": 1}),
+]
+
+
+@pytest.mark.parametrize("change", WRONG)
 def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict[str, Any]) -> None:
     path = Run(tmp_path).outcome("job", 1, 0)
     path.parent.mkdir(parents=True)

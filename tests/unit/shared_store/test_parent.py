@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, retain
 from shared_store.files import DamagedFile
-from shared_store.layout import Store
+from shared_store.layout import Run, Store
 from shared_store.parent import NewRun, RunExists, TeacherCopy, parent_checkpoint
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 
@@ -26,6 +27,13 @@ def store(tmp_path: Path) -> Store:
 
 def new(store: Store, source: Checkpoint | None = None) -> NewRun:
     return NewRun(store, "me", "source", source or list_checkpoints(store.run("source"))[-1])
+
+
+def heir(store: Store) -> Run:
+    """A clone of the source that is published."""
+    making = new(store)
+    making.copy()
+    return making.publish("heir", {"run": "heir"})
 
 
 def names(store: Store) -> list[str]:
@@ -51,9 +59,7 @@ def test_the_new_run_has_only_the_weights_and_its_lineage(store: Store) -> None:
 
 
 def test_a_clone_keeps_weights_that_the_source_s_retention_deletes(store: Store) -> None:
-    making = new(store)
-    making.copy()
-    run = making.publish("heir", {"run": "heir"})
+    run = heir(store)
     for iteration in (4, 5, 6):
         add_checkpoint(store, "source", iteration, score=9.0)
     assert "00000003-e1" in retain(store.run("source"), 2)
@@ -61,50 +67,35 @@ def test_a_clone_keeps_weights_that_the_source_s_retention_deletes(store: Store)
     assert parent is not None and parent.path.is_dir()
 
 
-def harm(path: Path, how: str) -> None:
-    if how == "missing":
-        path.unlink()
-    elif how == "short":
-        path.write_bytes(b"w")
-    elif how == "link":
-        os.replace(path, path.with_name("elsewhere"))
-        path.symlink_to("elsewhere")
-    else:
-        path.write_bytes(b"WEIGHTS" * 1000)
+HARMS: dict[str, Callable[[Path], Any]] = {
+    "is missing": Path.unlink,
+    "has 1 bytes": lambda path: path.write_bytes(b"w"),
+    "not a regular file": lambda path: (path.rename(path.with_name("elsewhere")), path.symlink_to("elsewhere")),
+    "was altered": lambda path: path.write_bytes(b"WEIGHTS" * 1000),
+}
 
 
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [("missing", "is missing"), ("short", "has 1 bytes"), ("link", "not a regular file"), ("altered", "was altered")],
-)
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_damage_is_found_before_the_copy_and_before_the_use(store: Store, when: str, how: str, said: str) -> None:
-    source = list_checkpoints(store.run("source"))[-1]
-    making = new(store)
-    if when == "before":
-        harm(source.path / "learner.pt", how)
-        with pytest.raises(DamagedCheckpoint, match=f"00000003-e1: .*learner.pt .*{said}|learner.pt was altered"):
-            making.copy()
-        making.discard()
-        assert names(store) == ["source"]
-        return
-    making.copy()
-    run = making.publish("heir", {"run": "heir"})
-    harm(run.parent / source.name / "learner.pt", how)
+@pytest.mark.parametrize("said", HARMS)
+def test_damage_is_found_before_the_copy_and_before_the_use(store: Store, said: str) -> None:
+    source, run = list_checkpoints(store.run("source"))[-1], heir(store)
+    HARMS[said](run.parent / source.name / "learner.pt")
     with pytest.raises(DamagedCheckpoint, match=said):
         parent_checkpoint(run)
+    making = new(store)
+    HARMS[said](source.path / "learner.pt")
+    with pytest.raises(DamagedCheckpoint, match=f"00000003-e1: .*learner.pt .*{said}|learner.pt was altered"):
+        making.copy()
+    making.discard()
+    assert names(store) == ["heir", "source"]
 
 
-def test_a_name_that_is_taken_is_never_written_over(store: Store) -> None:
+def test_a_name_that_is_taken_is_never_written_over_and_a_published_run_can_be_taken_back(store: Store) -> None:
     making = new(store)
     making.copy()
     with pytest.raises(RunExists):
         making.publish("source", {"run": "source"})
     making.discard()
     assert names(store) == ["source"] and list_checkpoints(store.run("source"))
-
-
-def test_a_published_run_can_be_taken_back(store: Store) -> None:
     making = new(store)
     making.copy()
     making.publish("heir", {"run": "heir"})
@@ -124,9 +115,7 @@ def test_leftovers_of_the_same_owner_are_cleared_away_and_nobody_else_s(store: S
 
 
 def test_a_lineage_that_leads_elsewhere_is_refused(store: Store) -> None:
-    making = new(store)
-    making.copy()
-    run = making.publish("heir", {"run": "heir"})
+    run = heir(store)
     text = (run.path / "run.json").read_text()
     (run.path / "run.json").write_text(text.replace("00000003-e1", "../../source/checkpoints/00000003-e1"))
     with pytest.raises(DamagedCheckpoint, match=r"run\.json names no checkpoint as its parent"):
@@ -178,7 +167,7 @@ def test_a_run_holds_its_teacher_before_it_exists_and_after_the_teacher_s_run_is
     assert pupil.description() == {"run": "pupil"}
 
 
-def test_an_unused_copy_of_a_teacher_leaves_nothing(store: Store) -> None:
+def test_a_copy_of_a_teacher_is_in_the_run_that_is_published_last_or_leaves_nothing(store: Store) -> None:
     copy = copy_of_teacher(store)
     copy.discard()
     published = copy_of_teacher(store)
@@ -191,13 +180,10 @@ def test_an_unused_copy_of_a_teacher_leaves_nothing(store: Store) -> None:
     another.publish(store.run("pupil").path)
     another.discard()
     assert os.listdir(store.run("pupil").path) == ["logs"]
-
-
-def test_a_copy_of_a_teacher_moves_on_to_the_run_that_is_published_last(store: Store) -> None:
-    copy = copy_of_teacher(store)
+    last = copy_of_teacher(store)
     for name in ("first", "second"):
-        copy.publish(store.run(name).path)
-    copy.close()
+        last.publish(store.run(name).path)
+    last.close()
     assert [len(list_checkpoints(store.run(name).teacher("source"))) for name in ("first", "second")] == [0, 1]
 
 

@@ -42,7 +42,7 @@ def test_an_error_is_reported_by_its_place_in_the_job(path: tuple[str | int, ...
 
 def test_times_are_minutes_seconds_and_milliseconds() -> None:
     assert [clock(seconds) for seconds in (185 / 15, 59.9996, 61.5, 0.0, None)] == [
-        *("0:12.333", "1:00.000", "1:01.500", "0:00.000", "-"),
+        *("0:12.333", "1:00.000", "1:01.500", "0:00.000", "-")
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.settings import first_difference, fixed_settings, innermost, merged, setting_at
 
 KIND = SimpleNamespace(fixed=("sizes", "net.depth", "rate"), clone_may_change=("rate",))
 
@@ -34,3 +34,10 @@ def test_fixed_settings_are_those_of_the_class_that_the_checkpoint_has() -> None
     assert fixed_settings(KIND) == ["sizes", "net.depth", "rate"] and fixed_settings(None) == []
     assert fixed_settings(KIND, of_clone=True) == ["sizes", "net.depth"]
     assert fixed_settings(KIND, {"net": None}, of_clone=True) == ["net.depth"]
+
+
+def test_changes_reach_into_sections_and_an_empty_section_replaces_one() -> None:
+    trained = {"rewards": {"alive": 1.0, "fall": -1.0}, "curriculum": {"level": [[0, 0.0]]}, "angle": 1.0}
+    changes = {"rewards": {"alive": 2.0}, "curriculum": {}, "angle": {"new": 1}}
+    assert merged(trained, changes) == {"rewards": {"alive": 2.0, "fall": -1.0}, "curriculum": {}, "angle": {"new": 1}}
+    assert trained["rewards"] == {"alive": 1.0, "fall": -1.0}

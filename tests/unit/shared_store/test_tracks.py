@@ -29,21 +29,14 @@ def test_a_track_is_kept_with_its_measures(store: Store) -> None:
     assert all(file.stat().st_mode & 0o222 == 0 for file in kept.path.iterdir()), "nothing of it may be written"
 
 
-def test_a_track_is_never_changed(store: Store) -> None:
+def test_a_track_is_never_changed(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     tracks.add(store, "hills", b"rows", {})
-    with pytest.raises(TrackError, match="track hills exists already, and tracks are immutable; choose another name"):
-        tracks.add(store, "hills", b"others", {})
+    for _ in range(2):
+        with pytest.raises(TrackError, match="hills exists already, and tracks are immutable; choose another name"):
+            tracks.add(store, "hills", b"others", {})
+        monkeypatch.setattr(tracks, "names", lambda store: [])  # it looked before the other one was done
     assert tracks.find(store, "hills").read() == b"rows"
     assert [path.name for path in store.tracks.iterdir()] == ["hills"], "nothing half made is left"
-
-
-def test_of_two_simultaneous_additions_of_a_track_one_succeeds(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    tracks.add(store, "hills", b"rows", {})
-    monkeypatch.setattr(tracks, "names", lambda store: [])  # it looked before the other one was done
-    with pytest.raises(TrackError, match="exists already"):
-        tracks.add(store, "hills", b"others", {})
-    monkeypatch.undo()
-    assert tracks.find(store, "hills").read() == b"rows" and len(list(store.tracks.iterdir())) == 1
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "random:7", "x" * 129])
@@ -65,10 +58,8 @@ def test_a_track_that_was_altered_is_not_read(store: Store) -> None:
     path = tracks.add(store, "hills", b"rows", {}).path
     (path / "track.npy").chmod(0o644)
     (path / "track.npy").write_bytes(b"ROWS")
-    with pytest.raises(
-        TrackError,
-        match=r"track hills is damaged: .* track.npy was altered .*; delete .*hills and make or import it again",
-    ):
+    said = r"track hills is damaged: .* track.npy was altered .*; delete .*hills and make or import it again"
+    with pytest.raises(TrackError, match=said):
         tracks.find(store, "hills").read()
     (path / "manifest.json").unlink()
     with pytest.raises(TrackError, match=r"track hills is damaged: .* manifest.json is missing"):

@@ -41,16 +41,8 @@ def test_a_changed_session_is_none(keys: KeyStore) -> None:
     session = here.sign_in(given(keys, "a"))
     name, end, rest = session.split(".", 2)
     other = given(keys, "b").partition(":")[0]
-    changed = [
-        f"{other}.{end}.{rest}",
-        f"{name}.{int(end) + 1}.{rest}",
-        session[:-1],
-        session + "0",
-        "",
-        ".",
-        "...",
-        "ä.1.x.y",
-    ]
+    changed = [f"{other}.{end}.{rest}", f"{name}.{int(end) + 1}.{rest}", session[:-1], session + "0"]
+    changed += ["", ".", "...", "ä.1.x.y"]
     assert [here.session(each) for each in changed] == [None] * len(changed)
     assert Access(keys).session(session) is None, "of another server"
 

@@ -27,10 +27,7 @@ PATH = LETTERS + "-._~!$&'()*+,;=:@%/"
 VALUE = "".join(map(chr, range(0x20, 0x7F))) + "\t"
 ACCEPTED = "accepted"
 REFUSALS = {
-    "IncompleteSignature",
-    "InvalidSignatureException",
-    "MissingAuthenticationToken",
-    "RequestExpired",
+    *("IncompleteSignature", "InvalidSignatureException", "MissingAuthenticationToken", "RequestExpired"),
     "UnrecognizedClientException",
 }
 

@@ -14,27 +14,21 @@ from shared_store.comparison import POINTS, RunFacts, grouped
 def run(name: str, seed: int, rewards: list[float], *, evaluated: float | None = None, **train: Any) -> RunFacts:
     spec = {"name": name, "train": {"task": "Ant", "seed": seed, **train}}
     records = [
-        {"iteration": i + 1, "env_steps": 10 * (i + 1), "reward": reward, "episode_length": 5.0}
-        for i, reward in enumerate(rewards)
+        {"iteration": i, "env_steps": 10 * i, "reward": reward, "episode_length": 5.0}
+        for i, reward in enumerate(rewards, 1)
     ]
     evaluation = None if evaluated is None else {"mean_return": evaluated, "success": {"share": 0.5}}
     return RunFacts(name, spec, records, evaluation)
 
 
 def test_runs_that_differ_in_name_and_seed_alone_are_one_group() -> None:
-    runs = [
-        run("ant-a", 1, [1.0]),
-        run("ant-b", 2, [3.0]),
-        run("slow", 1, [2.0], worlds=3),
-        RunFacts("bare", {}, [], None),
-    ]
-    groups = grouped(runs)
+    alike = [run("ant-a", 1, [1.0]), run("ant-b", 2, [3.0])]
+    groups = grouped([*alike, run("slow", 1, [2.0], worlds=3), RunFacts("bare", {}, [], None)])
     assert [group.label for group in groups] == ["ant-* (2)", "slow", "bare"]
     assert groups[0].describe()["seeds"] == [1, 2]
     assert groups[0].describe()["reward"] == {"mean": 2.0, "std": pytest.approx(2**0.5)}
-    assert grouped([RunFacts("a", {}, [], None), RunFacts("b", {}, [], None)])[1].label == "b", (
-        "nothing says that they are alike"
-    )
+    bare = grouped([RunFacts("a", {}, [], None), RunFacts("b", {}, [], None)])
+    assert bare[1].label == "b", "nothing says that they are alike"
 
 
 def test_a_group_has_the_spread_of_its_evaluations() -> None:
@@ -51,18 +45,15 @@ def test_a_curve_is_the_mean_where_runs_have_records_and_in_proportion_between_t
     assert curve[-1] == (30.0, 20.0, 0.0, 1), "the other run has ended"
     steps, mean, spread, count = min(curve, key=lambda point: abs(point[0] - 15.0))
     first, second = (steps - 10.0) / 10.0 * 10.0, 4.0 + (steps - 10.0) / 10.0 * 2.0
-    assert (
-        mean == pytest.approx((first + second) / 2)
-        and spread == pytest.approx(abs(first - second) / 2**0.5)
-        and count == 2
+    assert (mean, spread, count) == (
+        *(pytest.approx((first + second) / 2), pytest.approx(abs(first - second) / 2**0.5)),
+        2,
     )
 
 
 def test_a_single_run_keeps_its_own_points_and_one_without_episodes_has_no_curve() -> None:
-    groups = grouped([run("a", 1, [1.0, 5.0, 2.0]), run("b", 1, [], worlds=9)])
-    assert (
-        groups[0].curve() == [(10.0, 1.0, 0.0, 1), (20.0, 5.0, 0.0, 1), (30.0, 2.0, 0.0, 1)] and groups[1].curve() == []
-    )
+    one, none = grouped([run("a", 1, [1.0, 5.0, 2.0]), run("b", 1, [], worlds=9)])
+    assert one.curve() == [(10.0, 1.0, 0.0, 1), (20.0, 5.0, 0.0, 1), (30.0, 2.0, 0.0, 1)] and none.curve() == []
 
 
 def test_the_curves_are_drawn_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

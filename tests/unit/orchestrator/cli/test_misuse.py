@@ -11,42 +11,30 @@ from orchestrator.cli.catalogue import ENTRIES, load
 from orchestrator.cli.misuse import Group
 from tests.conftest import call_muster
 
+MISUSE = {
+    "evalute": "evalute: there is no such command; did you mean evaluate?",
+    "zzz": "zzz: there is no such command; see: muster --help",
+    "--verison": "--verison: there is no such option; did you mean --version? see: muster --help",
+    "evaluate x --episods 5": "--episods: there is no such option; did you mean --episodes? see: muster evaluate --help",
+    "list -z": "-z: there is no such option; see: muster list --help",
+    "models lst": "lst: there is no such command; did you mean list?",
+    "models qqq": "qqq: there is no such command; see: muster models --help",
+    "models diff a --jsn": "--jsn: there is no such option; did you mean --json? see: muster models diff --help",
+    "evaluate": "RUN[@ITERATION|@best|@latest] is missing; see: muster evaluate --help",
+    "logs": "JOB is missing; see: muster logs --help",
+    "models register x": "--name is missing; see: muster models register --help",
+    "queues a b": "b: more arguments than the command takes; see: muster queues --help",
+    "evaluate x --episodes ten": "--episodes: expected a whole number, found ten; see: muster evaluate --help",
+    "run x --cpus many": "--cpus: expected a number, found many; see: muster run --help",
+    "serve --port 70000": "--port: expected a value less than or equal to 65535, found '70000'; see: muster serve --help",
+    "serve --port": "--port needs a value; see: muster serve --help",
+    "list --json=5": "--json takes no value; see: muster list --help",
+}
 
-@pytest.mark.parametrize(
-    ("typed", "line"),
-    [
-        ("evalute", "evalute: there is no such command; did you mean evaluate?"),
-        ("zzz", "zzz: there is no such command; see: muster --help"),
-        ("--verison", "--verison: there is no such option; did you mean --version? see: muster --help"),
-        (
-            "evaluate x --episods 5",
-            "--episods: there is no such option; did you mean --episodes? see: muster evaluate --help",
-        ),
-        ("list -z", "-z: there is no such option; see: muster list --help"),
-        ("models lst", "lst: there is no such command; did you mean list?"),
-        ("models qqq", "qqq: there is no such command; see: muster models --help"),
-        (
-            "models diff a --jsn",
-            "--jsn: there is no such option; did you mean --json? see: muster models diff --help",
-        ),
-        ("evaluate", "RUN[@ITERATION|@best|@latest] is missing; see: muster evaluate --help"),
-        ("logs", "JOB is missing; see: muster logs --help"),
-        ("models register x", "--name is missing; see: muster models register --help"),
-        ("queues a b", "b: more arguments than the command takes; see: muster queues --help"),
-        (
-            "evaluate x --episodes ten",
-            "--episodes: expected a whole number, found ten; see: muster evaluate --help",
-        ),
-        ("run x --cpus many", "--cpus: expected a number, found many; see: muster run --help"),
-        (
-            "serve --port 70000",
-            "--port: expected a value less than or equal to 65535, found '70000'; see: muster serve --help",
-        ),
-        ("serve --port", "--port needs a value; see: muster serve --help"),
-        ("list --json=5", "--json takes no value; see: muster list --help"),
-    ],
-)
-def test_wrong_use_is_one_line_that_names_the_nearest(tmp_path: Path, typed: str, line: str) -> None:
+
+@pytest.mark.parametrize("typed", MISUSE)
+def test_wrong_use_is_one_line_that_names_the_nearest(tmp_path: Path, typed: str) -> None:
+    line = MISUSE[typed]
     done = call_muster(*typed.split(), home=tmp_path, COLUMNS="40")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"muster: {line}\n")
 

@@ -9,14 +9,8 @@ from orchestrator.cli.jobs import lost_iterations, slow_iteration
 
 def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[str, Any]:
     progress = {"iteration": done, "iteration_seconds": seconds} if done else None
-    return {
-        "name": "ant",
-        "kind": "train",
-        "status": "RUNNING",
-        "progress": progress,
-        "results": {"iteration": saved},
-        **facts,
-    }
+    told = {"name": "ant", "kind": "train", "status": "RUNNING", "progress": progress, "results": {"iteration": saved}}
+    return {**told, **facts}
 
 
 def test_iterations_that_no_checkpoint_has_are_lost() -> None:

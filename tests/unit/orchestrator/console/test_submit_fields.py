@@ -17,25 +17,14 @@ def test_the_wizard_of_every_task_begins_with_a_job_that_can_be_submitted() -> N
         spec = from_text(written(document(task, groups(task, ["default"]))), "job", whole=False)
         assert spec.train is not None and spec.train.task == task
         assert not any(each.startswith(":") or "`" in each for each in tasks()[task].split())
-
-
-def test_no_two_fields_have_one_name_and_an_algorithm_has_its_own() -> None:
-    for task in tasks():
         names = [each.name for group in groups(task, ["default"]) for each in group.fields]
-        assert len(names) == len(set(names))
+        assert len(names) == len(set(names)), "no two fields have one name"
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "def f():\n    return 1\n",
-        "# ½ 😀\n\n\n\tx = 'a: b'\n",
-        "  indented\nless\n",
-        "trailing \n\n",
-        "one line",
-        "#:\n- &a *b\n",
-    ],
-)
+CODES = ("def f():\n    return 1\n", "# ½ 😀\n\n\n\tx = 'a: b'\n", "  indented\nless\n", "trailing \n\n", "one line")
+
+
+@pytest.mark.parametrize("code", [*CODES, "#:\n- &a *b\n"])
 def test_code_comes_out_of_the_yaml_as_it_was_written(code: str) -> None:
     name = "train.config.reward_function"
     form = Form({name: [code.replace("\n", "\r\n")], "train.config.track": ["a", "b"], "name": ["x"]})
@@ -53,19 +42,12 @@ def test_settings_of_an_algorithm_that_is_not_chosen_are_left_out() -> None:
     assert train == {"task": "Ant", "algorithm": "sac", "sac": {"gamma": 0.8}}
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("3", 3),
-        ("3e-4", 0.0003),
-        ("-1E5", -1e5),
-        ("[1, 2.5]", [1, 2.5]),
-        ("{a: 1}", {"a": 1}),
-        ("x", "x"),
-        ("[1", "[1"),
-        ("&a 1", "&a 1"),
-    ],
-)
-def test_a_value_is_read_as_yaml_and_stays_a_text_where_it_is_none(text: str, value: object) -> None:
+VALUES = {"3": 3, "3e-4": 0.0003, "-1E5": -1e5, "[1, 2.5]": [1, 2.5], "{a: 1}": {"a": 1}, "x": "x", "[1": "[1"}
+VALUES["&a 1"] = "&a 1"
+
+
+@pytest.mark.parametrize("text", VALUES)
+def test_a_value_is_read_as_yaml_and_stays_a_text_where_it_is_none(text: str) -> None:
     form = Form({"train.config.episode_seconds": [text]})
-    assert document("Ant", filled(form, groups("Ant", [])))["train"]["config"]["episode_seconds"] == value
+    found = document("Ant", filled(form, groups("Ant", [])))["train"]["config"]["episode_seconds"]
+    assert found == VALUES[text]

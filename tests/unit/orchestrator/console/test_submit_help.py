@@ -23,34 +23,21 @@ train:
 """
 
 
-@pytest.mark.parametrize(
-    ("line", "section", "key"),
-    [
-        (1, "", "name"),
-        (2, "nodes", "max"),
-        (3, "train", "worlds"),
-        (4, "train", "iterations"),
-        (6, "train.config", "track"),
-        (7, "train.config", "lidar"),
-        (9, "train.config.reward_function", "text"),
-        (12, "train.config.reward_function", "file"),
-        (14, "train.ppo", "learning_rate"),
-        (0, "", "queue"),
-        (99, "train.ppo", "gamma"),
-    ],
-)
-def test_help_is_of_the_section_in_which_the_line_stands(line: int, section: str, key: str) -> None:
-    found = help_at(JOB, line)
+HELP = {1: ("", "name"), 2: ("nodes", "max"), 3: ("train", "worlds"), 4: ("train", "iterations"), 0: ("", "queue")}
+HELP |= {6: ("train.config", "track"), 7: ("train.config", "lidar"), 9: ("train.config.reward_function", "text")}
+HELP |= {12: ("train.config.reward_function", "file"), 14: ("train.ppo", "learning_rate"), 99: ("train.ppo", "gamma")}
+
+
+@pytest.mark.parametrize("line", HELP)
+def test_help_is_of_the_section_in_which_the_line_stands(line: int) -> None:
+    found, (section, key) = help_at(JOB, line), HELP[line]
     assert found["section"] == section and key in [each["name"] for each in found["keys"]]
 
 
 def test_help_says_what_a_key_is_and_which_are_given() -> None:
     found = help_at(JOB, 5)
-    assert found["key"] == {
-        "name": "train.worlds",
-        "about": "simulated worlds of each rank; whole number from 1",
-        "given": True,
-    }
+    about = "simulated worlds of each rank; whole number from 1"
+    assert found["key"] == {"name": "train.worlds", "about": about, "given": True}
     assert [each["name"] for each in found["keys"] if each["given"]] == ["task", "worlds", "config", "ppo"]
 
 

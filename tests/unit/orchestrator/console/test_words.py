@@ -2,46 +2,28 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from orchestrator.console import words
 
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (None, ""),
-        (-3, "0 s"),
-        (59.9, "59 s"),
-        (60, "1 min"),
-        (3600, "1 h"),
-        (3660, "1 h 1 min"),
-        (86400, "1 d"),
-        (90061, "1 d 1 h"),
-    ],
-)
-def test_a_duration_has_its_two_largest_units(seconds: float | None, text: str) -> None:
-    assert words.duration(seconds) == text
+DURATIONS = {
+    None: "",
+    -3: "0 s",
+    59.9: "59 s",
+    60: "1 min",
+    3600: "1 h",
+    3660: "1 h 1 min",
+    86400: "1 d",
+    90061: "1 d 1 h",
+}
+NUMBERS = {None: "", 0: "0", 12: "12", 3.4567: "3.46", -0.01234: "-0.0123", 1234.5: "1234", 18_240: "18.2 k"}
+NUMBERS |= {1_070_000: "1.07 M", -2.5e10: "-25.0 G"}
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, ""),
-        (0, "0"),
-        (12, "12"),
-        (3.4567, "3.46"),
-        (-0.01234, "-0.0123"),
-        (1234.5, "1234"),
-        (18_240, "18.2 k"),
-        (1_070_000, "1.07 M"),
-        (-2.5e10, "-25.0 G"),
-    ],
-)
-def test_a_number_has_three_or_four_digits_and_a_unit(value: float | None, text: str) -> None:
-    assert words.count(value) == text
+def test_a_duration_has_its_two_largest_units_and_a_number_three_or_four_digits_and_a_unit() -> None:
+    assert {seconds: words.duration(seconds) for seconds in DURATIONS} == DURATIONS
+    assert {value: words.count(value) for value in NUMBERS} == NUMBERS
 
 
 @given(st.lists(st.floats(-1e12, 1e12), min_size=2, max_size=60))
@@ -58,10 +40,8 @@ def test_a_curve_of_one_value_is_no_line_and_of_equal_values_a_flat_one() -> Non
 
 def test_an_attribute_shows_its_field_escaped_and_names_it_for_scripts() -> None:
     row = {"link": '/"><script>', "name": "x", "open": "", "done": 0}
-    made = words.bound(row, href="link", text="name", hidden="open", value="done")
-    assert (
-        made
-        == 'data-bind="href:link text:name hidden:open value:done" href="/&#34;&gt;&lt;script&gt;" hidden value="0"'
+    assert words.bound(row, href="link", text="name", hidden="open", value="done") == (
+        'data-bind="href:link text:name hidden:open value:done" href="/&#34;&gt;&lt;script&gt;" hidden value="0"'
     )
 
 

@@ -47,7 +47,6 @@ T = 1_000_000
 """The moment of every event here (steady time [ms])."""
 NATIVE = NativeOptions(is_native=True, on_child_failure="restart")
 TERMS = Terms(number=2, hosts=("h/0", "h/1"), whole=2, main=0, options=NATIVE, grace=30.0, allowed=3, spent=1)
-AWS = replace(TERMS, options=NativeOptions())
 
 LAUNCHING = State(TERMS)
 STARTING = replace(LAUNCHING, launched=True)
@@ -58,12 +57,16 @@ def ending(ending: Ending, reason: str = "why", exit_code: int | None = None, of
     return replace(of, verdict=Verdict(ending, reason, exit_code))
 
 
+def with_terms(state: State, **terms: Any) -> State:
+    return replace(state, terms=replace(state.terms, **terms))
+
+
 def asked(state: State) -> State:
     return replace(state, stop_reason="enough")
 
 
 def on_aws(state: State) -> State:
-    return replace(state, terms=AWS)
+    return with_terms(state, options=NativeOptions())
 
 
 def seen(*ends: NodeEnd | None, silences: Sequence[float | None] = (None, None), **facts: Any) -> Observed:
@@ -84,7 +87,19 @@ MAIN_LAST = (end(0), end(0))
 KILLED = end(143, asked=True)
 UNSURE = Verdict(Ending.FAILED, "main node: exit 143", 143, certain=False)
 FROZEN = Verdict(Ending.FAILED, "node 1 gives no sign of life for 21 s: frozen, or cut off")
-TIMED = replace(RUNNING, terms=replace(TERMS, timeout=50))
+LATE = Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
+REFUSED = Verdict(Ending.FATAL, "can't start the gang: no such image")
+AWS_FAILED = Verdict(Ending.FAILED, AWS_EXITED, 1)
+GONE = Verdict(Ending.FAILED, "Host EC2 (instance h/0) terminated.")
+ROOMLESS = "attempt 2 runs on 2 of 4 nodes: there is no room for more"
+
+
+def ends(verdict: Verdict, grace: float = 35.0, first: Instruction = SAYS_SO) -> list[Instruction]:
+    """A look at a gang brings its end about."""
+    return [first, Decide(verdict), Save(), Stop(grace)]
+
+
+TIMED = with_terms(RUNNING, timeout=50)
 
 RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     # -- launching
@@ -93,17 +108,9 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "a handle is saved at once": (LAUNCHING, Launched("handle"), [Keep("handle"), Save()]),
     "a launch that waits says why": (LAUNCHING, LaunchDelayed("no room", False), [Explain("no room")]),
     "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
-    "one that is not needed any more is given up": (
-        asked(LAUNCHING),
-        LaunchDelayed("no room", False),
-        [Decide(STOPPED), WindUp()],
-    ),
+    "one that is not needed is given up": (asked(LAUNCHING), LaunchDelayed("full", False), [Decide(STOPPED), WindUp()]),
     "unless something may run": (asked(LAUNCHING), LaunchDelayed("silent", True), [Explain("silent")]),
-    "a refusal is final": (
-        LAUNCHING,
-        LaunchRefused("no such image"),
-        [Decide(Verdict(Ending.FATAL, "can't start the gang: no such image")), WindUp()],
-    ),
+    "a refusal is final": (LAUNCHING, LaunchRefused("no such image"), [Decide(REFUSED), WindUp()]),
     "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),
     # -- what is told
     "what is launched is looked at": (STARTING, Due(), [Observe()]),
@@ -113,76 +120,40 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "also one that can't be seen any more": (RUNNING, seen(waits="silent"), [Explain("silent")]),
     "the main node's first sign makes the job run": (STARTING, seen(), [MarkRunning(RUNS, T)]),
     "in the engine's words where it has some": (STARTING, seen(words="on n1"), [MarkRunning("on n1", T)]),
-    "so does an end that came before any sign": (
-        STARTING,
-        seen(*MAIN_LAST),
-        [MarkRunning(RUNS, T), Decide(DONE), Save(), Stop(35.0)],
-    ),
-    "a gang with too little room is called so": (
-        replace(RUNNING, terms=replace(TERMS, whole=4)),
-        seen(),
-        [Explain("attempt 2 runs on 2 of 4 nodes: there is no room for more")],
-    ),
+    "so does an end that came before any sign": (STARTING, seen(*MAIN_LAST), ends(DONE, first=MarkRunning(RUNS, T))),
+    "a gang with too little room is called so": (with_terms(RUNNING, whole=4), seen(), [Explain(ROOMLESS)]),
     "one node is no nodes": (
-        replace(RUNNING, terms=replace(TERMS, hosts=("h/0",), whole=1)),
+        with_terms(RUNNING, hosts=("h/0",), whole=1),
         seen(None, silences=(None,)),
         [Explain("attempt 2 runs on 1 node")],
     ),
     # -- what ends it
-    "the main node's end decides": (RUNNING, seen(*MAIN_LAST), [SAYS_SO, Decide(DONE), Save(), Stop(35.0)]),
-    "a failure has little to save": (RUNNING, seen(end(1), None), [SAYS_SO, Decide(FAILED), Save(), Stop(5.0)]),
+    "the main node's end decides": (RUNNING, seen(*MAIN_LAST), ends(DONE)),
+    "a failure has little to save": (RUNNING, seen(end(1), None), ends(FAILED, 5.0)),
     "what was told to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, AwaitCause(T)]),
     "since the first time": (
         replace(RUNNING, cause_since=T - CAUSE_PATIENCE),
         seen(KILLED, None),
         [SAYS_SO, AwaitCause(T - CAUSE_PATIENCE)],
     ),
-    "but not for ever": (
-        replace(RUNNING, cause_since=T - CAUSE_PATIENCE - 1),
-        seen(KILLED, None),
-        [SAYS_SO, Decide(UNSURE), Save(), Stop(5.0)],
-    ),
+    "but not for ever": (replace(RUNNING, cause_since=T - CAUSE_PATIENCE - 1), seen(KILLED, None), ends(UNSURE, 5.0)),
     "nor when the job is to stop": (
         asked(RUNNING),
         seen(KILLED, None),
         [SAYS_SO, AwaitCause(T), Decide(STOPPED), Save(), Stop(35.0)],
     ),
-    "a request ends it": (asked(RUNNING), seen(), [SAYS_SO, Decide(STOPPED), Save(), Stop(35.0)]),
-    "also before it runs": (
-        asked(STARTING),
-        seen(waits="queued"),
-        [Explain("queued"), Decide(STOPPED), Save(), Stop(35.0)],
-    ),
-    "an end counts more than a request": (
-        asked(RUNNING),
-        seen(*MAIN_LAST),
-        [SAYS_SO, Decide(DONE), Save(), Stop(35.0)],
-    ),
-    "silence ends it": (
-        RUNNING,
-        seen(silences=(None, LOST + 1)),
-        [SAYS_SO, Decide(FROZEN), Save(), Stop(5.0)],
-    ),
+    "a request ends it": (asked(RUNNING), seen(), ends(STOPPED)),
+    "also before it runs": (asked(STARTING), seen(waits="queued"), ends(STOPPED, first=Explain("queued"))),
+    "an end counts more than a request": (asked(RUNNING), seen(*MAIN_LAST), ends(DONE)),
+    "silence ends it": (RUNNING, seen(silences=(None, LOST + 1)), ends(FROZEN, 5.0)),
     "not a short one": (RUNNING, seen(silences=(None, LOST)), [SAYS_SO]),
     "nor that of a node that has ended": (RUNNING, seen(None, end(0), silences=(None, LOST + 1)), [SAYS_SO]),
     "nor that of a child on AWS": (on_aws(RUNNING), seen(silences=(None, LOST + 1)), [SAYS_SO]),
-    "time ends it": (
-        replace(TIMED, running_since=T - 50_001),
-        seen(),
-        [SAYS_SO, Decide(Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")), Save(), Stop(35.0)],
-    ),
+    "time ends it": (replace(TIMED, running_since=T - 50_001), seen(), ends(LATE)),
     "to the second": (TIMED, seen(), [SAYS_SO]),
     "on AWS a child's end is nothing": (on_aws(RUNNING), seen(None, end(1)), [SAYS_SO]),
-    "and the main node's everything": (
-        on_aws(RUNNING),
-        seen(end(1), None),
-        [SAYS_SO, Decide(Verdict(Ending.FAILED, AWS_EXITED, 1)), Save(), Stop(5.0)],
-    ),
-    "where it vanished its host is named": (
-        on_aws(RUNNING),
-        seen(end(137, lost=True), None),
-        [SAYS_SO, Decide(Verdict(Ending.FAILED, "Host EC2 (instance h/0) terminated.")), Save(), Stop(5.0)],
-    ),
+    "and the main node's everything": (on_aws(RUNNING), seen(end(1), None), ends(AWS_FAILED, 5.0)),
+    "where it vanished its host is named": (on_aws(RUNNING), seen(end(137, lost=True), None), ends(GONE, 5.0)),
     "the scheduler ends it": (RUNNING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     "also before its launch": (LAUNCHING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     "not twice": (ending(Ending.FAILED), Preempted("for b"), []),
@@ -204,11 +175,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         seen(end(0), None),
         [AwaitChildren(T - FINISHING + 1)],
     ),
-    "and no longer": (
-        replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING),
-        seen(end(0), None),
-        [Stop(35.0)],
-    ),
+    "and no longer": (replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING), seen(end(0), None), [Stop(35.0)]),
     "on AWS not at all": (on_aws(ending(Ending.SUCCEEDED)), seen(end(0), None), [Stop(35.0)]),
     "an old picture is named": (
         ending(Ending.FAILED),
@@ -228,113 +195,56 @@ def test_a_rule_says_what_follows_from_an_event_in_a_state(rule: str) -> None:
 
 
 SAVED = "; last checkpoint: iteration 50"
+STOPPED_SO = f"enough{SAVED}"
+PREEMPTED_SO = f"attempt 2 was why{SAVED}"
+LEFT_SO = f"attempt 2 left on request{SAVED}; starting again"
+FAILED_SO = f"attempt 2 failed (why){SAVED}; trying again"
 LEFT = SHORTEST_REQUEUE
 SPENT, FREE = True, False
 REQUEUE, STOP = Ending.REQUEUE, Ending.STOPPED
 CODE_4 = {"action": "EXIT", "onExitCode": "4"}
 
 
-def with_terms(state: State, **terms: Any) -> State:
-    return replace(state, terms=replace(state.terms, **terms))
-
-
 def ran(state: State, milliseconds: int) -> State:
     return replace(state, running_since=T - milliseconds)
 
 
-LAST = {"spent": 2}
-"""Terms of the third of three attempts."""
+def final(code: int, condition: dict[str, str]) -> State:
+    return with_terms(ending(Ending.FAILED, exit_code=code), conditions=[condition])
+
+
+REASON_3 = {"action": "EXIT", "onReason": "exit 3"}
+BOTH_LEFT, MAIN_FAILED = (end(75), end(75)), (end(1), None)
+FAILED_LAST = with_terms(ending(Ending.FAILED), spent=2)
+"""In the third of three attempts."""
+AT_ONCE = ran(ending(REQUEUE), LEFT - 1)
+S = Status
+DONE_SO, LAST_SO = "done before it was preempted", "why (attempt 2 of 3)"
 
 # state, the nodes' ends → whether the attempt is spent, the job's state, and its reason
 CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
-    "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, Status.SUCCEEDED, "why"),
-    "done before the stop": (asked(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, Status.SUCCEEDED, "why"),
-    "stopped": (asked(ending(STOP)), (), SPENT, Status.FAILED, f"enough{SAVED}"),
-    "stopped, on AWS": (on_aws(asked(ending(STOP))), (), SPENT, Status.FAILED, "enough"),
-    "failed when it was asked to stop": (asked(ending(Ending.FAILED)), (), SPENT, Status.FAILED, f"enough{SAVED}"),
-    "left when it was asked to stop": (asked(ending(REQUEUE)), (), FREE, Status.FAILED, f"enough{SAVED}"),
-    "preempted when it was asked to stop": (
-        asked(ending(Ending.PREEMPTED)),
-        MAIN_LAST,
-        FREE,
-        Status.FAILED,
-        f"enough{SAVED}",
-    ),
-    "refused when it was asked to stop": (asked(ending(Ending.FATAL)), (), SPENT, Status.FAILED, "why"),
-    "over time when it was asked to stop": (asked(ending(Ending.TIMEOUT)), (), SPENT, Status.FAILED, "why"),
-    "preempted": (ending(Ending.PREEMPTED), (end(75), end(75)), FREE, Status.RUNNABLE, f"attempt 2 was why{SAVED}"),
-    "preempted before its launch": (
-        ending(Ending.PREEMPTED, of=LAUNCHING),
-        (),
-        FREE,
-        Status.RUNNABLE,
-        f"attempt 2 was why{SAVED}",
-    ),
-    "done before it was preempted": (
-        ending(Ending.PREEMPTED),
-        MAIN_LAST,
-        FREE,
-        Status.SUCCEEDED,
-        "done before it was preempted",
-    ),
-    "left on request": (
-        with_terms(ran(ending(REQUEUE), LEFT), spent=2),
-        (end(75), end(75)),
-        FREE,
-        Status.RUNNABLE,
-        f"attempt 2 left on request{SAVED}; starting again",
-    ),
-    "left at once": (
-        ran(ending(REQUEUE), LEFT - 1),
-        (end(75), end(75)),
-        SPENT,
-        Status.RUNNABLE,
-        f"attempt 2 left on request{SAVED}; starting again",
-    ),
-    "left at once, the last time": (
-        with_terms(ran(ending(REQUEUE), LEFT - 1), **LAST),
-        (end(75), end(75)),
-        SPENT,
-        Status.FAILED,
-        "why",
-    ),
-    "failed": (
-        ending(Ending.FAILED),
-        (end(1), None),
-        SPENT,
-        Status.RUNNABLE,
-        f"attempt 2 failed (why){SAVED}; trying again",
-    ),
-    "failed the last time": (
-        with_terms(ending(Ending.FAILED), **LAST),
-        (end(1), None),
-        SPENT,
-        Status.FAILED,
-        "why (attempt 3 of 3)",
-    ),
-    "failed the last time, on AWS": (
-        with_terms(on_aws(ending(Ending.FAILED)), **LAST),
-        (end(1), None),
-        SPENT,
-        Status.FAILED,
-        "why",
-    ),
-    "failed as no retry mends": (
-        with_terms(ending(Ending.FAILED, exit_code=4), conditions=[CODE_4]),
-        (end(4), None),
-        SPENT,
-        Status.FAILED,
-        "why (attempt 2 of 3)",
-    ),
-    "failed for the reason that no retry mends": (
-        with_terms(ending(Ending.FAILED, exit_code=3), conditions=[{"action": "EXIT", "onReason": "exit 3"}]),
-        (end(3), None),
-        SPENT,
-        Status.FAILED,
-        "why (attempt 2 of 3)",
-    ),
-    "fatal": (ending(Ending.FATAL), (), SPENT, Status.FAILED, "why"),
-    "over time": (ending(Ending.TIMEOUT), (), SPENT, Status.FAILED, "why"),
+    "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
+    "done before the stop": (asked(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
+    "stopped": (asked(ending(STOP)), (), SPENT, S.FAILED, STOPPED_SO),
+    "stopped, on AWS": (on_aws(asked(ending(STOP))), (), SPENT, S.FAILED, "enough"),
+    "failed when it was asked to stop": (asked(ending(Ending.FAILED)), (), SPENT, S.FAILED, STOPPED_SO),
+    "left when it was asked to stop": (asked(ending(REQUEUE)), (), FREE, S.FAILED, STOPPED_SO),
+    "preempted when it was asked to stop": (asked(ending(Ending.PREEMPTED)), MAIN_LAST, FREE, S.FAILED, STOPPED_SO),
+    "refused when it was asked to stop": (asked(ending(Ending.FATAL)), (), SPENT, S.FAILED, "why"),
+    "over time when it was asked to stop": (asked(ending(Ending.TIMEOUT)), (), SPENT, S.FAILED, "why"),
+    "preempted": (ending(Ending.PREEMPTED), BOTH_LEFT, FREE, S.RUNNABLE, PREEMPTED_SO),
+    "preempted before its launch": (ending(Ending.PREEMPTED, of=LAUNCHING), (), FREE, S.RUNNABLE, PREEMPTED_SO),
+    "done before it was preempted": (ending(Ending.PREEMPTED), MAIN_LAST, FREE, S.SUCCEEDED, DONE_SO),
+    "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=2), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
+    "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),
+    "left at once, the last time": (with_terms(AT_ONCE, spent=2), BOTH_LEFT, SPENT, S.FAILED, "why"),
+    "failed": (ending(Ending.FAILED), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "failed the last time": (FAILED_LAST, MAIN_FAILED, SPENT, S.FAILED, "why (attempt 3 of 3)"),
+    "failed the last time, on AWS": (on_aws(FAILED_LAST), MAIN_FAILED, SPENT, S.FAILED, "why"),
+    "failed as no retry mends": (final(4, CODE_4), (end(4), None), SPENT, S.FAILED, LAST_SO),
+    "failed for the reason that no retry mends": (final(3, REASON_3), (end(3), None), SPENT, S.FAILED, LAST_SO),
+    "fatal": (ending(Ending.FATAL), (), SPENT, S.FAILED, "why"),
+    "over time": (ending(Ending.TIMEOUT), (), SPENT, S.FAILED, "why"),
 }
 
 
@@ -345,14 +255,8 @@ def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
 
 
 EVENTS = (
-    Due(),
-    Launched("handle"),
-    LaunchDelayed("why", False),
-    LaunchRefused("why"),
-    Preempted("why"),
-    seen(),
-    StopDelayed("why"),
-    Gone(T, MAIN_LAST, ""),
+    *(Due(), Launched("handle"), LaunchDelayed("why", False), LaunchRefused("why"), Preempted("why"), seen()),
+    *(StopDelayed("why"), Gone(T, MAIN_LAST, "")),
 )
 
 

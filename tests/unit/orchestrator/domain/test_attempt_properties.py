@@ -42,22 +42,15 @@ from orchestrator.domain.native_options import NativeOptions
 NODES = 2
 
 moments = st.integers(0, 200_000).map(lambda each: 10_000_000 + each)
+codes = st.sampled_from([0, 1, 75, 137, 143])
 node_ends = st.none() | st.builds(
-    NodeEnd,
-    st.sampled_from([0, 1, 75, 137, 143]),
-    st.just("why"),
-    st.floats(0, 9),
-    lost=st.booleans(),
-    asked=st.booleans(),
+    NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), asked=st.booleans()
 )
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
 silences = st.just([None] * NODES) | st.lists(st.none() | st.floats(0, 60), min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
-launches = st.one_of(
-    *[st.just(Launched("handle"))] * 4,
-    st.builds(LaunchDelayed, words, st.booleans()),
-    st.just(LaunchRefused("refused")),
-)
+delays = st.builds(LaunchDelayed, words, st.booleans())
+launches = st.one_of(*[st.just(Launched("handle"))] * 4, delays, st.just(LaunchRefused("refused")))
 looks = st.builds(Observed, moments, both, silences, words, words, words)
 gone = st.builds(Gone, moments, both | st.just([]), words)
 stops = st.one_of(gone, gone, gone, st.none(), st.just(StopDelayed("not allowed")))
@@ -74,29 +67,17 @@ class Turn:
     stop: Event | None
 
 
-turns = st.builds(
-    Turn,
-    st.one_of(
-        *[st.none()] * 4,
-        st.just("enough"),
-        st.just(Preempted("preempted by job b")),
-        st.one_of(launches, looks, gone),  # out of place
-    ),
-    launches,
-    looks,
-    stops,
-)
+out_of_place = st.one_of(launches, looks, gone)
+before = st.one_of(*[st.none()] * 4, st.just("enough"), st.just(Preempted("preempted by job b")), out_of_place)
+turns = st.builds(Turn, before, launches, looks, stops)
+policies = st.sampled_from(["ignore", "restart", "fail"])
 terms = st.builds(
     Terms,
     number=st.just(1),
     hosts=st.just(("h/0", "h/1")),
     whole=st.just(NODES),
     main=st.integers(0, NODES - 1),
-    options=st.builds(
-        NativeOptions,
-        is_native=st.booleans(),
-        on_child_failure=st.sampled_from(["ignore", "restart", "fail"]),
-    ),
+    options=st.builds(NativeOptions, is_native=st.booleans(), on_child_failure=policies),
     grace=st.just(30.0),
     timeout=st.none() | st.just(60),
     allowed=st.integers(1, 3),
@@ -242,13 +223,7 @@ def test_leaving_on_request_and_preemption_spend_no_attempt_and_fail_no_job(stor
 def test_a_gang_whose_main_node_is_done_succeeds(terms: Terms, turns: Sequence[Turn]) -> None:
     done = [NodeEnd(0, "done", 1.0)] * NODES
     answered = [
-        replace(
-            turn,
-            before=None,
-            launch=Launched("handle"),
-            seen=replace(turn.seen, ends=done, waits=""),
-            stop=Gone(turn.seen.moment, done, ""),
-        )
+        Turn(None, Launched("handle"), replace(turn.seen, ends=done, waits=""), Gone(turn.seen.moment, done, ""))
         for turn in turns
     ]
     assert [each.status for page in told(terms, answered) if (each := closed(page))] == [Status.SUCCEEDED]

@@ -53,33 +53,30 @@ def test_options_of_the_engines_are_tags(tags: dict[str, str], engines: list[str
     check_tags(tags, engines, of_a_queue=of_a_queue)
 
 
-@pytest.mark.parametrize(
-    ("tag", "value", "engine", "of_a_queue", "why"),
-    [
-        (
-            *("muster:partiton", "gpu", "slurm", False),
-            "tag muster:partiton: a compute environment of the slurm engine has no such option; did you mean partition?",
-        ),
-        (
-            *("muster:job-que", "night", "aws-batch", True),
-            "tag muster:job-que: a queue of the aws-batch engine has no such option; did you mean job-queue?",
-        ),
-        (
-            *("muster:gpu", "a100", "local", True),
-            "tag muster:gpu: a queue of the local engine has no such option; there are images",
-        ),
-        (
-            *("muster:nice", "much", "slurm", True),
-            "tag muster:nice is 'much', not a whole number; it is sbatch's --nice of a job without priority",
-        ),
-        (*("muster:account", " ", "slurm", True), "tag muster:account is empty; it is an account"),
-        (*("muster:images", "refused", "local", False), "tag muster:images is 'refused'; did you mean refuse?"),
-    ],
-)
+NO = "has no such option"
+WRONG_TAGS = {
+    (
+        "muster:partiton",
+        "gpu",
+        "slurm",
+        False,
+    ): f": a compute environment of the slurm engine {NO}; did you mean partition?",
+    ("muster:job-que", "night", "aws-batch", True): f": a queue of the aws-batch engine {NO}; did you mean job-queue?",
+    ("muster:gpu", "a100", "local", True): f": a queue of the local engine {NO}; there are images",
+    ("muster:nice", "much", "slurm", True): (
+        " is 'much', not a whole number; it is sbatch's --nice of a job without priority"
+    ),
+    ("muster:account", " ", "slurm", True): " is empty; it is an account",
+    ("muster:images", "refused", "local", False): " is 'refused'; did you mean refuse?",
+}
+
+
+@pytest.mark.parametrize("case", WRONG_TAGS)
 def test_a_tag_that_is_misspelt_or_of_a_wrong_kind_is_refused_with_the_nearest_name(
-    tag: str, value: str, engine: str, of_a_queue: bool, why: str
+    case: tuple[str, str, str, bool],
 ) -> None:
-    with pytest.raises(ValueError, match=f"^{re.escape(why)}$"):
+    tag, value, engine, of_a_queue = case
+    with pytest.raises(ValueError, match=f"^{re.escape(f'tag {tag}{WRONG_TAGS[case]}')}$"):
         check_tags({tag: value}, [engine], of_a_queue=of_a_queue)
 
 
@@ -91,6 +88,6 @@ def test_every_option_is_in_the_documentation_of_its_engine(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("value", ["5", "-5", "0"])
-def test_a_whole_number_may_be_negative(value: str) -> None:
-    Option("nice", "a number", int).check(value)
+def test_a_whole_number_may_be_negative() -> None:
+    for value in ("5", "-5", "0"):
+        Option("nice", "a number", int).check(value)

@@ -31,7 +31,14 @@ def test_a_stop_goes_on_until_nothing_is_left_whether_the_backend_answers_or_not
     assert next(answers) == "not asked for"
 
 
-def test_a_stop_that_is_never_answered_ends_with_the_engine_the_gang_and_the_last_answer() -> None:
+def refused() -> str:
+    raise EngineError("not authorized")
+
+
+def test_a_stop_that_is_never_answered_ends_with_the_last_answer_and_a_refused_one_at_once() -> None:
+    with pytest.raises(EngineError, match=r"^not authorized$"):
+        stop(60.0, refused)
+
     def step() -> str:
         raise NotYet("the daemon is away")
 
@@ -39,14 +46,6 @@ def test_a_stop_that_is_never_answered_ends_with_the_engine_the_gang_and_the_las
         with pytest.raises(Transient) as told:
             stop(0.02, last)
         assert str(told.value) == f"the fake engine has not ended gang job/1/1 within 0.02 s; last answer: {words}"
-
-
-def test_a_refusal_ends_a_stop_at_once() -> None:
-    def step() -> str:
-        raise EngineError("not authorized")
-
-    with pytest.raises(EngineError, match=r"^not authorized$"):
-        stop(60.0, step)
 
 
 def test_a_slurm_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -78,10 +79,15 @@ def test_an_engine_that_is_not_installed_counts_as_one_that_can_do_nothing() -> 
     assert traits_of("gone") == Traits()
 
 
-def served(traits: Traits) -> EngineSet:
+@contextmanager
+def served(traits: Traits) -> Iterator[EngineSet]:
     engine = FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)]))
     engine.traits = traits
-    return EngineSet([engine])
+    several = EngineSet([engine])
+    try:
+        yield several
+    finally:
+        several.close()
 
 
 CONTAINER = {"image": "any", "secrets": [{"name": "KEY", "valueFrom": "key"}]}
@@ -90,8 +96,7 @@ CONTAINER = {"image": "any", "secrets": [{"name": "KEY", "valueFrom": "key"}]}
 @pytest.mark.parametrize("way", SecretValues)
 def test_secrets_go_the_way_that_the_engine_declares(way: SecretValues, monkeypatch: pytest.MonkeyPatch) -> None:
     gang = make_gang("job", "/store", 1, "fake/host", ["any"], [CONTAINER])
-    several = served(Traits(secrets=way))
-    try:
+    with served(Traits(secrets=way)) as several:
         monkeypatch.setattr(several.secrets, "of", lambda container, queue: {"KEY": "value"})
         if way is SecretValues.NONE:
             with pytest.raises(EngineError, match="the fake engine has no safe way"):
@@ -101,24 +106,17 @@ def test_secrets_go_the_way_that_the_engine_declares(way: SecretValues, monkeypa
         given = several.with_secrets(gang).environments[0].get("KEY")
         assert given == ("value" if way is SecretValues.ENVIRONMENT else None)
         monkeypatch.undo()
-        if way is SecretValues.REFERENCES:
+        with nullcontext() if way is SecretValues.REFERENCES else pytest.raises(SecretsError):
             several.check_secrets(["fake"], [CONTAINER], "default")
-        else:
-            with pytest.raises(SecretsError):
-                several.check_secrets(["fake"], [CONTAINER], "default")
-    finally:
-        several.close()
 
 
 def test_a_user_is_refused_by_an_engine_that_can_t_take_one_on() -> None:
     gang = make_gang("job", "/store", 1, "fake/host", ["any"], [{"user": "1000"}])
-    for traits, refused in ((Traits(), True), (Traits(users=True), False), (Traits(images=True), False)):
-        several = served(traits)
-        try:
-            if refused:
-                with pytest.raises(EngineError, match="the fake engine runs jobs as the user of its nodes"):
-                    several.plan(gang)
-            else:
-                several.plan(gang)
-        finally:
-            several.close()
+    refused = pytest.raises(EngineError, match="the fake engine runs jobs as the user of its nodes")
+    for traits, outcome in (
+        (Traits(), refused),
+        (Traits(users=True), nullcontext()),
+        (Traits(images=True), nullcontext()),
+    ):
+        with served(traits) as several, outcome:  # type: ignore[attr-defined]
+            several.plan(gang)

@@ -54,20 +54,16 @@ def view(backend: Backend) -> CachedView[str]:
     return CachedView("nothing", backend, name="view", silence="no answer yet")
 
 
-def test_a_value_is_read_again_once_it_is_too_old(backend: Backend, view: CachedView[str]) -> None:
-    backend.answers.put("first")
-    assert view.get(60.0, patience=60.0) == "first" and view.get(60.0, patience=60.0) == "first"
-    assert backend.asked == 1, "it holds for a minute"
-    backend.answers.put("second")
-    assert view.get(0.0, patience=60.0) == "second"
-
-
-def test_without_patience_the_old_value_comes_at_once_and_the_new_one_later(
+def test_a_value_comes_at_once_without_patience_and_is_read_again_once_it_is_too_old(
     backend: Backend, view: CachedView[str]
 ) -> None:
     assert view.get(0.0) == "nothing" and view.trouble is None
     backend.answers.put("first")
     wait_for(lambda: view.value == "first", 10, "the answer")
+    assert view.get(60.0, patience=60.0) == "first" and view.get(60.0, patience=60.0) == "first"
+    assert backend.asked == 1, "it holds for a minute"
+    backend.answers.put("second")
+    assert view.get(0.0, patience=60.0) == "second"
 
 
 def test_a_backend_that_fails_leaves_the_old_value_and_says_why_it_is_stale(

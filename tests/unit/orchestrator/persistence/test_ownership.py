@@ -40,16 +40,11 @@ def known(record: RunRecord | None) -> tuple[str, str | None] | None:
     return (record.queue, record.owner) if record else None
 
 
-def test_an_unknown_run_has_no_owner_and_a_waiting_one_has_its_jobs(session: Session, run: Run) -> None:
+def test_a_run_belongs_to_its_first_job_until_a_later_one_creates_it(session: Session, run: Run) -> None:
     assert owner_of(session, run) is None
     submitted(session, "a", "robots", 1)
-    submitted(session, "b", "lab", 2)
-    assert known(owner_of(session, run)) == ("robots", "key robots")
-
-
-def test_a_run_belongs_to_the_job_that_creates_it_not_to_one_that_never_started(session: Session, run: Run) -> None:
-    submitted(session, "a", "robots", 1)
     later = submitted(session, "b", "lab", 2)
+    assert known(owner_of(session, run)) == ("robots", "key robots")
     assert known(record_owner(session, run, later)) == ("lab", "key lab")
     run.create({"run": "r", "queue": "other"})
     assert known(owner_of(session, run)) == ("lab", "key lab")  # the database's record comes first

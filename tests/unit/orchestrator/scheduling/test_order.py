@@ -7,86 +7,82 @@ import pytest
 from orchestrator.domain.gang import Shape, gang_needs
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import Start, decide
+from orchestrator.scheduling.decide import Start
 from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare
 from tests.support.orchestrator.scheduling import (
+    CAPACITY,
     FAIR,
-    compute_environment,
+    REQUIREMENT,
+    Pass,
+    environment,
     gang,
     host,
     job,
     line,
-    names,
+    needs,
     node,
     on,
     queue,
-    reason,
     running,
-    snapshot,
-    started,
 )
 
 # -- gangs ------------------------------------------------------------------------------------------------------------
 
 
 def test_without_waiting_jobs_nothing_is_decided() -> None:
-    decisions = decide(snapshot([host()], []))
-    assert (decisions.starts, decisions.preempts, decisions.cancels) == ((), (), ())
-    assert list(decisions.report.order("default")) == []
+    decided = Pass([host()])
+    assert (decided.starts, decided.preempts, decided.cancels, decided.waits()) == ((), (), (), "")
 
 
 def test_a_gang_that_fits_starts_with_what_it_asked_for() -> None:
     waiting = [job("ant", gang(node(0.5, 1, 1024), node(1, 2, 512)))]
-    assert decide(snapshot([host(gpus=3)], waiting)).starts == (
+    assert Pass([host(gpus=3)], waiting).starts == (
         Start("ant-0123456789", "all", (Placement("a", ("a2",), 0.5, 1024), Placement("a", ("a0", "a1"), 1, 512))),
     )
 
 
 def test_no_gpu_is_given_twice() -> None:
     held = [running("other", on("a", 1, [0, 2]))]
-    [start] = decide(snapshot([host(gpus=4)], [job("ant", gang(node(1, 1), node(1, 1)))], held)).starts
+    [start] = Pass([host(gpus=4)], [job("ant", gang(node(1, 1), node(1, 1)))], held).starts
     assert [placement.gpus for placement in start.placements] == [("a1",), ("a3",)]
 
 
 def test_a_gang_starts_whole_or_not_at_all() -> None:
-    held = [running("cart", on("a", 5, memory=10))]
-    decisions = decide(snapshot([host(cpus=8)], [job("ant", gang(*[node()] * 4))], held))
-    assert decisions.starts == ()
-    assert reason(decisions, "ant") == (
+    decided = Pass([host(cpus=8)], [job("ant", gang(*[node()] * 4))], [running("cart", on("a", 5, memory=10))])
+    assert decided.starts == ()
+    assert decided.reason("ant") == (
         "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 4 nodes with 4 CPUs, 0 GPUs, 400 MiB in all; "
         "3 CPUs, 0 GPUs, 7.99 GiB free until job cart (cart-012) ends"
     )
 
 
 def test_a_gang_may_span_hosts() -> None:
-    assert started(decide(snapshot([host("a"), host("b", 2)], [job("ant", gang(*[node(2)] * 3))]))) == "ant:a+a+b"
+    assert Pass([host("a"), host("b", 2)], [job("ant", gang(*[node(2)] * 3))]).started == "ant:a+a+b"
 
 
 def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
     waiting = [job("ant", gang(*[node()] * 4, minimum=2))]
-    assert started(decide(snapshot([host(cpus=8)], waiting))) == "ant:a+a+a+a"
-    assert started(decide(snapshot([host(cpus=8)], waiting, [running("x", on("a", 5))]))) == "ant:a+a+a"
-    decisions = decide(snapshot([host(cpus=8)], waiting, [running("x", on("a", 7))]))
-    assert reason(decisions, "ant") == (
-        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs at least 2 nodes with 2 CPUs, 0 GPUs, 200 MiB in all; "
-        "1 CPU, 0 GPUs, 8 GiB free until job x (x-012345) ends"
+    assert Pass([host(cpus=8)], waiting).started == "ant:a+a+a+a"
+    assert Pass([host(cpus=8)], waiting, [running("x", on("a", 5))]).started == "ant:a+a+a"
+    assert Pass([host(cpus=8)], waiting, [running("x", on("a", 7))]).reason("ant") == (
+        f"{CAPACITY} - {needs(2, nodes=2, least='at least ')}; 1 CPU, 0 GPUs, 8 GiB free until job x (x-012345) ends"
     )
+    limited = Pass([host(cpus=16)], [job("ant", gang(*[node(2)] * 4, minimum=1))], (), (), [environment(max_cpus=5)])
+    assert limited.started == "ant:a+a", "to the limit of its compute environment"
 
 
 def test_resources_of_a_vanished_host_are_not_counted() -> None:
     held = [running("lost", on("gone", 4)), running("cart", on("a", 1))]
-    assert started(decide(snapshot([host()], [job("ant", gang(node(3)))], held))) == "ant:a"
+    assert Pass([host()], [job("ant", 3)], held).started == "ant:a"
 
 
 def test_the_shape_of_a_job_is_read_from_its_definition_once() -> None:
     resources = [{"type": "VCPU", "value": "2"}, {"type": "GPU", "value": "1"}, {"type": "MEMORY", "value": "512"}]
-    container = {"image": "x", "resourceRequirements": resources}
-    ranges = [{"targetNodes": "0:", "container": container}]
-    needs = gang_needs({"numNodes": 2, "mainNode": 1, "nodeRangeProperties": ranges})
-    assert needs.shape == Shape((Resources(2, 1, 512), Resources(2, 1, 512)), 2, 1)
-    assert needs.shape is needs.shape
-    assert hash(needs.shape) == hash(Shape((Resources(2, 1, 512), Resources(2, 1, 512)), 2, 1))
+    ranges = [{"targetNodes": "0:", "container": {"image": "x", "resourceRequirements": resources}}]
+    read = gang_needs({"numNodes": 2, "mainNode": 1, "nodeRangeProperties": ranges})
+    whole = Shape((Resources(2, 1, 512), Resources(2, 1, 512)), 2, 1)
+    assert read.shape == whole and hash(read.shape) == hash(whole) and read.shape is read.shape
 
 
 # -- order ------------------------------------------------------------------------------------------------------------
@@ -94,16 +90,14 @@ def test_the_shape_of_a_job_is_read_from_its_definition_once() -> None:
 
 def test_first_in_first_out_whatever_the_priority_and_the_order_of_the_snapshot() -> None:
     waiting = [job("young", age=1, priority=9), job("old", age=3), job("tie-b", age=2), job("tie-a", age=2)]
-    decisions = decide(snapshot([host()], waiting))
-    assert started(decisions) == "old:a tie-a:a tie-b:a young:a"
-    full = decide(snapshot([host()], waiting, [running("x", on("a", 4))]))
-    assert names(full.report.order("default")) == "old tie-a tie-b young"
+    assert Pass([host()], waiting).started == "old:a tie-a:a tie-b:a young:a"
+    assert Pass([host()], waiting, [running("x", on("a", 4))]).waits() == "old tie-a tie-b young"
 
 
 def test_queues_come_by_priority_then_by_name() -> None:
     queues = [queue("low", 1), queue("high-b", 5), queue("high-a", 5)]
     waiting = [job("l", queue="low", age=9), job("b", queue="high-b", age=5), job("a", queue="high-a")]
-    assert started(decide(snapshot([host()], waiting, queues=queues))) == "a:a b:a l:a"
+    assert Pass([host()], waiting, queues=queues).started == "a:a b:a l:a"
 
 
 def test_the_share_with_the_least_weighted_use_is_served_first() -> None:
@@ -112,46 +106,40 @@ def test_the_share_with_the_least_weighted_use_is_served_first() -> None:
     usage = {("default", s): u for s, u in {"heavy": 5000, "team-a": 240, "team-xy": 170, "other": 490}.items()}
     usage["elsewhere", "heavy"] = 1e9
     # weighted: heavy 500, team-a 480, team-xy 510 (the longer prefix), other 490
-    decisions = decide(snapshot([host()], waiting, queues=[queue(policy=policy)], usage=usage))
-    assert started(decisions) == "team-a:a other:a heavy:a team-xy:a"
+    decided = Pass([host()], waiting, queues=[queue(policy=policy)], usage=usage)
+    assert decided.started == "team-a:a other:a heavy:a team-xy:a"
 
 
 def test_shares_take_turns_as_their_weights_say() -> None:
-    policy = FairShare(600, 0, {"a": 0.5})
     waiting = [job(f"{share}{i}", share=share, age=9 - i) for share in "ab" for i in range(4)]
-    decisions = decide(snapshot([host(cpus=8)], waiting, queues=[queue(policy=policy)]))
+    decided = Pass([host(cpus=8)], waiting, queues=[queue(policy=FairShare(600, 0, {"a": 0.5}))])
     # a CPU of a is charged 30, one of b 60: a0 (a 30) b0 (b 60) a1 (60) a2 (90) b1 (120) a3; then only b is left
-    assert started(decisions) == "a0:a b0:a a1:a a2:a b1:a a3:a b2:a b3:a"
+    assert decided.started == "a0:a b0:a a1:a a2:a b1:a a3:a b2:a b3:a"
 
 
 def test_gpus_count_where_a_gang_has_any_else_cpus() -> None:
     waiting = [
         job("a0", gang(node(1, 2), node(1, 2)), share="a", age=9),  # charges 240
-        job("a1", gang(node(1)), share="a", age=8),
-        job("b0", gang(node(3)), share="b", age=9),  # 180
-        job("b1", gang(node(1)), share="b", age=8),  # 60
-        job("b2", gang(node(1)), share="b", age=7),
+        job("a1", share="a", age=8),
+        job("b0", 3, share="b", age=9),  # 180
+        job("b1", share="b", age=8),  # 60
+        job("b2", share="b", age=7),
     ]
     # a 240, then b: 180, b: 240, a tie that a's name wins
-    decisions = decide(snapshot([host(cpus=16, gpus=4)], waiting, queues=[queue(policy=FAIR)]))
-    assert started(decisions) == "a0:a+a b0:a b1:a a1:a b2:a"
+    decided = Pass([host(cpus=16, gpus=4)], waiting, queues=[queue(policy=FAIR)])
+    assert decided.started == "a0:a+a b0:a b1:a a1:a b2:a"
 
 
 def test_in_a_share_priority_comes_before_age() -> None:
-    waiting = [
-        job("young", share="s", priority=5),
-        job("old", share="s", priority=5, age=5),
-        job("eldest", share="s", age=9),
-        job("first", share="s", priority=9999),
-    ]
-    decisions = decide(snapshot([host()], waiting, queues=[queue(policy=FAIR)]))
-    assert started(decisions) == "first:a old:a young:a eldest:a"
+    young, old = job("young", share="s", priority=5), job("old", share="s", priority=5, age=5)
+    waiting = [young, old, job("eldest", share="s", age=9), job("first", share="s", priority=9999)]
+    assert Pass([host()], waiting, queues=[queue(policy=FAIR)]).started == "first:a old:a young:a eldest:a"
 
 
 def test_jobs_without_a_share_have_one_of_their_own() -> None:
-    waiting = [job("named", share="s"), job("none")]
     usage = {("default", ""): 50.0, ("default", "s"): 10.0}
-    assert started(decide(snapshot([host()], waiting, queues=[queue(policy=FAIR)], usage=usage))) == "named:a none:a"
+    decided = Pass([host()], [job("named", share="s"), job("none")], queues=[queue(policy=FAIR)], usage=usage)
+    assert decided.started == "named:a none:a"
 
 
 @pytest.mark.parametrize(
@@ -161,98 +149,61 @@ def test_use_halves_with_every_half_life(age: float, decay: int, left: float) ->
     assert decayed(800.0, age, decay) == left
 
 
-# -- compute environments ------------------------------------------------------------------------------------------------------------
+# -- compute environments ---------------------------------------------------------------------------------------------
 
 
 def test_compute_environments_are_tried_in_the_queues_order() -> None:
-    compute_environments = [
-        compute_environment("p", ("a",)),
-        compute_environment("q", ("b",)),
-        compute_environment("r", ("c",), enabled=False),
-    ]
-    queues = [queue(compute_environments=("r", "q", "p"))]
+    environments = [environment("p", ("a",)), environment("q", ("b",)), environment("r", ("c",), enabled=False)]
     hosts = [host("a", 2), host("b", 1), host("c", 8)]
-    decisions = decide(
-        snapshot(hosts, line(job("x"), job("y"), job("z")), queues=queues, compute_environments=compute_environments)
-    )
-    assert started(decisions) == "x:b y:a z:a"
-    assert [start.compute_environment for start in decisions.starts] == ["q", "p", "p"]
+    waiting = line(job("x"), job("y"), job("z"))
+    decided = Pass(hosts, waiting, queues=[queue(environments=("r", "q", "p"))], environments=environments)
+    assert decided.started == "x:b y:a z:a"
+    assert [start.compute_environment for start in decided.starts] == ["q", "p", "p"]
 
 
 def test_a_gang_stays_in_one_compute_environment() -> None:
-    compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
-    decisions = decide(
-        snapshot(
-            [host("a", 2), host("b", 2)],
-            [job("wide", gang(*[node()] * 3))],
-            queues=[queue(compute_environments=("p", "q"))],
-            compute_environments=compute_environments,
-        )
-    )
-    assert decisions.starts == ()
-    assert reason(decisions, "wide") == (
-        "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - "
-        "compute environment p: needs 3 nodes with 3 CPUs, 0 GPUs, 300 MiB in all; "
-        "all hosts together have 2 CPUs, 0 GPUs, 8 GiB; "
-        "compute environment q: needs 3 nodes with 3 CPUs, 0 GPUs, 300 MiB in all; "
-        "all hosts together have 2 CPUs, 0 GPUs, 8 GiB"
-    )
+    environments, queues = [environment("p", ("a",)), environment("q", ("b",))], [queue(environments=("p", "q"))]
+    decided = Pass([host("a", 2), host("b", 2)], [job("wide", gang(*[node()] * 3))], (), queues, environments)
+    assert decided.starts == ()
+    why = "needs 3 nodes with 3 CPUs, 0 GPUs, 300 MiB in all; all hosts together have 2 CPUs, 0 GPUs, 8 GiB"
+    assert decided.reason("wide") == f"{REQUIREMENT} - compute environment p: {why}; compute environment q: {why}"
 
 
 def test_a_compute_environment_uses_no_more_cpus_than_it_may() -> None:
-    held = [running("cart", on("a", 2)), running("other", on("b", 1), compute_environment="rest")]
-    compute_environments = [compute_environment(max_cpus=5), compute_environment("rest")]
-    waiting = line(job("x", gang(node(2))), job("y", gang(node(2))))
-    decisions = decide(snapshot([host("a", 8), host("b", 8)], waiting, held, compute_environments=compute_environments))
-    assert started(decisions) == "x:a"
-    assert reason(decisions, "y") == (
-        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 2 CPUs, 0 GPUs, 100 MiB in all; "
-        "compute environment all may use 1 CPU more at this time until job cart (cart-012) ends"
-    )
-
-
-def test_an_elastic_gang_shrinks_to_the_limit_of_its_compute_environment() -> None:
-    waiting = [job("ant", gang(*[node(2)] * 4, minimum=1))]
-    assert (
-        started(decide(snapshot([host(cpus=16)], waiting, compute_environments=[compute_environment(max_cpus=5)])))
-        == "ant:a+a"
+    held = [running("cart", on("a", 2)), running("other", on("b", 1), environment="rest")]
+    environments = [environment(max_cpus=5), environment("rest")]
+    decided = Pass([host("a", 8), host("b", 8)], line(job("x", 2), job("y", 2)), held, (), environments)
+    assert decided.started == "x:a"
+    assert decided.reason("y") == (
+        f"{CAPACITY} - {needs(2)}; compute environment all may use 1 CPU more at this time until job cart (cart-012) ends"
     )
 
 
 def test_one_machine_that_two_engines_have_is_not_given_out_twice() -> None:
     one = Host("localhost", 4, ("0",), 8192, machine="localhost")
     two = Host("docker/here", 4, ("0",), 8192, machine="localhost")
-    queues = [queue("local", compute_environments=("local",)), queue("docker", compute_environments=("docker",))]
-    compute_environments = [ComputeEnvironment(name, True, None, None, name) for name in ("local", "docker")]
+    queues = [queue("local", environments=("local",)), queue("docker", environments=("docker",))]
+    environments = [ComputeEnvironment(name, True, None, None, name) for name in ("local", "docker")]
     for cpus, gpus in (1, ("0",)), (3, ()):
         shape = gang(node(cpus, len(gpus)))
         both = [job("a", shape, queue="docker"), job("b", shape, queue="local")]
-        decisions = decide(snapshot([one, two], both, queues=queues, compute_environments=compute_environments))
-        assert started(decisions) == "a:docker/here" and "free" in reason(decisions, "b")
-        held = [running("a", Placement("docker/here", gpus, cpus, 100), compute_environment="docker")]
-        decisions = decide(
-            snapshot([one, two], both[1:], held, queues=queues, compute_environments=compute_environments)
-        )
-        assert started(decisions) == "" and "until job a (a-012345) ends" in reason(decisions, "b")
+        decided = Pass([one, two], both, queues=queues, environments=environments)
+        assert decided.started == "a:docker/here" and "free" in decided.reason("b")
+        held = [running("a", Placement("docker/here", gpus, cpus, 100), environment="docker")]
+        decided = Pass([one, two], both[1:], held, queues, environments)
+        assert decided.started == "" and "until job a (a-012345) ends" in decided.reason("b")
     # what a head of one engine waits for is kept by the other too, but for what it leaves
-    held = [running("a", on("localhost", 2), compute_environment="local", timeout=200)]
-    waiting = line(
-        job("head", gang(node(3)), queue="docker"), job("late", queue="local"), job("b", gang(node(1)), queue="local")
-    )
-    decisions = decide(snapshot([one, two], waiting, held, queues=queues, compute_environments=compute_environments))
-    assert started(decisions) == "late:localhost" and "behind job head" in reason(decisions, "b")
+    held = [running("a", on("localhost", 2), environment="local", timeout=200)]
+    waiting = line(job("head", 3, queue="docker"), job("late", queue="local"), job("b", queue="local"))
+    decided = Pass([one, two], waiting, held, queues, environments)
+    assert decided.started == "late:localhost" and "behind job head" in decided.reason("b")
     # and a compute environment of every engine has it once
-    everywhere = decide(snapshot([one, two], [job("both", gang(node(3), node(3)))]))
-    assert started(everywhere) == "" and "all hosts together have 4 CPUs, 1 GPU" in reason(everywhere, "both")
+    everywhere = Pass([one, two], [job("both", gang(node(3), node(3)))])
+    assert everywhere.started == "" and "all hosts together have 4 CPUs, 1 GPU" in everywhere.reason("both")
 
 
 def test_compute_environments_that_share_a_host_do_not_give_it_out_twice() -> None:
-    compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("a", "b"))]
+    environments = [environment("p", ("a",)), environment("q", ("a", "b"))]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]
-    waiting = [job("x", gang(node(3)), queue="one"), job("y", gang(node(3)), queue="two")]
-    assert (
-        started(
-            decide(snapshot([host("a"), host("b")], waiting, queues=queues, compute_environments=compute_environments))
-        )
-        == "x:a y:b"
-    )
+    waiting = [job("x", 3, queue="one"), job("y", 3, queue="two")]
+    assert Pass([host("a"), host("b")], waiting, (), queues, environments).started == "x:a y:b"

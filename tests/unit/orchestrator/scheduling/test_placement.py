@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import decide
 from orchestrator.scheduling.fit import fit
 from orchestrator.scheduling.placement import never_fits, place
-from tests.support.orchestrator.scheduling import compute_environment, gang, host, job, node, queue, reason, snapshot
+from tests.support.orchestrator.scheduling import Pass, environment, gang, host, job, node, queue, seats
 
 
 def where(shape: Shape, *hosts: Host) -> str | None:
@@ -23,8 +22,47 @@ def where(shape: Shape, *hosts: Host) -> str | None:
     return " ".join(placement.host for placement in placements) if placements else None
 
 
-def test_hosts_are_filled_one_after_the_other() -> None:
-    assert where(gang(*[node(2)] * 3), host("a", 4), host("b", 2)) == "a a b"
+UNLIKE = gang(node(1, 1), node(1), node(4), minimum=1)
+ELASTIC = gang(*[node(1)] * 4, minimum=2)
+TENTHS = [node(0.1)] * 10
+HUNGRY = node(1, 0, 5000)
+WHERE: dict[str, tuple[Shape, list[Host], str | None]] = {
+    "hosts are filled one after the other": (gang(*[node(2)] * 3), [host("a", 4), host("b", 2)], "a a b"),
+    "fractions of a CPU add up": (gang(*TENTHS), [host(cpus=1)], " ".join("a" * 10)),
+    "to what is a CPU but for rounding": (gang(*TENTHS), [host(cpus=1 - 1e-12)], " ".join("a" * 10)),
+    "but not to more": (gang(*TENTHS, node(0.1)), [host(cpus=1)], None),
+    "an elastic gang takes no more than it asks for": (ELASTIC, [host(cpus=8)], "a a a a"),
+    "it takes as many nodes as fit": (ELASTIC, [host(cpus=3.5)], "a a a"),
+    "down to the least": (ELASTIC, [host(cpus=2)], "a a"),
+    "and not less": (ELASTIC, [host(cpus=1.9)], None),
+    "one of unlike nodes starts whole": (UNLIKE, [host("a", 8, 1)], "a a a"),
+    "or drops the last ones": (UNLIKE, [host("a", 5, 1)], "a a"),
+    "down to the first": (UNLIKE, [host("a", 1, 1)], "a"),
+    "which it needs": (UNLIKE, [host("a", 8, 0)], None),
+    "small and large nodes": (gang(node(2), node(4)), [host("large", 4), host("small", 2)], "small large"),
+    "in whatever order they come": (gang(node(4), node(2)), [host("large", 4), host("small", 2)], "large small"),
+    "nodes without GPUs leave those with GPUs their host": (
+        gang(node(4), node(1, 1)),
+        [host("gpu", 4, gpus=1), host("cpu", 4)],
+        "cpu gpu",
+    ),
+    # filling hosts as they come would put the first node on the wide host, on which alone the second one fits
+    "a node with GPUs leaves the other the only host with enough CPUs": (
+        gang(node(4, 1), node(8)),
+        [host("wide", 8, gpus=1), host("narrow", 4, gpus=1)],
+        "narrow wide",
+    ),
+    "memory counts": (gang(HUNGRY, HUNGRY), [host("a"), host("b")], "a b"),
+    "and may be too little": (gang(HUNGRY, HUNGRY, HUNGRY), [host("a"), host("b")], None),
+    "nodes that take nothing fit anywhere": (gang(*[Resources(0, 0, 0)] * 3), [host(cpus=0, memory=0)], "a a a"),
+}
+
+
+@pytest.mark.parametrize("case", WHERE)
+def test_a_gang_has_its_place(case: str) -> None:
+    shape, hosts, expected = WHERE[case]
+    assert where(shape, *hosts) == expected
+    assert (never_fits(shape, hosts) is None) == (expected is not None)
 
 
 def test_every_node_gets_gpus_of_its_own() -> None:
@@ -34,56 +72,9 @@ def test_every_node_gets_gpus_of_its_own() -> None:
     )
 
 
-def test_fractions_of_a_cpu_add_up() -> None:
-    assert where(gang(*[node(0.1)] * 10), host(cpus=1)) == " ".join("a" * 10)
-    assert where(gang(*[node(0.1)] * 10), host(cpus=1 - 1e-12)) is not None
-    assert where(gang(*[node(0.1)] * 11), host(cpus=1)) is None
-
-
-@pytest.mark.parametrize(("cpus", "expected"), [(8, "a a a a"), (3.5, "a a a"), (2, "a a"), (1.9, None)])
-def test_an_elastic_gang_takes_as_many_nodes_as_fit(cpus: float, expected: str | None) -> None:
-    assert where(gang(*[node(1)] * 4, minimum=2), host(cpus=cpus)) == expected
-
-
-def test_an_elastic_gang_of_unlike_nodes_drops_the_last_ones() -> None:
-    shape = gang(node(1, 1), node(1), node(4), minimum=1)
-    assert where(shape, host("a", 8, 1)) == "a a a"
-    assert where(shape, host("a", 5, 1)) == "a a"
-    assert where(shape, host("a", 1, 1)) == "a"
-    assert where(shape, host("a", 8, 0)) is None
-
-
 def test_no_more_nodes_than_asked_for() -> None:
-    placements = place(gang(*[node(1)] * 4, minimum=2), [host(cpus=8)], 3)
-    assert placements is not None and len(placements) == 3
-    assert place(gang(*[node(1)] * 4, minimum=2), [host(cpus=8)], 1) is None
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_unlike_nodes_fit_on_unlike_hosts_in_whatever_order_they_come(order: tuple[int, int]) -> None:
-    nodes = [node(2), node(4)]
-    shape = gang(*(nodes[i] for i in order))
-    hosts = [host("large", 4), host("small", 2)]
-    assert never_fits(shape, hosts) is None
-    assert where(shape, *hosts) == " ".join(("small", "large")[i] for i in order)
-
-
-def test_nodes_without_gpus_leave_those_with_gpus_their_host() -> None:
-    assert where(gang(node(4), node(1, 1)), host("gpu", 4, gpus=1), host("cpu", 4)) == "cpu gpu"
-
-
-def test_a_node_with_gpus_leaves_the_only_host_with_enough_cpus_to_the_other() -> None:
-    # filling hosts as they come would put the first node on the wide host, on which alone the second one fits
-    assert where(gang(node(4, 1), node(8)), host("wide", 8, gpus=1), host("narrow", 4, gpus=1)) == "narrow wide"
-
-
-def test_memory_counts() -> None:
-    assert where(gang(*[node(1, 0, 5000)] * 2), host("a"), host("b")) == "a b"
-    assert where(gang(*[node(1, 0, 5000)] * 3), host("a"), host("b")) is None
-
-
-def test_a_node_that_takes_nothing_fits_anywhere() -> None:
-    assert where(gang(*[Resources(0, 0, 0)] * 3), host(cpus=0, memory=0)) == "a a a"
+    placements = place(ELASTIC, [host(cpus=8)], 3)
+    assert placements is not None and len(placements) == 3 and place(ELASTIC, [host(cpus=8)], 1) is None
 
 
 def test_the_reason_why_a_gang_never_fits_covers_only_its_required_nodes() -> None:
@@ -103,11 +94,7 @@ def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Hos
     [
         ([node(0.5)] * 3, 3, "needs 3 hosts, one for each node; there are 2"),
         ([node(0.5)] * 4, 3, "needs at least 3 hosts, one for each node; there are 2"),
-        (
-            [node(1, 1)] * 2,
-            2,
-            "needs 2 hosts with 1 CPU, 1 GPU, 100 MiB, one for each node; there is 1",
-        ),
+        ([node(1, 1)] * 2, 2, "needs 2 hosts with 1 CPU, 1 GPU, 100 MiB, one for each node; there is 1"),
     ],
 )
 def test_a_lack_of_hosts_for_one_node_each_is_counted_in_hosts(nodes: list[Resources], minimum: int, why: str) -> None:
@@ -142,15 +129,7 @@ hosts_strategy = st.lists(
 @settings(max_examples=100, deadline=None)
 @given(hosts_strategy, nodes, st.integers(1, 6))
 def test_a_gang_of_equal_nodes_fits_exactly_where_it_can(hosts: list[Host], each: Resources, count: int) -> None:
-    room = sum(
-        min(
-            int((h.cpus + 1e-9) // each.cpus),
-            len(h.gpus) // each.gpus if each.gpus else count,
-            h.memory // each.memory,
-        )
-        for h in hosts
-    )
-    assert (place(gang(*[each] * count), hosts) is not None) == (room >= count)
+    assert (place(gang(*[each] * count), hosts) is not None) == (seats(each, hosts) >= count)
 
 
 @settings(max_examples=100, deadline=None)
@@ -176,34 +155,21 @@ def test_every_node_gets_what_it_needs_and_no_host_gives_more_than_it_has(
 
 def test_one_machine_that_two_engines_serve_is_placed_on_once() -> None:
     twice = [replace(host("localhost"), machine="pc"), replace(host("docker/pc"), machine="pc")]
-    found = fit(gang(node(3), node(3)), queue(compute_environments=("all",)), {"all": compute_environment()}, twice)
+    found = fit(gang(node(3), node(3)), queue(), {"all": environment()}, twice)
     assert found.allocation is None and found.problem is not None and "all hosts together have 4 CPUs" in found.problem
 
 
 def test_a_gang_that_awaits_new_hosts_is_not_a_problem_and_has_no_placement_yet() -> None:
-    found = fit(
-        gang(*[node(3)] * 3),
-        queue(compute_environments=("all",)),
-        {"all": compute_environment()},
-        [host()],
-        elastic=["all"],
-    )
+    found = fit(gang(*[node(3)] * 3), queue(), {"all": environment()}, [host()], elastic=["all"])
     assert (found.allocation, found.problem) == (None, None)
 
 
 def test_a_disabled_compute_environment_is_used_if_no_other_is_possible() -> None:
-    compute_environments = {
-        "off": compute_environment("off", enabled=False),
-        "on": compute_environment("on", hosts=("a",)),
-    }
-    both = queue(compute_environments=("off", "on"))
-    small = fit(gang(node(2)), both, compute_environments, [host("a", 2), host("b", 8)]).allocation
-    large = fit(gang(node(6)), both, compute_environments, [host("a", 2), host("b", 8)]).allocation
-    assert (
-        small is not None
-        and large is not None
-        and (small.compute_environment, large.compute_environment) == ("on", "off")
-    )
+    environments = {"off": environment("off", enabled=False), "on": environment("on", hosts=("a",))}
+    for cpus, expected in ((2, "on"), (6, "off")):
+        both = queue(environments=("off", "on"))
+        found = fit(gang(node(cpus)), both, environments, [host("a", 2), host("b", 8)]).allocation
+        assert found is not None and found.compute_environment == expected
 
 
 machines = st.sampled_from(["", "m1", "m2"])
@@ -217,19 +183,19 @@ pools_strategy = st.lists(
 @settings(max_examples=200, deadline=None)
 @given(hosts_strategy, st.lists(machines, min_size=4, max_size=4), pools_strategy, nodes, st.integers(1, 4), st.data())
 def test_a_gang_alone_starts_exactly_where_it_is_said_to_fit(
-    hosts: list[Host], on: list[str], compute_environments: list, each: Resources, count: int, data: st.DataObject
+    hosts: list[Host], on: list[str], pools: list, each: Resources, count: int, data: st.DataObject
 ) -> None:
     hosts = [replace(host, machine=machine) for host, machine in zip(hosts, on, strict=False)]
     known = [
-        compute_environment(f"p{i}", None if names is None else tuple(sorted(names)), max_cpus=most)
-        for i, (names, most) in enumerate(compute_environments)
+        environment(f"p{i}", None if names is None else tuple(sorted(names)), max_cpus=most)
+        for i, (names, most) in enumerate(pools)
     ]
     shape = gang(*[each] * count, minimum=data.draw(st.integers(1, count)))
-    ordered = queue(compute_environments=tuple(each.name for each in known))
+    ordered = queue(environments=tuple(each.name for each in known))
     found = fit(shape, ordered, {each.name: each for each in known}, hosts)
-    decided = decide(snapshot(hosts, [job("a", shape)], queues=[ordered], compute_environments=known))
+    decided = Pass(hosts, [job("a", shape)], (), [ordered], known)
     assert [(start.compute_environment, start.placements) for start in decided.starts] == (
         [tuple(found.allocation)] if found.allocation else []
     )
     if found.allocation is None:
-        assert found.problem is not None and reason(decided, "a").endswith(found.problem)
+        assert found.problem is not None and decided.reason("a").endswith(found.problem)

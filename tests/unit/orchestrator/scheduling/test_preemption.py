@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import pytest
 
-from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, decide
-from orchestrator.scheduling.snapshot import TimeLimit
+from orchestrator.domain.gang import Shape
+from orchestrator.scheduling.decide import Cancel, Preempt
+from orchestrator.scheduling.snapshot import Queue, Running, TimeLimit
 from tests.support.orchestrator.scheduling import (
+    CAPACITY,
     FAIR,
-    compute_environment,
+    MAXIMUM,
+    REQUIREMENT,
+    Pass,
+    environment,
     gang,
     host,
     job,
     leads,
     line,
-    names,
     node,
     on,
     queue,
-    reason,
     running,
-    snapshot,
-    started,
 )
 
 # -- preemption -------------------------------------------------------------------------------------------------------
@@ -29,209 +30,143 @@ from tests.support.orchestrator.scheduling import (
 HIGH = [queue("high", 9), queue("mid", 5), queue("low", 1)]
 
 
-def preempted(decisions: Decisions) -> str:
-    return names(each.job for each in decisions.preempts)
+def cart(cpus: float = 4, queue: str = "low", name: str = "cart", host: str = "a", **facts: object) -> Running:
+    """A gang that may be preempted."""
+    return running(name, on(host, cpus), queue=queue, **{"preemptible": True, **facts})  # type: ignore[arg-type]
 
 
 def test_a_job_of_a_higher_queue_preempts_and_keeps_what_comes_free() -> None:
-    held = [running("cart", on("a", 4), queue="low", preemptible=True)]
-    waiting = [job("ant", gang(node(3)), queue="high"), job("small", gang(node(2)), queue="low", timeout=60)]
-    decisions = decide(snapshot([host()], waiting, held, HIGH))
-    assert decisions.preempts == (Preempt("cart-0123456789", "ant-0123456789"),)
-    assert decisions.starts == ()
-    assert reason(decisions, "ant").endswith("free until job cart (cart-012), preempted for it, has stopped")
-    assert reason(decisions, "small").startswith("CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - 1st in queue low, behind")
+    decided = Pass([host()], [job("ant", 3, queue="high"), job("small", 2, queue="low", timeout=60)], [cart()], HIGH)
+    assert decided.preempts == (Preempt("cart-0123456789", "ant-0123456789"),)
+    assert decided.starts == ()
+    assert decided.reason("ant").endswith("free until job cart (cart-012), preempted for it, has stopped")
+    assert decided.reason("small").startswith(f"{CAPACITY} - 1st in queue low, behind")
 
 
 @pytest.mark.parametrize(
-    "held",
+    ("held", "queues"),
     [
-        running("cart", on("a", 4), queue="low"),
-        running("cart", on("a", 4), queue="high", preemptible=True),
-        running("cart", on("a", 4), queue="low", preemptible=True, ending=True),
-        running("cart", on("a", 4), queue="deleted", preemptible=True),
+        ([cart(preemptible=False)], HIGH),
+        ([cart(queue="high")], HIGH),
+        ([cart(ending=True)], HIGH),
+        ([cart(queue="deleted")], HIGH),
+        ([cart(queue="equal")], [queue("high", 5), queue("equal", 5)]),
+        ([cart(2), running("fixed", on("a", 2), queue="low")], HIGH),  # that would not be enough
+        ([cart(queue="high")], [queue("high")]),  # first in, first out
     ],
 )
-def test_only_what_may_be_preempted_is(held) -> None:  # type: ignore[no-untyped-def]
-    assert decide(snapshot([host()], [job("ant", queue="high", priority=9)], [held], HIGH)).preempts == ()
-
-
-def test_an_equal_queue_is_not_preempted() -> None:
-    held = [running("cart", on("a", 4), queue="b", preemptible=True)]
-    queues = [queue("a", 5), queue("b", 5)]
-    assert decide(snapshot([host()], [job("ant", queue="a")], held, queues)).preempts == ()
-
-
-def test_nobody_is_preempted_where_that_would_not_be_enough() -> None:
-    held = [running("cart", on("a", 2), queue="low", preemptible=True), running("fixed", on("a", 2), queue="low")]
-    decisions = decide(snapshot([host()], [job("ant", gang(node(3)), queue="high")], held, HIGH))
-    assert decisions.preempts == ()
+def test_only_what_may_be_preempted_and_gives_room_is(held: list[Running], queues: list[Queue]) -> None:
+    assert Pass([host()], [job("ant", 3, queue="high", priority=9)], held, queues).preempts == ()
 
 
 def test_victims_are_ordered_by_queue_then_priority_then_age() -> None:
     held = [
-        running("mid", on("a", 1), queue="mid", preemptible=True, for_seconds=1),
-        running("old", on("a", 1), queue="low", preemptible=True, for_seconds=900),
-        running("young", on("a", 1), queue="low", preemptible=True, for_seconds=10),
-        running("dear", on("a", 1), queue="low", preemptible=True, for_seconds=1, priority=7),
+        cart(1, "mid", "mid", for_seconds=1),
+        cart(1, name="old", for_seconds=900),
+        cart(1, name="young", for_seconds=10),
+        cart(1, name="dear", for_seconds=1, priority=7),
     ]
-    chosen = [
-        preempted(decide(snapshot([host()], [job("ant", gang(node(cpus)), queue="high")], held, HIGH)))
-        for cpus in (1, 2, 3, 4)
-    ]
+    chosen = [Pass([host()], [job("ant", cpus, queue="high")], held, HIGH).preempted for cpus in (1, 2, 3, 4)]
     assert chosen == ["young", "young old", "young old dear", "young old dear mid"]
 
 
 def test_no_more_are_preempted_than_needed() -> None:
     held = [
-        running("small", on("a", 1), queue="low", preemptible=True, for_seconds=1),
-        running("other", on("b", 1), queue="low", preemptible=True, for_seconds=2),
-        running("large", on("b", 3), queue="low", preemptible=True, for_seconds=3),
+        cart(1, name="small", for_seconds=1),
+        cart(1, name="other", host="b", for_seconds=2),
+        cart(3, name="large", host="b", for_seconds=3),
         running("fixed", on("a", 3), queue="low"),
     ]
     # the youngest two come first but are not enough, and with the third they are no longer needed
-    decisions = decide(snapshot([host("a"), host("b")], [job("ant", gang(node(3)), queue="high")], held, HIGH))
-    assert preempted(decisions) == "large"
+    assert Pass([host("a"), host("b")], [job("ant", 3, queue="high")], held, HIGH).preempted == "large"
 
 
 def test_no_further_victims_are_chosen_while_some_stop() -> None:
-    held = [
-        running("first", on("a", 2), queue="low", preemptible=True, ending=True),
-        running("second", on("a", 2), queue="low", preemptible=True),
-    ]
-    assert preempted(decide(snapshot([host()], [job("ant", gang(node(2)), queue="high")], held, HIGH))) == ""
-    assert preempted(decide(snapshot([host()], [job("ant", gang(node(3)), queue="high")], held, HIGH))) == "second"
+    held = [cart(2, name="first", ending=True), cart(2, name="second")]
+    assert Pass([host()], [job("ant", 2, queue="high")], held, HIGH).preempted == ""
+    assert Pass([host()], [job("ant", 3, queue="high")], held, HIGH).preempted == "second"
 
 
 def test_in_a_share_a_higher_priority_preempts_a_lower_one() -> None:
-    held = [running("cart", on("a", 4), share="s", priority=1, preemptible=True)]
-    queues = [queue(policy=FAIR)]
-    assert preempted(decide(snapshot([host()], [job("ant", share="s", priority=2)], held, queues))) == "cart"
-    assert preempted(decide(snapshot([host()], [job("ant", share="s", priority=1)], held, queues))) == ""
+    for priority, expected in ((2, "cart"), (1, "")):
+        waiting, held = [job("ant", share="s", priority=priority)], [cart(queue="default", share="s", priority=1)]
+        assert Pass([host()], waiting, held, [queue(policy=FAIR)]).preempted == expected
 
 
 def test_across_shares_only_one_that_would_be_served_first_preempts() -> None:
-    held = [running("cart", on("a", 4), share="t", priority=1, preemptible=True)]
-    queues, waiting = [queue(policy=FAIR)], [job("ant", share="s", priority=2)]
-    for mine, its, expected in ((10.0, 20.0, "cart"), (20.0, 10.0, ""), (10.0, 10.0, "cart")):
+    held, queues = [cart(queue="default", share="t", priority=1)], [queue(policy=FAIR)]
+    ant = job("ant", share="s", priority=2)
+    # behind a job that never fits, for which 120 are charged, it comes later
+    huge = job("huge", gang(node(2, 2)), share="s", priority=9)
+    for waiting, mine, its, expected in (
+        *(([ant], 10.0, 20.0, "cart"), ([ant], 20.0, 10.0, ""), ([ant], 10.0, 10.0, "cart")),
+        *(([huge, ant], 10.0, 129.0, ""), ([huge, ant], 10.0, 131.0, "cart")),
+    ):
         usage = {("default", "s"): mine, ("default", "t"): its}
-        assert preempted(decide(snapshot([host()], waiting, held, queues, usage=usage))) == expected
-
-
-def test_charges_for_earlier_jobs_count_when_shares_are_compared() -> None:
-    # the share of the head comes first, but the head itself only after one that never fits, for which 120 are charged
-    held = [running("cart", on("a", 4), share="t", priority=1, preemptible=True)]
-    waiting = [job("huge", gang(node(2, 2)), share="s", priority=9), job("ant", share="s", priority=2)]
-    for its, expected in ((129.0, ""), (131.0, "cart")):
-        usage = {("default", "s"): 10.0, ("default", "t"): its}
-        decisions = decide(snapshot([host()], waiting, held, [queue(policy=FAIR)], usage=usage))
-        assert preempted(decisions) == expected
-
-
-def test_in_a_queue_that_is_first_in_first_out_nobody_is_preempted() -> None:
-    held = [running("cart", on("a", 4), preemptible=True)]
-    assert decide(snapshot([host()], [job("ant", priority=9)], held)).preempts == ()
+        assert Pass([host()], waiting, held, queues, usage=usage).preempted == expected
 
 
 def test_the_cpus_that_a_compute_environment_may_use_are_preempted_for_too() -> None:
-    held = [running("cart", on("a", 2), queue="low", preemptible=True)]
-    waiting = [job("ant", gang(node(3)), queue="high")]
-    assert (
-        preempted(decide(snapshot([host(cpus=64)], waiting, held, HIGH, [compute_environment(max_cpus=4)]))) == "cart"
-    )
+    decided = Pass([host(cpus=64)], [job("ant", 3, queue="high")], [cart(2)], HIGH, [environment(max_cpus=4)])
+    assert decided.preempted == "cart"
 
 
 # -- jobs that are stuck ----------------------------------------------------------------------------------------------
 
-CAPACITY = "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
-MAXIMUM = "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE"
-REQUIREMENT = "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT"
+LIMITED = (TimeLimit(CAPACITY, 600),)
 
 
 @pytest.mark.parametrize(
     ("code", "shape"), [(CAPACITY, gang(node(4))), (MAXIMUM, gang(node(6))), (REQUIREMENT, gang(node(1, 1)))]
 )
 @pytest.mark.parametrize(("waited", "late"), [(601, True), (600, False)])
-def test_a_job_stuck_first_in_its_queue_is_cancelled(code, shape, waited, late) -> None:  # type: ignore[no-untyped-def]
+def test_a_job_stuck_first_in_its_queue_is_cancelled(code: str, shape: Shape, waited: int, late: bool) -> None:
     others = [TimeLimit(each, 1) for each in (CAPACITY, MAXIMUM, REQUIREMENT) if each != code]
-    queues = [queue(limits=(*others, TimeLimit(code, 600)))]
-    held = [running("cart", on("a", 1))]
-    decisions = decide(
-        snapshot(
-            [host(cpus=4)],
-            [job("x", shape, runnable=999)],
-            held,
-            queues,
-            compute_environments=[compute_environment(max_cpus=5)],
-            leading=leads("x", code, waited),
-        )
-    )
+    queues, held = [queue(limits=(*others, TimeLimit(code, 600)))], [running("cart", on("a", 1))]
+    waiting, leading = [job("x", shape, runnable=999)], leads("x", code, waited)
+    decided = Pass([host()], waiting, held, queues, [environment(max_cpus=5)], leading=leading)
     if late:
         cancel = Cancel("x-0123456789", f"Canceled by JobStateTimeLimit action due to reason: {code}")
-        assert decisions.cancels == (cancel,)
-        assert list(decisions.report.order("default")) == []
+        assert decided.cancels == (cancel,) and decided.waits() == ""
     else:
-        assert decisions.cancels == ()
-        assert reason(decisions, "x").startswith(f"{code} - ")
+        assert decided.cancels == () and decided.reason("x").startswith(f"{code} - ")
 
 
 def test_only_the_first_that_does_not_start_is_cancelled_and_the_next_takes_its_place() -> None:
-    queues = [queue(limits=(TimeLimit(CAPACITY, 600),))]
-    held = [running("cart", on("a", 2), timeout=700)]
-    waiting = line(
-        job("runs", runnable=999),
-        job("stuck", gang(node(4)), runnable=999),
-        job("next", gang(node(4)), runnable=999),
-        job("small", runnable=999),
-    )
-    decisions = decide(snapshot([host()], waiting, held, queues, leading=leads("stuck", CAPACITY, 601)))
-    assert started(decisions) == "runs:a"
-    assert names(each.job for each in decisions.cancels) == "stuck"
-    assert names(decisions.report.order("default")) == "next small"
-    assert reason(decisions, "next").startswith(f"{CAPACITY} - needs 1 node with 4 CPUs")
-    assert reason(decisions, "small").startswith("2nd in queue default, behind job next (next-012)")
+    jobs = (("runs", 1), ("stuck", 4), ("next", 4), ("small", 1))
+    waiting = line(*[job(name, cpus, runnable=999) for name, cpus in jobs])
+    held, leading = [running("cart", on("a", 2), timeout=700)], leads("stuck", CAPACITY, 601)
+    decided = Pass([host()], waiting, held, [queue(limits=LIMITED)], leading=leading)
+    assert (decided.started, decided.cancelled, decided.waits()) == ("runs:a", "stuck", "next small")
+    assert decided.reason("next").startswith(f"{CAPACITY} - needs 1 node with 4 CPUs")
+    assert decided.reason("small").startswith("2nd in queue default, behind job next (next-012)")
 
 
 def test_only_the_time_at_the_head_counts_and_a_pass_tells_the_next_one_since_when_that_is() -> None:
-    queues = [queue(limits=(TimeLimit(CAPACITY, 600),))]
     held, waiting = [running("cart", on("a", 4))], line(job("x", runnable=9999), job("y", runnable=9999))
-    first = decide(snapshot([host()], waiting, held, queues))
-    assert first.cancels == () and first.leading == leads("x", CAPACITY, 0)
-    again = decide(snapshot([host()], waiting, held, queues, leading=leads("x", CAPACITY, 500)))
-    assert again.cancels == () and again.leading == leads("x", CAPACITY, 500)
-    for before in (leads("y", CAPACITY, 999), leads("x", MAXIMUM, 999)):  # another job, another reason: from now on
-        assert decide(snapshot([host()], waiting, held, queues, leading=before)).leading == leads("x", CAPACITY, 0)
+    for before, since in (
+        ({}, 0),
+        (leads("x", CAPACITY, 500), 500),
+        (leads("y", CAPACITY, 999), 0),  # another job, another reason: from now on
+        (leads("x", MAXIMUM, 999), 0),
+    ):
+        decided = Pass([host()], waiting, held, [queue(limits=LIMITED)], leading=before)
+        assert decided.cancels == () and decided.decisions.leading == leads("x", CAPACITY, since)
 
 
 def test_a_cancelled_job_preempts_no_gang() -> None:
-    queues = [queue("high", 9, limits=(TimeLimit(CAPACITY, 600),)), queue("low")]
-    held = [running("cart", on("a", 4), queue="low", preemptible=True)]
-    leading = leads("ant", CAPACITY, 601, "high")
-    decisions = decide(snapshot([host()], [job("ant", queue="high")], held, queues, leading=leading))
-    assert (len(decisions.cancels), decisions.preempts) == (1, ())
+    queues, leading = [queue("high", 9, limits=LIMITED), queue("low")], leads("ant", CAPACITY, 601, "high")
+    decided = Pass([host()], [job("ant", queue="high")], [cart()], queues, leading=leading)
+    assert (len(decided.cancels), decided.preempts) == (1, ())
 
 
-def test_the_first_of_a_queue_behind_the_head_of_another_is_stuck_too() -> None:
-    queues = [queue("high", 9), queue("low", limits=(TimeLimit(CAPACITY, 600),))]
-    held = [running("cart", on("a", 2))]
-    waiting = [job("ant", gang(node(4)), queue="high"), job("small", queue="low")]
-    decisions = decide(snapshot([host()], waiting, held, queues, leading=leads("small", CAPACITY, 601, "low")))
-    assert names(each.job for each in decisions.cancels) == "small"
-
-
-def test_the_first_of_a_queue_is_stuck_too_where_an_equal_job_of_another_queue_was_tried_before() -> None:
-    queues = [queue("high", 9), queue("low", limits=(TimeLimit(CAPACITY, 600),))]
-    waiting = [job("ant", gang(node(4)), queue="high"), job("cart", gang(node(4)), queue="low")]
-    leading = leads("cart", CAPACITY, 601, "low")
-    decisions = decide(snapshot([host()], waiting, [running("held", on("a", 2))], queues, leading=leading))
-    assert names(each.job for each in decisions.cancels) == "cart"
+@pytest.mark.parametrize("cpus", [1, 4])
+def test_the_first_of_a_queue_behind_the_head_of_another_is_stuck_too_also_where_it_is_its_equal(cpus: int) -> None:
+    queues, held = [queue("high", 9), queue("low", limits=LIMITED)], [running("cart", on("a", 2))]
+    waiting = [job("ant", 4, queue="high"), job("next", cpus, queue="low")]
+    assert Pass([host()], waiting, held, queues, leading=leads("next", CAPACITY, 601, "low")).cancelled == "next"
 
 
 def test_a_queue_without_a_usable_compute_environment_cancels_no_job() -> None:
     queues = [queue(limits=tuple(TimeLimit(code, 600) for code in (CAPACITY, MAXIMUM, REQUIREMENT)))]
-    decisions = decide(
-        snapshot(
-            [host()], [job("x", runnable=999)], queues=queues, compute_environments=[compute_environment(enabled=False)]
-        )
-    )
-    assert decisions.cancels == ()
+    assert Pass([host()], [job("x", runnable=999)], (), queues, [environment(enabled=False)]).cancels == ()

@@ -17,7 +17,7 @@ from orchestrator.scheduling.decide import Decisions, decide
 from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.placement import less, place
 from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare, Queue, Running, Snapshot, TimeLimit, Waiting
-from tests.support.orchestrator.scheduling import NOW, compute_environment, gang, host, node, queue
+from tests.support.orchestrator.scheduling import NOW, environment, gang, host, node, queue, seats
 
 nodes = st.builds(node, st.sampled_from([0.5, 1, 2, 3]), st.integers(0, 2), st.sampled_from([100, 500, 2000]))
 equal = st.builds(lambda each, count: gang(*[each] * count), nodes, st.integers(1, 4))
@@ -49,13 +49,11 @@ def check_capacity(
         assert sum(placement.memory for placement in here) <= each.memory
         gpus = Counter(gpu for placement in here for gpu in placement.gpus)
         assert set(gpus) <= set(each.gpus) and all(count == 1 for count in gpus.values())
-    for each_pool in compute_environments.values():
-        used = [
-            placement for gang in running if gang.compute_environment == each_pool.name for placement in gang.placements
-        ]
-        assert each_pool.max_cpus is None or sum(placement.cpus for placement in used) <= each_pool.max_cpus + 1e-6
-        if each_pool.hosts is not None:
-            assert {placement.host for placement in used} <= set(each_pool.hosts)
+    for pool in compute_environments.values():
+        used = [placement for gang in running if gang.compute_environment == pool.name for placement in gang.placements]
+        assert pool.max_cpus is None or sum(placement.cpus for placement in used) <= pool.max_cpus + 1e-6
+        if pool.hosts is not None:
+            assert {placement.host for placement in used} <= set(pool.hosts)
 
 
 def check_pass(snapshot: Snapshot, decisions: Decisions) -> None:
@@ -68,10 +66,8 @@ def check_pass(snapshot: Snapshot, decisions: Decisions) -> None:
         assert job.shape.minimum <= len(start.placements) <= len(members)
         for placement, wanted in zip(start.placements, members, strict=False):
             assert placement.resources == wanted
-        assert (
-            start.compute_environment in snapshot.queues[job.queue].compute_environments
-            and snapshot.compute_environments[start.compute_environment].enabled
-        )
+        assert start.compute_environment in snapshot.queues[job.queue].compute_environments
+        assert snapshot.compute_environments[start.compute_environment].enabled
         assert {placement.host for placement in start.placements} <= {each.name for each in snapshot.hosts}
         running.append(begun(job, start.compute_environment, start.placements, snapshot.now))
     check_capacity(snapshot.hosts, snapshot.compute_environments, running)
@@ -102,19 +98,6 @@ def equal_decisions(one: Decisions, two: Decisions, queues: Iterable[str]) -> bo
 # -- the head's reservation -------------------------------------------------------------------------------------------
 
 
-def seats(shape: Shape, hosts: Sequence[Host]) -> bool:
-    """Whether a gang of equal nodes fits: reckoned by division, apart from the scheduler."""
-    each = shape.nodes[0]
-    return sum(
-        min(
-            int((free.cpus + 1e-9) // each.cpus),
-            len(free.gpus) // each.gpus if each.gpus else 99,
-            free.memory // each.memory,
-        )
-        for free in hosts
-    ) >= len(shape.nodes)
-
-
 def earliest(shape: Shape, hosts: Sequence[Host], running: Sequence[Running], now: int) -> float:
     """When the shape fits if gangs end at their timeouts and nothing else starts [ms]."""
 
@@ -124,7 +107,8 @@ def earliest(shape: Shape, hosts: Sequence[Host], running: Sequence[Running], no
 
     for time in sorted({now, *map(end, running)}):
         left = [placement for each in running if end(each) > time or end(each) == inf for placement in each.placements]
-        if seats(shape, [less(each, [p for p in left if p.host == each.name]) for each in hosts]):
+        free = [less(each, [p for p in left if p.host == each.name]) for each in hosts]
+        if seats(shape.nodes[0], free) >= len(shape.nodes):
             return time
     return inf
 
@@ -145,43 +129,35 @@ def jobs(prefix: str, timeouts: st.SearchStrategy[int | None], size: int) -> st.
 
 
 def snapshot_of(hosts: Sequence[Host], waiting: Sequence[Waiting], running: Sequence[Running], now: int) -> Snapshot:
-    return Snapshot(now, hosts, {"all": compute_environment()}, {"default": queue()}, waiting, running, {})
+    return Snapshot(now, hosts, {"all": environment()}, {"default": queue()}, waiting, running, {})
 
 
 some_timeouts = st.one_of(st.none(), st.sampled_from([60, 100, 200, 300, 1000]))
 
 
+ages_strategy = st.lists(st.integers(0, 200), min_size=6, max_size=6)
+
+
 @settings(max_examples=150, deadline=None)
-@given(
-    hosts_strategy,
-    jobs("r", some_timeouts, 6),
-    jobs("w", some_timeouts, 8),
-    st.lists(st.integers(0, 200), min_size=6, max_size=6),
-)
+@given(hosts_strategy, jobs("r", some_timeouts, 6), jobs("w", some_timeouts, 8), ages_strategy)
 def test_jobs_that_pass_the_head_do_not_delay_it(
     hosts: list[Host], earlier: list[Waiting], waiting: list[Waiting], ages: list[int]
 ) -> None:
     first = decide(snapshot_of(hosts, earlier, [], NOW))
     by_id = {job.job: job for job in earlier + waiting}
     running = [
-        dataclasses.replace(
-            begun(by_id[start.job], start.compute_environment, start.placements, NOW - 1000 * age), ending=False
-        )
+        begun(by_id[start.job], start.compute_environment, start.placements, NOW - 1000 * age)
         for start, age in zip(first.starts, ages, strict=False)
         if by_id[start.job].timeout is None or by_id[start.job].timeout > age  # type: ignore[operator]
     ]
-    decisions = decide(snapshot_of(hosts, waiting, running, NOW))
-    check_pass(snapshot_of(hosts, waiting, running, NOW), decisions)
-    reservation = next(
-        (
-            by_id[job]
-            for job in decisions.report.order("default")
-            if decisions.report.reason(job).startswith("CAPACITY")
-        ),
-        None,
-    )
-    if reservation is None:
+    snapshot = snapshot_of(hosts, waiting, running, NOW)
+    decisions = decide(snapshot)
+    check_pass(snapshot, decisions)
+    report = decisions.report
+    heads = [by_id[job] for job in report.order("default") if report.reason(job).startswith("CAPACITY")]
+    if not heads:
         return
+    reservation = heads[0]
     starts = [begun(by_id[start.job], start.compute_environment, start.placements, NOW) for start in decisions.starts]
     before = [each for each in starts if by_id[each.job].created_at < reservation.created_at]
     promised = earliest(reservation.shape, hosts, [*running, *before], NOW)
@@ -232,9 +208,9 @@ QUEUES = {
 COMPUTE_ENVIRONMENTS = {
     each.name: each
     for each in [
-        compute_environment("ab", ("a", "b")),
-        compute_environment("bc", ("b", "c"), max_cpus=5),
-        compute_environment("all", max_cpus=9),
+        environment("ab", ("a", "b")),
+        environment("bc", ("b", "c"), max_cpus=5),
+        environment("all", max_cpus=9),
     ]
 }
 
@@ -267,9 +243,8 @@ class Cluster(RuleBasedStateMachine):
     ) -> None:
         for _ in range(count):
             name = f"j{len(self.jobs)}"
-            job = Waiting(
-                name, name, queue, shape, priority, share if queue == "fair" else None, self.now, self.now, timeout
-            )
+            shared = share if queue == "fair" else None
+            job = Waiting(name, name, queue, shape, priority, shared, self.now, self.now, timeout)
             self.jobs[name] = (job, preemptible)
             self.waiting[name] = job
         self.run_pass()
@@ -299,9 +274,8 @@ class Cluster(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(sorted(COMPUTE_ENVIRONMENTS)))
     def switch_a_pool(self, name: str) -> None:
-        self.compute_environments[name] = dataclasses.replace(
-            self.compute_environments[name], enabled=not self.compute_environments[name].enabled
-        )
+        pool = self.compute_environments[name]
+        self.compute_environments[name] = dataclasses.replace(pool, enabled=not pool.enabled)
         self.run_pass()
 
     @rule(name=st.sampled_from(sorted(HOSTS)))

@@ -6,244 +6,183 @@ import pytest
 
 from orchestrator.domain.gang import Shape
 from orchestrator.scheduling import free_resources as free
-from orchestrator.scheduling.decide import decide
 from orchestrator.scheduling.placement import place
-from orchestrator.scheduling.snapshot import FairShare
+from orchestrator.scheduling.snapshot import FairShare, Running
 from tests.support.orchestrator.scheduling import (
-    compute_environment,
+    CAPACITY,
+    Pass,
+    environment,
     gang,
     host,
     job,
     line,
-    names,
+    needs,
     node,
     on,
     queue,
-    reason,
     running,
-    snapshot,
-    started,
 )
 
 # -- backfill ---------------------------------------------------------------------------------------------------------
 
+BEHIND = f"2nd in queue default, behind job large (large-01), which {needs(4)}"
+LARGE = job("large", 4)
+
+
+def cart(cpus: float = 1, **facts: object) -> Running:
+    return running("cart", on("a", cpus), **facts)  # type: ignore[arg-type]
+
 
 def test_small_jobs_do_not_overtake_a_large_one_that_waits_for_room() -> None:
-    waiting = line(job("large", gang(node(4))), job("small"))
-    decisions = decide(snapshot([host()], waiting, [running("cart", on("a", 1, memory=10))]))
-    assert started(decisions) == ""
-    assert reason(decisions, "large") == (
+    decided = Pass([host()], line(LARGE, job("small")), [running("cart", on("a", 1, memory=10))])
+    assert decided.started == ""
+    assert decided.reason("large") == (
         "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 4 CPUs, 0 GPUs, 100 MiB in all; "
         "3 CPUs, 0 GPUs, 7.99 GiB free until job cart (cart-012) ends"
     )
-    assert reason(decisions, "small") == (
+    assert decided.reason("small") == (
         "2nd in queue default, behind job large (large-01), which needs 1 node with 4 CPUs, 0 GPUs, 100 MiB in all; "
         "it would fit now, but on what is kept for that job"
     )
 
 
 def test_a_job_passes_only_if_its_timeout_ends_by_the_start_of_the_head() -> None:
-    held = [running("cart", on("a", 1), for_seconds=100, timeout=700)]  # ends in 600 s
-    waiting = line(
-        job("large", gang(node(4))), job("late", timeout=601), job("in-time", timeout=600), job("endless", gang(node()))
-    )
-    decisions = decide(snapshot([host()], waiting, held))
-    assert started(decisions) == "in-time:a"
-    assert reason(decisions, "large").endswith(
+    waiting = line(LARGE, job("late", timeout=601), job("in-time", timeout=600), job("endless"))
+    decided = Pass([host()], waiting, [cart(for_seconds=100, timeout=700)])  # ends in 600 s
+    assert decided.started == "in-time:a"
+    assert decided.reason("large").endswith(
         "2 CPUs, 0 GPUs, 7.9 GiB free until job cart (cart-012) ends, at the latest at 2027-01-15 08:10:00 UTC"
     )
-    assert reason(decisions, "late") == (
-        "2nd in queue default, behind job large (large-01), which needs 1 node with 4 CPUs, 0 GPUs, 100 MiB in all "
-        "and starts by 2027-01-15 08:10:00 UTC; "
+    assert decided.reason("late") == (
+        f"{BEHIND} and starts by 2027-01-15 08:10:00 UTC; "
         "it would fit now, but on what is kept for that job: with a timeout of at most 600 s it could start"
     )
 
 
 def test_no_timeout_is_short_enough_while_nobody_knows_when_the_head_starts() -> None:
     held = [running("known", on("a", 1), timeout=700), running("unknown", on("a", 1))]
-    waiting = line(job("large", gang(node(4))), job("short", timeout=60))
-    assert started(decide(snapshot([host()], waiting, held))) == ""
+    assert Pass([host()], line(LARGE, job("short", timeout=60)), held).started == ""
 
 
 def test_a_job_of_any_length_may_start_beside_a_reservation() -> None:
     # the head will be on b, from which nothing but its own room is taken; one CPU of b is left over
-    held = [running("cart", on("b", 3))]
-    waiting = line(
-        job("large", gang(node(3))),
-        job("wide", gang(node(2))),
-        job("first"),
-        job("second"),
-        job("third"),
-    )
-    decisions = decide(snapshot([host("a", 2), host("b", 4)], waiting, held))
-    assert started(decisions) == "wide:a first:b"
-    assert reason(decisions, "second").startswith("2nd in queue default, behind job large (large-01)")
+    waiting = line(job("large", 3), job("wide", 2), job("first"), job("second"), job("third"))
+    decided = Pass([host("a", 2), host("b", 4)], waiting, [running("cart", on("b", 3))])
+    assert decided.started == "wide:a first:b"
+    assert decided.reason("second").startswith("2nd in queue default, behind job large (large-01)")
 
 
 def test_short_jobs_use_what_is_kept_and_long_ones_what_is_not() -> None:
-    held = [running("cart", on("a", 2), for_seconds=0, timeout=100)]
     waiting = line(
-        job("large", gang(node(3))),  # in 100 s, which leaves one CPU
+        job("large", 3),  # in 100 s, which leaves one CPU
         job("short", timeout=100),  # takes one of the two that are free
         job("long", timeout=101),  # takes the other, and the one that the head leaves
         job("more", timeout=101),
     )
-    assert started(decide(snapshot([host()], waiting, held))) == "short:a long:a"
+    assert Pass([host()], waiting, [cart(2, for_seconds=0, timeout=100)]).started == "short:a long:a"
 
 
-def test_long_jobs_together_leave_the_head_its_resources() -> None:
-    held = [running("cart", on("a", 4), timeout=700)]
-    waiting = line(job("large", gang(node(5))), *[job(f"j{i}", timeout=9999) for i in range(5)])
-    assert started(decide(snapshot([host(cpus=8)], waiting, held))) == "j0:a j1:a j2:a"
+def test_long_jobs_together_leave_the_head_its_resources_and_no_more_is_kept() -> None:
+    waiting = line(job("large", 5), *[job(f"j{i}", timeout=9999) for i in range(5)])
+    assert Pass([host(cpus=8)], waiting, [cart(4, timeout=700)]).started == "j0:a j1:a j2:a"
+    held = [running("x", on("a", 1), timeout=700), running("y", on("a", 1), timeout=700)]
+    assert Pass([host()], line(job("large", 3), job("long"), job("longer")), held).started == "long:a"
+    # at the end of cart there are 6 CPUs, of which the smallest size takes 4
+    elastic = line(job("elastic", gang(*[node(2)] * 3, minimum=2)), job("small"), job("next"))
+    assert Pass([host(cpus=6)], elastic, [cart(3, timeout=700)]).started == "small:a next:a"
 
 
 def test_gpus_are_kept_by_number() -> None:
     held = [running("cart", on("a", 1, [0, 1]), timeout=700)]
     waiting = line(job("large", gang(node(1, 3))), *[job(f"j{i}", gang(node(1, 1))) for i in range(2)])
-    decisions = decide(snapshot([host(cpus=8, gpus=4)], waiting, held))
-    assert [(names([s.job]), s.placements[0].gpus) for s in decisions.starts] == [("j0", ("a2",))]
+    decided = Pass([host(cpus=8, gpus=4)], waiting, held)
+    assert decided.started == "j0:a" and decided.starts[0].placements[0].gpus == ("a2",)
 
 
 def test_the_limit_of_a_compute_environment_is_reserved_too() -> None:
-    compute_environments = [compute_environment("p", max_cpus=4), compute_environment("q")]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("p",)), queue("three", 0, ("q",))]
-    held = [running("cart", on("a", 1), compute_environment="p", timeout=700)]
     waiting = [
-        job("large", gang(node(4)), queue="one"),
+        job("large", 4, queue="one"),
         job("same-environment", queue="two"),
-        job("other-environment", gang(node(6)), queue="three"),  # of the 16 CPUs at that time, 12 are not kept
-        job("too-much", gang(node(7)), queue="three"),
+        job("other-environment", 6, queue="three"),  # of the 16 CPUs at that time, 12 are not kept
+        job("too-much", 7, queue="three"),
     ]
-    decisions = decide(snapshot([host(cpus=16)], waiting, held, queues, compute_environments))
-    assert started(decisions) == "other-environment:a"
+    held, environments = [cart(environment="p", timeout=700)], [environment("p", max_cpus=4), environment("q")]
+    assert Pass([host(cpus=16)], waiting, held, queues, environments).started == "other-environment:a"
 
 
 def test_a_gang_that_is_being_stopped_counts_as_gone_soon() -> None:
-    held = [running("cart", on("a", 1), ending=True), running("other", on("b", 4), timeout=700)]
-    waiting = line(job("large", gang(node(4))), job("small", timeout=60))
-    decisions = decide(snapshot([host(), host("b")], waiting, held))
-    assert started(decisions) == ""
-    assert reason(decisions, "large").endswith("3 CPUs, 0 GPUs, 16 GiB free until job cart (cart-012) has stopped")
+    held = [cart(ending=True), running("other", on("b", 4), timeout=700)]
+    decided = Pass([host(), host("b")], line(LARGE, job("small", timeout=60)), held)
+    assert decided.started == ""
+    assert decided.reason("large").endswith("3 CPUs, 0 GPUs, 16 GiB free until job cart (cart-012) has stopped")
 
 
-def test_a_gang_that_is_still_starting_is_expected_to_run_for_its_whole_timeout() -> None:
-    [held] = [running("cart", on("a", 1), timeout=300)]
-    starting = type(held)(
-        held.job,
-        held.name,
-        held.queue,
-        None,
-        0,
-        held.compute_environment,
-        held.placements,
-        None,
-        held.timeout,
-        False,
-        False,
-    )
-    waiting = line(job("large", gang(node(4))), job("late", timeout=301), job("in-time", timeout=300))
-    assert started(decide(snapshot([host()], waiting, [starting]))) == "in-time:a"
-
-
-def test_gangs_that_this_pass_starts_are_waited_for_like_others() -> None:
-    waiting = line(
-        job("now", timeout=500), job("large", gang(node(4))), job("late", timeout=501), job("ok", timeout=500)
-    )
-    decisions = decide(snapshot([host()], waiting))
-    assert started(decisions) == "now:a ok:a"
-    assert reason(decisions, "large").endswith(
-        "until job now (now-0123) ends, at the latest at 2027-01-15 08:08:20 UTC"
-    )
-
-
-def test_resources_that_the_head_does_not_need_are_not_reserved() -> None:
-    held = [running("x", on("a", 1), timeout=700), running("y", on("a", 1), timeout=700)]
-    waiting = line(job("large", gang(node(3))), job("long"), job("longer"))
-    assert started(decide(snapshot([host()], waiting, held))) == "long:a"
-
-
-def test_an_elastic_head_keeps_room_for_its_smallest_size() -> None:
-    held = [running("cart", on("a", 3), timeout=700)]
-    waiting = line(job("elastic", gang(*[node(2)] * 3, minimum=2)), job("small"), job("next"))
-    # at the end of cart there are 6 CPUs, of which the smallest size takes 4
-    assert started(decide(snapshot([host(cpus=6)], waiting, held))) == "small:a next:a"
+def test_a_gang_that_starts_now_or_before_is_expected_to_run_for_its_whole_timeout() -> None:
+    waiting = line(LARGE, job("late", timeout=301), job("in-time", timeout=300))
+    assert Pass([host()], waiting, [cart(for_seconds=None, timeout=300)]).started == "in-time:a"
+    decided = Pass([host()], line(job("now", timeout=500), LARGE, job("late", timeout=501), job("ok", timeout=500)))
+    assert decided.started == "now:a ok:a"
+    assert decided.reason("large").endswith("until job now (now-0123) ends, at the latest at 2027-01-15 08:08:20 UTC")
 
 
 def test_an_absurd_timeout_counts_as_none() -> None:
-    held = [running("cart", on("a", 1), timeout=10**15)]
-    waiting = line(job("large", gang(node(4))), job("small", timeout=10**14))
-    decisions = decide(snapshot([host()], waiting, held))
-    assert started(decisions) == ""
-    assert reason(decisions, "large").endswith("free until job cart (cart-012) ends")
+    decided = Pass([host()], line(LARGE, job("small", timeout=10**14)), [cart(timeout=10**15)])
+    assert decided.started == "" and decided.reason("large").endswith("free until job cart (cart-012) ends")
 
 
 def test_equal_jobs_are_tried_once_a_pass_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     tried: list[Shape] = []
     monkeypatch.setattr(free, "place", lambda shape, *rest: tried.append(shape) or place(shape, *rest))
     held = [running(f"r{i}", on("a", 1), timeout=200 + i) for i in range(4)]
-    waiting = line(*[job(f"j{i}", gang(node(1 + i % 2)), timeout=60 + i) for i in range(2000)])
-    decide(snapshot([host()], waiting, held))
+    Pass([host()], line(*[job(f"j{i}", 1 + i % 2, timeout=60 + i) for i in range(2000)]), held)
     # two shapes, each with and without time to end before the head starts, and the bisection for the head
     assert len(tried) < 20
 
 
-# -- several reservations ----------------------------------------------------------------------------------------------------
+# -- several reservations ---------------------------------------------------------------------------------------------
+
+TWO_HOSTS, APART = [host("a"), host("b")], [environment("p", ("a",)), environment("q", ("b",))]
 
 
 def test_a_job_that_waits_holds_up_only_the_hosts_it_could_use() -> None:
-    compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]
-    held = [running("cart", on("a", 1), compute_environment="p"), running("ant", on("b", 1), compute_environment="q")]
+    held = [cart(environment="p"), running("ant", on("b", 1), environment="q")]
     waiting = [
-        job("one-large", gang(node(4)), queue="one"),
+        job("one-large", 4, queue="one"),
         job("two-small", queue="two", age=9),
-        job("two-large", gang(node(4)), queue="two", age=8),
+        job("two-large", 4, queue="two", age=8),
         job("two-next", queue="two", age=7),
     ]
-    decisions = decide(snapshot([host("a"), host("b")], waiting, held, queues, compute_environments))
-    assert started(decisions) == "two-small:b"
-    assert reason(decisions, "two-large").startswith(
-        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 4 CPUs"
-    )
-    assert reason(decisions, "two-next").startswith("2nd in queue two, behind job two-large (two-larg)")
+    decided = Pass(TWO_HOSTS, waiting, held, queues, APART)
+    assert decided.started == "two-small:b"
+    assert decided.reason("two-large").startswith(f"{CAPACITY} - needs 1 node with 4 CPUs")
+    assert decided.reason("two-next").startswith("2nd in queue two, behind job two-large (two-larg)")
 
 
 def test_a_job_with_several_compute_environments_is_the_head_of_those_that_are_not_kept_yet() -> None:
-    compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     queues = [queue("one", 3, ("p",)), queue("both", 2, ("p", "q")), queue("two", 1, ("q",))]
-    held = [
-        running("cart", on("a", 1), compute_environment="p"),
-        running("ant", on("b", 1), compute_environment="q", timeout=700),
-    ]
-    waiting = [
-        job("one-large", gang(node(4)), queue="one"),
-        job("both-large", gang(node(4)), queue="both"),
-        job("two-small", queue="two"),
-        job("two-short", queue="two", timeout=600),
-    ]
-    decisions = decide(snapshot([host("a"), host("b")], waiting, held, queues, compute_environments))
-    assert started(decisions) == "two-short:b"
-    assert reason(decisions, "two-small") == (
-        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - 1st in queue two, behind job both-large (both-lar), "
-        "which needs 1 node with 4 CPUs, 0 GPUs, 100 MiB in all and starts by 2027-01-15 08:10:00 UTC; "
+    held = [cart(environment="p"), running("ant", on("b", 1), environment="q", timeout=700)]
+    large = [job("one-large", 4, queue="one"), job("both-large", 4, queue="both")]
+    waiting = [*large, job("two-small", queue="two"), job("two-short", queue="two", timeout=600)]
+    decided = Pass(TWO_HOSTS, waiting, held, queues, APART)
+    assert decided.started == "two-short:b"
+    assert decided.reason("two-small") == (
+        f"{CAPACITY} - 1st in queue two, behind job both-large (both-lar), "
+        f"which {needs(4)} and starts by 2027-01-15 08:10:00 UTC; "
         "it would fit now, but on what is kept for that job: with a timeout of at most 600 s it could start"
     )
 
 
 def test_equal_jobs_with_other_timeouts_are_each_judged_by_their_own() -> None:
-    compute_environments = [
-        compute_environment("p", ("a",)),
-        compute_environment("q", ("b",)),
-        compute_environment("r"),
-    ]
     queues = [queue("one", 3, ("p",)), queue("two", 2, ("q",)), queue("any", 1, ("r",))]
     held = [
-        running("cart", on("a", 3), compute_environment="p", timeout=200),  # ends in 100 s
-        running("ant", on("b", 3), compute_environment="q", timeout=300),  # ends in 200 s
+        cart(3, environment="p", timeout=200),  # ends in 100 s
+        running("ant", on("b", 3), environment="q", timeout=300),  # ends in 200 s
     ]
     waiting = [
-        job("one-large", gang(node(4)), queue="one"),
-        job("two-large", gang(node(4)), queue="two"),
+        job("one-large", 4, queue="one"),
+        job("two-large", 4, queue="two"),
         job("endless", queue="any", age=9),
         job("long", queue="any", age=8, timeout=201),
         job("longer", queue="any", age=7, timeout=202),
@@ -251,30 +190,29 @@ def test_equal_jobs_with_other_timeouts_are_each_judged_by_their_own() -> None:
         job("short", queue="any", age=5, timeout=100),
         job("second", queue="any", age=4, timeout=100),
     ]
-    decisions = decide(snapshot([host("a"), host("b")], waiting, held, queues, compute_environments))
-    assert started(decisions) == "middle:b short:a"
+    assert Pass(TWO_HOSTS, waiting, held, queues, [*APART, environment("r")]).started == "middle:b short:a"
 
 
 def test_a_job_of_a_lower_queue_may_use_hosts_that_the_head_of_a_higher_one_can_not() -> None:
-    queues = [queue("high", 2), queue("low", 1)]
-    held = [running("cart", on("a", 2), timeout=700)]
-    waiting = [job("large", gang(node(4)), queue="high"), job("short", queue="low", timeout=600, age=99)]
-    assert started(decide(snapshot([host()], waiting, held, queues))) == "short:a"
+    waiting = [job("large", 4, queue="high"), job("short", queue="low", timeout=600, age=99)]
+    assert Pass([host()], waiting, [cart(2, timeout=700)], [queue("high", 2), queue("low", 1)]).started == "short:a"
 
 
 # -- what is kept for shares that are not active ----------------------------------------------------------------------
 
+HALF = FairShare(600, 50, {})
+
 
 def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_active() -> None:
-    policy = FairShare(600, 50, {})
     waiting = line(*[job(f"j{i}", gang(node(1, 1)), share="s") for i in range(6)])
-    decisions = decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=[queue(policy=policy)]))
-    assert started(decisions) == "j0:a j1:a j2:a j3:a"
-    assert reason(decisions, "j4") == (
-        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 1 CPU, 1 GPU, 100 MiB in all; "
-        "its queue uses 4 of the 4 GPUs that it may use of all: "
+    decided = Pass([host(cpus=8, gpus=8)], waiting, queues=[queue(policy=HALF)])
+    assert decided.started == "j0:a j1:a j2:a j3:a"
+    assert decided.reason("j4") == (
+        f"{CAPACITY} - {needs(1, 1)}; its queue uses 4 of the 4 GPUs that it may use of all: "
         "50% is kept for shares that are not active (1 active share now)"
     )
+    elastic = [job("ant", gang(*[node(1, 1)] * 6, minimum=2), share="s")]
+    assert Pass([host(cpus=8, gpus=8)], elastic, queues=[queue(policy=HALF)]).started == "ant:a+a+a+a"
 
 
 @pytest.mark.parametrize(
@@ -290,35 +228,21 @@ def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_a
 )
 def test_more_active_shares_reduce_the_reservation(usage, extra, free) -> None:  # type: ignore[no-untyped-def]
     waiting = line(*[job(f"j{i}", gang(node(0.1, 1)), share="s") for i in range(9)])
-    queues = [queue(policy=FairShare(600, 50, {}))]
-    decisions = decide(snapshot([host(cpus=8, gpus=8)], waiting, extra, queues, usage=usage))
-    assert len(decisions.starts) == free
+    assert len(Pass([host(cpus=8, gpus=8)], waiting, extra, [queue(policy=HALF)], usage=usage).starts) == free
 
 
 def test_only_use_of_the_queues_own_gangs_counts() -> None:
-    queues = [queue(policy=FairShare(600, 50, {})), queue("other")]
     held = [running("cart", on("a", 1.5), share="s"), running("ant", on("a", 4), queue="other")]
-    waiting = line(job("x", gang(node(2)), share="s"), job("y", gang(node(3)), share="s"), job("z", share="s"))
-    decisions = decide(snapshot([host(cpus=10)], waiting, held, queues))
+    waiting = line(job("x", 2, share="s"), job("y", 3, share="s"), job("z", share="s"))
+    decided = Pass([host(cpus=10)], waiting, held, [queue(policy=HALF), queue("other")])
     # 5 of 10 CPUs may be used, 1.5 are: x makes that 3.5, y does not fit into the rest and holds up nobody, z does
-    assert started(decisions) == "x:a z:a"
-    assert reason(decisions, "y").endswith(
+    assert decided.started == "x:a z:a"
+    assert decided.reason("y").endswith(
         "its queue uses 4.5 of the 5 CPUs that it may use of all: "
         "50% is kept for shares that are not active (1 active share now)"
     )
 
 
-def test_an_elastic_gang_shrinks_to_the_limit_of_its_queue() -> None:
-    waiting = [job("ant", gang(*[node(1, 1)] * 6, minimum=2), share="s")]
-    queues = [queue(policy=FairShare(600, 50, {}))]
-    assert started(decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=queues))) == "ant:a+a+a+a"
-
-
 def test_a_job_may_start_in_the_next_compute_environment_when_the_first_is_reserved() -> None:
-    queues = [queue(compute_environments=("p", "q"), policy=FairShare(600, 50, {}))]
-    compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
-    waiting = line(*[job(f"j{i}", share="s") for i in range(5)])
-    assert (
-        started(decide(snapshot([host("a"), host("b", 2)], waiting, (), queues, compute_environments)))
-        == "j0:a j1:a j2:b"
-    )
+    queues, waiting = [queue(environments=("p", "q"), policy=HALF)], line(*[job(f"j{i}", share="s") for i in range(5)])
+    assert Pass([host("a"), host("b", 2)], waiting, (), queues, APART).started == "j0:a j1:a j2:b"

@@ -85,27 +85,20 @@ def test_each_kind_of_job_has_its_command(kind: str, section: Any, command: list
     assert list(gang_needs(definition(**{kind: section})["nodeProperties"]).nodes[0].command) == command
 
 
-def test_the_user_s_environment_is_carried() -> None:
-    needs = gang_needs(definition(command=["x"], environment={"A": "b c", "EMPTY": ""})["nodeProperties"])
-    assert (needs.nodes[0].environment["A"], needs.nodes[0].environment["EMPTY"]) == ("b c", "")
+def test_the_user_s_environment_is_carried_and_a_job_without_a_timeout_has_none() -> None:
+    made = definition(command=["x"], environment={"A": "b c", "EMPTY": ""})
+    environment = gang_needs(made["nodeProperties"]).nodes[0].environment
+    assert (environment["A"], environment["EMPTY"]) == ("b c", "") and "timeout" not in made
 
 
-def test_a_job_without_a_timeout_has_none() -> None:
-    assert "timeout" not in definition(command=["x"])
-
-
-def test_a_submission_names_job_queue_and_definition() -> None:
+def test_a_submission_names_job_queue_and_definition_and_its_variables_are_added_on_every_node() -> None:
     spec = validate({"name": "ant", "queue": "gpu", "command": ["x"]}, "s")
-    assert compile_submission(spec, "arn:1") == {"jobName": "ant", "jobQueue": "gpu", "jobDefinition": "arn:1"}
-
-
-def test_variables_of_a_submission_are_added_on_every_node() -> None:
-    spec = validate({"name": "ant", "command": ["x"]}, "s")
-    [override] = compile_submission(spec, "arn:1", {"MUSTER_RUN": "old"})["nodeOverrides"]["nodePropertyOverrides"]
-    assert override == {
-        "targetNodes": "0:",
-        "containerOverrides": {"environment": [{"name": "MUSTER_RUN", "value": "old"}]},
-    }
+    named = {"jobName": "ant", "jobQueue": "gpu", "jobDefinition": "arn:1"}
+    assert compile_submission(spec, "arn:1") == named
+    added = {"environment": [{"name": "MUSTER_RUN", "value": "old"}]}
+    overrides = [{"targetNodes": "0:", "containerOverrides": added}]
+    told = compile_submission(spec, "arn:1", {"MUSTER_RUN": "old"})
+    assert told["nodeOverrides"]["nodePropertyOverrides"] == overrides
 
 
 def test_aws_s_own_model_of_the_api_accepts_both_requests() -> None:
@@ -124,20 +117,11 @@ def test_aws_s_own_model_of_the_api_accepts_both_requests() -> None:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "nodes"),
-    [
-        ("0:", [0, 1, 2, 3]),
-        (":", [0, 1, 2, 3]),
-        (":1", [0, 1]),
-        ("1:2", [1, 2]),
-        ("3", [3]),
-        ("2:", [2, 3]),
-        ("5:", []),
-    ],
-)
-def test_target_nodes_are_read_as_aws_reads_them(text: str, nodes: list[int]) -> None:
-    assert list(target_nodes(text, 4)) == nodes
+TARGETS = {"0:": [0, 1, 2, 3], ":": [0, 1, 2, 3], ":1": [0, 1], "1:2": [1, 2], "3": [3], "2:": [2, 3], "5:": []}
+
+
+def test_target_nodes_are_read_as_aws_reads_them() -> None:
+    assert {text: list(target_nodes(text, 4)) for text in TARGETS} == TARGETS
 
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "1-2", "0:1:2", "1:b", " 1", "1.5"])
@@ -153,13 +137,9 @@ def test_of_nested_ranges_the_inner_one_counts_in_whatever_order_they_come() -> 
         assert commands == [("outer",), ("inner",), ("x",), ("outer",)]
 
 
-def test_of_two_equal_ranges_the_later_one_counts() -> None:
-    ranges = [("0:", container(command=["first"])), ("0:3", container(command=["second"]))]
+def test_of_two_equal_ranges_the_later_one_counts_and_one_may_exceed_the_existing_nodes() -> None:
+    ranges = [("0:", container(command=["first"])), ("0:9", container(command=["second"]))]
     assert {node.command for node in gang_needs(properties(*ranges)).nodes} == {("second",)}
-
-
-def test_a_range_may_exceed_the_existing_nodes() -> None:
-    assert len(gang_needs(properties(("0:9", container()), count=2)).nodes) == 2
 
 
 def test_nodes_without_a_range_are_named() -> None:
@@ -170,13 +150,13 @@ def test_nodes_without_a_range_are_named() -> None:
 def test_resources_are_read_from_requirements_or_from_the_older_fields() -> None:
     newer = [{"type": kind, "value": value} for kind, value in (("VCPU", "0.5"), ("MEMORY", "2048"), ("GPU", "2"))]
     ranges = [("0", container(resourceRequirements=newer)), ("1", container(vcpus=3, memory=512)), ("2:", container())]
-    nodes = gang_needs(properties(*ranges)).nodes
-    assert [node.resources for node in nodes[:3]] == [Resources(0.5, 2, 2048), Resources(3, 0, 512), Resources(1, 0, 4)]
-
-
-def test_a_job_from_the_batch_api_behaves_as_on_aws() -> None:
-    needs = gang_needs(properties(("0:", container())))
-    assert (needs.minimum, needs.options, needs.spec) == (4, NativeOptions(), None)
+    needs = gang_needs(properties(*ranges))
+    assert (needs.minimum, needs.options, needs.spec) == (4, NativeOptions(), None), "as on AWS"
+    assert [node.resources for node in needs.nodes[:3]] == [
+        Resources(0.5, 2, 2048),
+        Resources(3, 0, 512),
+        Resources(1, 0, 4),
+    ]
 
 
 def test_settings_are_those_of_the_main_node() -> None:
@@ -199,8 +179,7 @@ def test_a_gang_may_start_smaller_but_never_without_its_main_node(minimum: str, 
 def test_a_gang_needs_the_resources_of_its_spec(low: int, more: int, cpus: float, gpus: int, memory: int) -> None:
     cpus = round(cpus, 2)
     resources = {"cpus": cpus, "gpus": gpus, "memory": memory}
-    needs = gang_needs(
-        definition(command=["x"], nodes={"min": low, "max": low + more}, resources=resources)["nodeProperties"]
-    )
+    made = definition(command=["x"], nodes={"min": low, "max": low + more}, resources=resources)
+    needs = gang_needs(made["nodeProperties"])
     assert (needs.main, needs.minimum, len(needs.nodes)) == (0, low, low + more)
     assert {node.resources for node in needs.nodes} == {Resources(cpus, gpus, memory)}

@@ -25,18 +25,15 @@ def test_a_race_is_driven_by_the_league_s_rules_on_one_node_like_those_of_the_tr
     assert (spec.name, spec.kind, spec.queue, spec.nodes.max) == ("race-grand-prix-fast-3", "race", "lab", 1)
     assert (spec.resources.cpus, spec.resources.gpus, spec.environment) == (2, 1, {"LEVEL": "1"})
     assert spec.race is not None and spec.race.model_dump() == {
-        "run": "racer-1",
-        "checkpoint": 9,
-        "trials": 5,
-        "continuous": True,
-        "off_track_penalty": 2.0,
-        "crash_penalty": 1.0,
-        "max_resets": 4,
-        "seconds": 60.0,
-        "track": ["oval", "hills"],
-        "seed": 7,
-        "config": CAR,
-        "keep": True,
+        **{"run": "racer-1", "checkpoint": 9, "trials": 5, "continuous": True, "off_track_penalty": 2.0, "keep": True},
+        **{
+            "crash_penalty": 1.0,
+            "max_resets": 4,
+            "seconds": 60.0,
+            "track": ["oval", "hills"],
+            "seed": 7,
+            "config": CAR,
+        },
     }
 
 

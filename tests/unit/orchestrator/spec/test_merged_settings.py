@@ -12,45 +12,21 @@ import pytest
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.file import load
 
-WRONG = [
-    ("Ant", "ppo", "learning_rate_limits: [0.1, 0.001]", "learning_rate_limits: expected the least, then the greatest"),
-    ("Ant", "ppo", "weight_decay: 0.1", "weight_decay: adam has none; set optimizer: adamw"),
-    (
-        "CartpolePixels",
-        "ppo",
-        "channels: [8, 8]",
-        "channels, kernel_sizes and strides: give one number of each for every convolution",
-    ),
-    ("Ant", "sac", "updates: 3", "updates: expected a multiple of policy_delay (2), got 3"),
+WRONG = {
+    "Ant ppo learning_rate_limits: [0.1, 0.001]": "learning_rate_limits: expected the least, then the greatest",
+    "Ant ppo weight_decay: 0.1": "weight_decay: adam has none; set optimizer: adamw",
+    "CartpolePixels ppo channels: [8, 8]": "channels, kernel_sizes and strides: give one number of each for every convolution",
+    "Ant sac updates: 3": "updates: expected a multiple of policy_delay (2), got 3",
     # the task's own 8 updates
-    ("Cartpole", "sac", "policy_delay: 3", "updates: expected a multiple of policy_delay (3), got 8"),
-    ("Cartpole", "sac", "v_min: 9.0", "v_min: expected less than v_max (5), got 9"),
-    (
-        "CartpolePixels",
-        "sac",
-        "updates: 8",
-        "it can't learn from images, and observation group 'policy' is one; use ppo",
-    ),
-    (
-        "Ant",
-        "sac",
-        "critic_group: critics",
-        "critic_group: there is no observation group 'critics'; there are policy, critic",
-    ),
-    (
-        "Ant",
-        "rsl_rl",
-        "obs_groups: {critic: [critics]}",
-        "obs_groups: critic: there is no observation group 'critics'; there are policy, critic",
-    ),
-    (
-        "Ant",
-        "rsl_rl",
-        "algorithm: {class_name: Distillation}",
-        "teacher_checkpoint: name the run that trained the teacher",
-    ),
-    ("Ant", "rsl_rl", "teacher_checkpoint: taught@3", "teacher_checkpoint: PPO has no teacher; leave it out"),
-]
+    "Cartpole sac policy_delay: 3": "updates: expected a multiple of policy_delay (3), got 8",
+    "Cartpole sac v_min: 9.0": "v_min: expected less than v_max (5), got 9",
+    "CartpolePixels sac updates: 8": "it can't learn from images, and observation group 'policy' is one; use ppo",
+    "Ant sac critic_group: critics": "critic_group: there is no observation group 'critics'; there are policy, critic",
+    "Ant rsl_rl obs_groups: {critic: [critics]}": "obs_groups: critic: there is no observation group 'critics'; there are policy, critic",
+    "Ant rsl_rl algorithm: {class_name: Distillation}": "teacher_checkpoint: name the run that trained the teacher",
+    "Ant rsl_rl teacher_checkpoint: taught@3": "teacher_checkpoint: PPO has no teacher; leave it out",
+}
+"""Task, algorithm and settings: what is said of them."""
 
 
 def job(path: Path, task: str, algorithm: str, settings: str) -> str:
@@ -62,10 +38,9 @@ def job(path: Path, task: str, algorithm: str, settings: str) -> str:
     return str(file)
 
 
-@pytest.mark.parametrize(("task", "algorithm", "settings", "said"), WRONG)
-def test_rules_over_several_settings_are_refused_with_file_line_and_key(
-    tmp_path: Path, task: str, algorithm: str, settings: str, said: str
-) -> None:
+@pytest.mark.parametrize("case", WRONG)
+def test_rules_over_several_settings_are_refused_with_file_line_and_key(tmp_path: Path, case: str) -> None:
+    (task, algorithm, settings), said = case.split(" ", 2), WRONG[case]
     path = job(tmp_path, task, algorithm, settings)
     with pytest.raises(SpecError) as refused:
         load(path)
@@ -76,18 +51,14 @@ def test_rules_over_several_settings_are_refused_with_file_line_and_key(
 
 def test_settings_of_the_job_override_those_of_the_task(tmp_path: Path) -> None:
     for task, algorithm, settings in (
-        ("Cartpole", "sac", "{policy_delay: 3, updates: 9}"),
-        ("CartpolePixels", "ppo", "{channels: [8], kernel_sizes: [3], strides: [1]}"),
-        ("Ant", "ppo", "{weight_decay: 0.1, optimizer: adamw}"),
-        ("Ant", "rsl_rl", "{algorithm: {class_name: Distillation}, teacher_checkpoint: taught}"),
-        ("Ant", "rsl_rl", "{algorithm: {class_name: 'my_module:MyDistillation'}, teacher_checkpoint: taught}"),
-        ("Ant", "rsl_rl", "{algorithm: {class_name: 'my_module:MyDistillation'}}"),
+        ("Cartpole", "sac", "policy_delay: 3, updates: 9"),
+        ("CartpolePixels", "ppo", "channels: [8], kernel_sizes: [3], strides: [1]"),
+        ("Ant", "ppo", "weight_decay: 0.1, optimizer: adamw"),
+        ("Ant", "rsl_rl", "algorithm: {class_name: Distillation}, teacher_checkpoint: taught"),
+        ("Ant", "rsl_rl", "algorithm: {class_name: 'my_module:MyDistillation'}, teacher_checkpoint: taught"),
+        ("Ant", "rsl_rl", "algorithm: {class_name: 'my_module:MyDistillation'}"),
     ):
-        file = tmp_path / "job.yaml"
-        file.write_text(
-            f"name: a\ntrain: {{task: {task}, worlds: 4, iterations: 2, algorithm: {algorithm}, {algorithm}: {settings}}}\n"
-        )
-        load(str(file))
+        load(job(tmp_path, task, algorithm, f"{{{settings}}}"))
 
 
 def test_an_unknown_task_is_left_to_its_rank(tmp_path: Path) -> None:
@@ -96,21 +67,22 @@ def test_an_unknown_task_is_left_to_its_rank(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "settings", "said"),
+    ("algorithm", "settings", "key", "found"),
     [
-        ("rsl_rl", "algorithm: {max_grad_norm: .inf}", "8: train.rsl_rl.algorithm.max_grad_norm: "),
-        ("rsl_rl", "actor: {hidden_dims: [8, -.inf]}", "8: train.rsl_rl.actor.hidden_dims.1: "),
-        ("sac", "v_max: .inf", "8: train.sac.v_max: "),
+        ("rsl_rl", "algorithm: {max_grad_norm: .inf}", "algorithm.max_grad_norm", "inf"),
+        ("rsl_rl", "actor: {hidden_dims: [8, -.inf]}", "actor.hidden_dims.1", "-inf"),
+        ("sac", "v_max: .inf", "v_max", "inf"),
     ],
 )
 def test_a_number_that_json_does_not_have_is_refused_wherever_it_stands(
-    tmp_path: Path, algorithm: str, settings: str, said: str
+    tmp_path: Path, algorithm: str, settings: str, key: str, found: str
 ) -> None:
     path = job(tmp_path, "Ant", algorithm, settings)
     with pytest.raises(SpecError) as refused:
         load(path)
-    found = "-inf" if "-.inf" in settings else "inf"
-    assert str(refused.value) == f"{path}:{said}expected a finite number, found a number ({found})"
+    assert (
+        str(refused.value) == f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
+    )
 
 
 def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) -> None:

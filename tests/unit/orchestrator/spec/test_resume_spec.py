@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import yaml
 from pydantic import BaseModel
 
 from orchestrator.api.errors import ClientError
@@ -24,13 +25,10 @@ from tests.support.orchestrator.trained import add_checkpoint, add_run
 
 RUN = Run(Path("/store/runs/ant"))
 TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
+OTHERS = ("evaluate", "race", "export", "record", "render")
 KINDS: dict[str, dict[str, Any]] = {
     "train": {"train": TRAIN},
-    "evaluate": {"evaluate": {"run": "other"}},
-    "race": {"race": {"run": "other"}},
-    "export": {"export": {"run": "other"}},
-    "record": {"record": {"run": "other"}},
-    "render": {"render": {"run": "other"}},
+    **{kind: {kind: {"run": "other"}} for kind in OTHERS},
     "command": {"command": ["true"]},
 }
 
@@ -44,19 +42,15 @@ def container(definition: dict[str, Any]) -> dict[str, Any]:
 
 
 def variable(name: str) -> Place:
-    return lambda definition, _: next(
-        (each["value"] for each in container(definition)["environment"] if each["name"] == name), None
-    )
+    return lambda definition, _: {e["name"]: e["value"] for e in container(definition)["environment"]}.get(name)
 
 
 def resource(kind: str) -> Place:
-    return lambda definition, _: next(
-        (each["value"] for each in container(definition)["resourceRequirements"] if each["type"] == kind), None
-    )
+    return lambda definition, _: {e["type"]: e["value"] for e in container(definition)["resourceRequirements"]}[kind]
 
 
 def carried(key: str) -> Place:
-    """In the spec that the rank reads; tests of the worker show what it does with it."""
+    """In the spec that the rank reads."""
     return lambda definition, _: setting_at(json.loads(variable("MUSTER_SPEC")(definition, {})), key)
 
 
@@ -71,69 +65,9 @@ APPLIED: dict[str, tuple[str, Any, Place]] = {
     "resources.cpus": ("2.5", "2.5", resource("VCPU")),
     "resources.gpus": ("2", "2", variable("MUSTER_RANKS_PER_NODE")),
     "resources.memory": ("2GiB", "2048", resource("MEMORY")),
-    "secrets": ("{KEY: name}", {"KEY": "name"}, carried("secrets")),
-    "track.wandb.project": ("a", "a", carried("track.wandb.project")),
-    "track.wandb.entity": ("a", "a", carried("track.wandb.entity")),
-    "track.wandb.group": ("a", "a", carried("track.wandb.group")),
-    "track.wandb.tags": ("[a]", ["a"], carried("track.wandb.tags")),
-    "track.wandb.mode": ("offline", "offline", carried("track.wandb.mode")),
-    "track.mlflow.uri": ("sqlite:///a", "sqlite:///a", carried("track.mlflow.uri")),
-    "track.mlflow.experiment": ("a", "a", carried("track.mlflow.experiment")),
-    "track.mlflow.tags": ("{a: b}", {"a": "b"}, carried("track.mlflow.tags")),
-    "train.iterations": ("9", 9, carried("train.iterations")),
-    "evaluate.run": ("ant", "ant", carried("evaluate.run")),
-    "evaluate.checkpoint": ("3", 3, carried("evaluate.checkpoint")),
-    "evaluate.episodes": ("3", 3, carried("evaluate.episodes")),
-    "evaluate.worlds": ("3", 3, carried("evaluate.worlds")),
-    "evaluate.seed": ("3", 3, carried("evaluate.seed")),
-    "evaluate.config": ("{x: 1}", {"x": 1}, carried("evaluate.config")),
-    "evaluate.keep": ("false", False, carried("evaluate.keep")),
-    "race.run": ("ant", "ant", carried("race.run")),
-    "race.checkpoint": ("3", 3, carried("race.checkpoint")),
-    "race.trials": ("5", 5, carried("race.trials")),
-    "race.continuous": ("true", True, carried("race.continuous")),
-    "race.off_track_penalty": ("5.0", 5.0, carried("race.off_track_penalty")),
-    "race.crash_penalty": ("5.0", 5.0, carried("race.crash_penalty")),
-    "race.max_resets": ("3", 3, carried("race.max_resets")),
-    "race.seconds": ("60.0", 60.0, carried("race.seconds")),
-    "race.track": ("chicane", "chicane", carried("race.track")),
-    "race.seed": ("3", 3, carried("race.seed")),
-    "race.config": ("{x: 1}", {"x": 1}, carried("race.config")),
-    "race.keep": ("false", False, carried("race.keep")),
-    "evaluation.every": ("{every: 3}", 3, carried("evaluation.every")),
-    "evaluation.episodes": ("{every: 3, episodes: 7}", 7, carried("evaluation.episodes")),
-    "evaluation.worlds": ("{every: 3, worlds: 7}", 7, carried("evaluation.worlds")),
-    "evaluation.queue": ("{every: 3, queue: idle}", "idle", carried("evaluation.queue")),
-    "evaluation.share": ("{every: 3, share: mine}", "mine", carried("evaluation.share")),
-    "evaluation.resources.cpus": ("{every: 3, resources: {cpus: 2.5}}", 2.5, carried("evaluation.resources.cpus")),
-    "evaluation.resources.gpus": ("{every: 3, resources: {gpus: 1}}", 1, carried("evaluation.resources.gpus")),
-    "evaluation.resources.memory": (
-        "{every: 3, resources: {memory: 2GiB}}",
-        2048,
-        carried("evaluation.resources.memory"),
-    ),
-    "evaluation.retry.attempts": ("{every: 3, retry: {attempts: 2}}", 2, carried("evaluation.retry.attempts")),
-    "export.run": ("ant", "ant", carried("export.run")),
-    "export.checkpoint": ("3", 3, carried("export.checkpoint")),
-    "export.episodes": ("3", 3, carried("export.episodes")),
-    "export.worlds": ("3", 3, carried("export.worlds")),
-    "record.run": ("ant", "ant", carried("record.run")),
-    "record.checkpoint": ("3", 3, carried("record.checkpoint")),
-    "record.worlds": ("3", 3, carried("record.worlds")),
-    "record.episodes": ("3", 3, carried("record.episodes")),
-    "record.seed": ("3", 3, carried("record.seed")),
-    "render.run": ("ant", "ant", carried("render.run")),
-    "render.checkpoint": ("3", 3, carried("render.checkpoint")),
-    "render.format": ("png", "png", carried("render.format")),
-    "render.worlds": ("3", 3, carried("render.worlds")),
-    "render.seconds": ("2.5", 2.5, carried("render.seconds")),
-    "render.width": ("128", 128, carried("render.width")),
-    "render.height": ("128", 128, carried("render.height")),
     "command": ("[echo, hello]", ["echo", "hello"], lambda definition, _: container(definition)["command"]),
     "environment": ("{COLOUR: red}", "red", variable("COLOUR")),
     "image": ("mine:2", "mine:2", lambda definition, _: container(definition)["image"]),
-    "checkpoint.every": ("auto", "auto", carried("checkpoint.every")),
-    "checkpoint.keep": ("3", 3, carried("checkpoint.keep")),
     "logs.limit": ("2MiB", str(2 << 20), variable("MUSTER_LOG_LIMIT")),
     "retry.attempts": ("7", 7, lambda definition, _: definition["retryStrategy"]["attempts"]),
     "on_child_failure": ("fail", "fail", variable("MUSTER_ON_CHILD_FAILURE")),
@@ -141,11 +75,29 @@ APPLIED: dict[str, tuple[str, Any, Place]] = {
     "stall_timeout": ("10m", "600", variable("MUSTER_STALL_TIMEOUT")),
 }
 """Of each key that may change: another value as ``--set`` has it, what becomes of it, and where the job has that."""
+CARRIED: dict[str, Any] = yaml.safe_load("""
+secrets: {KEY: name}
+track:
+  wandb: {project: a, entity: a, group: a, tags: [a], mode: offline}
+  mlflow: {uri: 'sqlite:///a', experiment: a, tags: {a: b}}
+train: {iterations: 9}
+evaluate: {run: ant, checkpoint: 3, episodes: 3, worlds: 3, seed: 3, config: {x: 1}, keep: false}
+race:
+  {run: ant, checkpoint: 3, trials: 5, continuous: true, off_track_penalty: 5.0, crash_penalty: 5.0, max_resets: 3,
+   seconds: 60.0, track: chicane, seed: 3, config: {x: 1}, keep: false}
+export: {run: ant, checkpoint: 3, episodes: 3, worlds: 3}
+record: {run: ant, checkpoint: 3, worlds: 3, episodes: 3, seed: 3}
+render: {run: ant, checkpoint: 3, format: png, worlds: 3, seconds: 2.5, width: 128, height: 128}
+checkpoint: {every: auto, keep: 3}
+evaluation:
+  {every: 3, episodes: 7, worlds: 7, queue: idle, share: mine, resources: {cpus: 2.5, gpus: 1, memory: 2048}, retry: {attempts: 2}}
+""")
+"""Other values of keys that the rank reads in the spec as they are given; tests of the worker show what it does with them."""
 REFUSED = {
     "train.task": "Cartpole",
     "train.seed": "7",
     "train.algorithm": "sac",
-    "train.config": "{rewards: {forward: 2.0}}",
+    "train.config": "{rewards: {up: 2.0}}",
 }
 """Of each key that can't change: another value."""
 ELSEWHERE = {"train.worlds", "train.settings", "train.hyperparameters"}
@@ -167,6 +119,10 @@ def keys_of(model: type[BaseModel], path: str = "") -> Iterator[str]:
             yield f"{path}{name}"
 
 
+def carried_keys() -> list[str]:
+    return [key for key in keys_of(Spec) if setting_at(CARRIED, key) is not None]
+
+
 def kind_of(key: str) -> str:
     first = key.partition(".")[0]
     return first if first in KINDS else "train"
@@ -186,13 +142,14 @@ def requests_of(spec: Spec) -> tuple[dict[str, Any], dict[str, Any]]:
 def test_every_key_of_the_spec_is_in_one_of_the_tables() -> None:
     algorithms = {f"train.{name}.{field}" for name, kind in ALGORITHMS.items() for field in kind.__pydantic_fields__}
     assert len(algorithms) > 50
-    assert set(keys_of(Spec)) == {*APPLIED, *REFUSED, *ELSEWHERE, *algorithms}
+    assert set(keys_of(Spec)) == {*APPLIED, *carried_keys(), *REFUSED, *ELSEWHERE, *algorithms}
 
 
-@pytest.mark.parametrize("key", APPLIED)
+@pytest.mark.parametrize("key", [*APPLIED, *carried_keys()])
 def test_a_key_that_is_accepted_is_in_the_job_that_goes_on(key: str) -> None:
-    text, expected, place = APPLIED[key]
     named = next((section for section in ("nodes", "evaluation") if key.startswith(f"{section}.")), key)
+    given = json.dumps(setting_at(CARRIED, named))
+    text, expected, place = APPLIED.get(key) or (given, setting_at(CARRIED, key), carried(key))
     before, after = changed(kind_of(key), f"{named}={text}")
     _check_changes(RUN, before, after)
     assert place(*requests_of(before)) != expected and place(*requests_of(after)) == expected
@@ -250,16 +207,13 @@ def test_each_setting_of_an_algorithm_is_carried_to_the_rank_or_refused_by_name(
             assert carried(f"train.{name}.{item.name}")(*requests_of(after)) is not None
 
 
-VALUES = {
+VALUES: dict[str, Any] = {
     "num_outputs": 5,
     "predictor_hidden_dims": [9],
     "target_hidden_dims": [9],
     "activation": "tanh",
-    "state_normalization": "true",
-    "reward_normalization": "true",
-    "learning_rate": 0.5,
-    "optimizer": "sgd",
 }
+VALUES |= {"state_normalization": "true", "reward_normalization": "true", "learning_rate": 0.5, "optimizer": "sgd"}
 """Another one, where a text is none."""
 
 
@@ -273,14 +227,13 @@ def test_a_fixed_setting_inside_a_section_is_refused_by_its_full_name(key: str) 
         _check_changes(RUN, before, after)
 
 
-RATES = [("ppo", "learning_rate"), ("rsl_rl", "algorithm.learning_rate")]
+RATES = {"ppo": "learning_rate", "rsl_rl": "algorithm.learning_rate"}
 FORMS = {
-    "ppo": ["train.ppo.learning_rate=0.001", "train.ppo={learning_rate: 0.001}"],
-    "rsl_rl": [
-        "train.rsl_rl.algorithm.learning_rate=0.001",
-        "train.rsl_rl.algorithm={learning_rate: 0.001}",
-        "train.rsl_rl={algorithm: {learning_rate: 0.001}}",
-    ],
+    "train.ppo.learning_rate=0.001": "ppo",
+    "train.ppo={learning_rate: 0.001}": "ppo",
+    "train.rsl_rl.algorithm.learning_rate=0.001": "rsl_rl",
+    "train.rsl_rl.algorithm={learning_rate: 0.001}": "rsl_rl",
+    "train.rsl_rl={algorithm: {learning_rate: 0.001}}": "rsl_rl",
 }
 """How ``--set`` may give the rate of each algorithm that adapts it."""
 
@@ -293,11 +246,12 @@ def saved_with(path: Path, rate: float, name: str, *assignments: str) -> Checkpo
     return add_checkpoint(store, "ant", 1, algorithm=name, train=train, learning_rate=rate)
 
 
-@pytest.mark.parametrize(("name", "form"), [(name, form) for name in FORMS for form in FORMS[name]])
+@pytest.mark.parametrize("form", FORMS)
 def test_a_learning_rate_that_would_have_no_effect_is_refused_in_whatever_form_it_is_given(
-    tmp_path: Path, name: str, form: str
+    tmp_path: Path, form: str
 ) -> None:
-    key = dict(RATES)[name]
+    name = FORMS[form]
+    key = RATES[name]
     chosen = saved_with(tmp_path, 0.0004, name, f"train.{name}.{key}=0.001")
     after = changed("train", form, algorithm=name)[1]
     with pytest.raises(ClientError) as refused:
@@ -309,7 +263,7 @@ def test_a_learning_rate_that_would_have_no_effect_is_refused_in_whatever_form_i
     _check_rate(RUN, chosen, after, ["train.iterations=9"])
 
 
-@pytest.mark.parametrize(("name", "key"), RATES)
+@pytest.mark.parametrize(("name", "key"), RATES.items())
 def test_a_learning_rate_that_takes_effect_or_is_in_effect_is_accepted(tmp_path: Path, name: str, key: str) -> None:
     form = f"train.{name}.{key}=0.001"
     after = changed("train", form, algorithm=name)[1]
@@ -323,7 +277,6 @@ def test_two_options_for_the_same_setting_are_refused() -> None:
     assert Changes(assignments=("train.iterations=3",), nodes=4).all() == ["train.iterations=3", "nodes=4"]
     assert Changes(assignments=("nodes=2",)).all() == ["nodes=2"]
     for assignment in ("nodes=2", "nodes.max=2"):
-        with pytest.raises(
-            ClientError, match=rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
-        ):
+        said = rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
+        with pytest.raises(ClientError, match=said):
             Changes(assignments=(assignment,), nodes=4).all()

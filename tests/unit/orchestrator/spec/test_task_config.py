@@ -24,74 +24,58 @@ from worker.tasks import find_task
 from worker.tasks.overrides import configured
 
 TWO_FACTORS = "expected [least, greatest], two factors"
-WRONG = [
+WRONG = {
     # misspelt
-    ("Ant", "fall_hight: 0.3", "fall_hight: AntConfig has no such key; did you mean fall_height?"),
-    ("Ant", "randomize: {mas: [1, 2]}", "randomize.mas: Randomization has no such key; did you mean mass?"),
-    ("Ant", "rewards: {foward: 1.0}", "rewards.foward: AntConfig has no term 'foward'; did you mean forward?"),
-    (
-        "Cartpole",
-        "rewards: {xyz: 1.0}",
-        "rewards.xyz: CartpoleConfig has no term 'xyz'; there are alive, angle, position",
-    ),
-    ("CartpolePixels", "camera: {witdh: 32}", "camera.witdh: CameraConfig has no such key; did you mean width?"),
+    "Ant fall_hight: 0.3": "fall_hight: AntConfig has no such key; did you mean fall_height?",
+    "Ant randomize: {mas: [1, 2]}": "randomize.mas: Randomization has no such key; did you mean mass?",
+    "Ant rewards: {foward: 1.0}": "rewards.foward: AntConfig has no term 'foward'; did you mean forward?",
+    "Cartpole rewards: {xyz: 1.0}": "rewards.xyz: CartpoleConfig has no term 'xyz'; there are alive, angle, position",
+    "CartpolePixels camera: {witdh: 32}": "camera.witdh: CameraConfig has no such key; did you mean width?",
     # another type
-    ("Ant", "fall_height: low", "fall_height: expected a number, found a text ('low')"),
-    ("Ant", "fall_height: 3e-1", "fall_height: expected a number, found a text ('3e-1'); in YAML it is written 3.0e-1"),
-    ("Ant", "fall_height: true", "fall_height: expected a number, found true or false (True)"),
-    ("Ant", "fall_height: null", "fall_height: expected a number, found nothing"),
-    ("Quadruped", "substeps: 1.5", "substeps: expected a whole number, found a number (1.5)"),
-    ("Ant", "rewards: [1.0]", "rewards: expected a mapping, found a list"),
-    ("Ant", "rewards: {up: 1, fall: high}", "rewards.fall: expected a number, found a text ('high')"),
-    ("Ant", "randomize: 3", "randomize: expected a mapping, found a whole number (3)"),
+    "Ant fall_height: low": "fall_height: expected a number, found a text ('low')",
+    "Ant fall_height: 3e-1": "fall_height: expected a number, found a text ('3e-1'); in YAML it is written 3.0e-1",
+    "Ant fall_height: true": "fall_height: expected a number, found true or false (True)",
+    "Ant fall_height: null": "fall_height: expected a number, found nothing",
+    "Quadruped substeps: 1.5": "substeps: expected a whole number, found a number (1.5)",
+    "Ant rewards: [1.0]": "rewards: expected a mapping, found a list",
+    "Ant rewards: {up: 1, fall: high}": "rewards.fall: expected a number, found a text ('high')",
+    "Ant randomize: 3": "randomize: expected a mapping, found a whole number (3)",
     # out of range
-    ("Ant", "control_hz: 0", "control_hz: expected a value greater than 0, found 0"),
-    ("Cartpole", "substeps: 0", "substeps: expected a value greater than or equal to 1, found 0"),
-    ("Humanoid", "nan_limit: -0.5", "nan_limit: expected a value greater than or equal to 0, found -0.5"),
-    ("Quadruped", "command_turn: [1, -1]", "command_turn: expected [least, greatest], found [1, -1]"),
-    ("Quadruped", "command_stand: 2", "command_stand: expected a value less than or equal to 1, found 2"),
-    ("Ant", "randomize: {mass: [0, 1]}", f"randomize.mass: {TWO_FACTORS} above 0, found [0, 1]"),
-    ("Ant", "randomize: {gravity: [1]}", f"randomize.gravity: {TWO_FACTORS} of 0 or more, found [1]"),
-    ("CartpolePixels", "camera: {samples: 65}", "camera.samples: expected a value less than or equal to 64, found 65"),
-    ("CartpolePixels", "camera: {target: [0, 1]}", "camera.target: expected [x, y, z], found [0, 1]"),
+    "Ant control_hz: 0": "control_hz: expected a value greater than 0, found 0",
+    "Cartpole substeps: 0": "substeps: expected a value greater than or equal to 1, found 0",
+    "Humanoid nan_limit: -0.5": "nan_limit: expected a value greater than or equal to 0, found -0.5",
+    "Quadruped command_turn: [1, -1]": "command_turn: expected [least, greatest], found [1, -1]",
+    "Quadruped command_stand: 2": "command_stand: expected a value less than or equal to 1, found 2",
+    "Ant randomize: {mass: [0, 1]}": f"randomize.mass: {TWO_FACTORS} above 0, found [0, 1]",
+    "Ant randomize: {gravity: [1]}": f"randomize.gravity: {TWO_FACTORS} of 0 or more, found [1]",
+    "CartpolePixels camera: {samples: 65}": "camera.samples: expected a value less than or equal to 64, found 65",
+    "CartpolePixels camera: {target: [0, 1]}": "camera.target: expected [x, y, z], found [0, 1]",
     # a curriculum
-    ("Ant", "curriculum: {forwrd: [[0, 1]]}", "curriculum.forwrd: there is no such term; did you mean forward?"),
-    ("Ant", "curriculum: {forward: 3}", "curriculum.forward: expected points [iteration, value], found 3"),
-    ("Ant", "curriculum: {forward: []}", "curriculum.forward: expected points [iteration, value], found []"),
-    ("Ant", "curriculum: {level: [[0, 2]]}", "curriculum.level: expected levels from 0 to 1, found [[0, 2]]"),
-    (
-        "Ant",
-        "curriculum: {up: [[5, 1], [2, 1]]}",
-        "curriculum.up: the iterations of its points must grow, found [[5, 1], [2, 1]]",
-    ),
+    "Ant curriculum: {forwrd: [[0, 1]]}": "curriculum.forwrd: there is no such term; did you mean forward?",
+    "Ant curriculum: {forward: 3}": "curriculum.forward: expected points [iteration, value], found 3",
+    "Ant curriculum: {forward: []}": "curriculum.forward: expected points [iteration, value], found []",
+    "Ant curriculum: {level: [[0, 2]]}": "curriculum.level: expected levels from 0 to 1, found [[0, 2]]",
+    "Ant curriculum: {up: [[5, 1], [2, 1]]}": "curriculum.up: the iterations of its points must grow, found [[5, 1], [2, 1]]",
     # several fields together
-    ("Ant", "randomize: {push_interval: 2}", "randomize: push_interval and push_velocity: give both, or none"),
-    ("Ant", "randomize: {colors: 0.1}", "randomize.colors: AntConfig has no camera that would see it"),
-    (
-        "CartpolePixels",
-        "randomize: {observation_noise: 0.1}",
-        "randomize.observation_noise: it is for numbers, not for images; use light and colors",
-    ),
-    (
-        "CartpolePixels",
-        "camera: {target: [0, -3.2, 1.4]}",
-        "camera.target: the camera stands there, at [0.0, -3.2, 1.4]; choose another point",
-    ),
+    "Ant randomize: {push_interval: 2}": "randomize: push_interval and push_velocity: give both, or none",
+    "Ant randomize: {colors: 0.1}": "randomize.colors: AntConfig has no camera that would see it",
+    "CartpolePixels randomize: {observation_noise: 0.1}": "randomize.observation_noise: it is for numbers, not for images; use light and colors",
+    "CartpolePixels camera: {target: [0, -3.2, 1.4]}": "camera.target: the camera stands there, at [0.0, -3.2, 1.4]; choose another point",
     # how it is trained
-    ("Ant", "ppo: {steps: 8}", "ppo: not a key of AntConfig; settings of ppo stand under train.ppo"),
-    ("Ant", "sac: {steps: 8}", "sac: not a key of AntConfig; settings of sac stand under train.sac"),
-]
+    "Ant ppo: {steps: 8}": "ppo: not a key of AntConfig; settings of ppo stand under train.ppo",
+    "Ant sac: {steps: 8}": "sac: not a key of AntConfig; settings of sac stand under train.sac",
+}
+"""Task and configuration: what is said of it."""
 
 
-@pytest.mark.parametrize(("task", "config", "said"), WRONG)
-def test_the_submission_and_the_rank_refuse_the_same_in_the_same_words(
-    tmp_path: Path, task: str, config: str, said: str
-) -> None:
+@pytest.mark.parametrize("case", WRONG)
+def test_the_submission_and_the_rank_refuse_the_same_in_the_same_words(tmp_path: Path, case: str) -> None:
+    task, config = case.split(" ", 1)
     path = tmp_path / "job.yaml"
     path.write_text(f"name: a\ntrain:\n  task: {task}\n  worlds: 4\n  iterations: 2\n  config:\n    {config}\n")
     with pytest.raises(SpecError) as submitted:
         load(str(path))
-    assert str(submitted.value).startswith(f"{path}:7: train.config.{said}")
+    assert str(submitted.value).startswith(f"{path}:7: train.config.{WRONG[case]}")
     with pytest.raises(UserError) as started:
         configure(find_task(task), yaml.safe_load(path.read_text())["train"])
     assert str(submitted.value) == f"{path}:7: {started.value}" and "\n" not in str(started.value)
@@ -127,6 +111,7 @@ def test_no_simulation_is_imported_to_check() -> None:
     assert not {"torch", "warp", "newton", "numpy", "mujoco", "gymnasium"} & set(loaded)
 
 
+KEYS = ["rewards", "randomize", "curriculum", "camera", "command_turn", "substeps", "ppo", "nan_limit"]
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-3, 2**63) | st.floats() | st.text(max_size=6),
     lambda inner: (
@@ -138,14 +123,7 @@ VALUES = st.recursive(
 
 
 @given(
-    st.sampled_from(["Ant", "CartpolePixels", "Quadruped"]),
-    st.dictionaries(
-        st.sampled_from(
-            ["rewards", "randomize", "curriculum", "camera", "command_turn", "substeps", "ppo", "nan_limit"]
-        ),
-        VALUES,
-        max_size=3,
-    ),
+    st.sampled_from(["Ant", "CartpolePixels", "Quadruped"]), st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=3)
 )
 def test_any_configuration_is_taken_or_refused_in_one_line(task: str, config: dict[str, object]) -> None:
     problem = task_config(task).problem_with(config)  # type: ignore[union-attr]
