@@ -29,7 +29,7 @@ def run_page(page: str, directory: Path, then: str = "") -> str:
     if taken():
         pytest.skip(f"PORT {PORT}, WHICH THE PAGE USES, IS TAKEN ON THIS MACHINE")
     clone = directory / "muster"
-    shutil.copytree(REPOSITORY, clone, ignore=shutil.ignore_patterns(".*", "__pycache__"), symlinks=True)
+    shutil.copytree(REPOSITORY, clone, ignore=shutil.ignore_patterns(".git", ".venv", ".*cache", "build", "__pycache__"), symlinks=True)
     environment = clone / ".venv"
     environment.mkdir()
     for entry in Path(sys.executable).parent.parent.iterdir():
@@ -40,7 +40,7 @@ def run_page(page: str, directory: Path, then: str = "") -> str:
     script = "\n".join([*found, then]).replace("make test ", ": make test ")
     hidden = ("MUSTER_HOME", "MUSTER_URL", "MUSTER_TOKEN", "VIRTUAL_ENV")
     env = {name: value for name, value in os.environ.items() if name not in hidden}
-    ending = "trap 'kill $(jobs -p) 2>/dev/null; wait' EXIT"
+    ending = "trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT"
     command = ["bash", "-euxc", f"{ending}\n{script}"]
     env |= {"HOME": str(directory), "PYTHONUNBUFFERED": "1"}
     done = subprocess.run(command, cwd=clone, env=env, capture_output=True, text=True, timeout=900)
