@@ -18,7 +18,7 @@ import yaml
 
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, Unreachable
-from tests.conftest import MUSTER, REPOSITORY, wait_for
+from tests.conftest import MUSTER, PATIENCE, REPOSITORY, wait_for
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 from tests.support.worker.ranks import free_port
 
@@ -54,7 +54,7 @@ class Cluster:
         self._command = [*compose(), *options, *files]
 
     def compose(self, *arguments: str) -> str:
-        done = subprocess.run([*self._command, *arguments], capture_output=True, text=True, timeout=300)
+        done = subprocess.run([*self._command, *arguments], capture_output=True, text=True, timeout=100 * PATIENCE)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -70,7 +70,7 @@ class Cluster:
             "COLUMNS": "200",
         }
         done = subprocess.run(
-            [MUSTER, *arguments], env=env, cwd=REPOSITORY, capture_output=True, text=True, timeout=120
+            [MUSTER, *arguments], env=env, cwd=REPOSITORY, capture_output=True, text=True, timeout=60 * PATIENCE
         )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout

@@ -16,7 +16,7 @@ import pytest
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
-from tests.conftest import Serving
+from tests.conftest import MAIN_LAST, PATIENCE, Serving
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.hosts import start_ranks, two_hosts
 from tests.support.worker.ranks import training
@@ -37,7 +37,7 @@ needs_two = pytest.mark.skipif(not EACH, reason="needs two NVIDIA GPUs")
 NOTICED = 120
 """Seconds in which the other ranks have started, trained and noticed that one is gone; a collective's own limit is 600."""
 
-SCRIPT = """
+SCRIPT = f"""
 import os, torch, torch.distributed as dist
 rank, local, size = (int(os.environ[name]) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"))
 here = [torch.cuda.get_device_properties(i).uuid for i in range(torch.cuda.device_count())]
@@ -48,7 +48,7 @@ dist.all_reduce(shared)
 assert (shared == size * (size + 1) / 2).all()
 print("rank", rank, "of", size, "sees", os.environ["CUDA_VISIBLE_DEVICES"], *here, "uses", here[local], flush=True)
 dist.destroy_process_group()
-"""
+{MAIN_LAST}"""
 
 
 @pytest.fixture(params=["local", "ray"])
@@ -123,7 +123,7 @@ def test_two_hosts_train_over_tcp_lose_a_rank_and_resume(tmp_path: Path) -> None
         assert [checkpoint.iteration for checkpoint in list_checkpoints(run)] == [20]
         raise_epoch(run, 2)
         second = start(2)
-        said = [process.communicate(timeout=200)[0] for process in second]
+        said = [process.communicate(timeout=60 * PATIENCE)[0] for process in second]
         assert [process.returncode for process in second] == [0] * len(second), said[0][-2000:]
         assert "resumed from checkpoint 00000020" in said[0]
         assert list_checkpoints(run)[-1].iteration == 60

@@ -72,13 +72,6 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
     assert bench.stopped(handle) == [1, 0, 2]
 
 
-def test_a_gang_of_one_without_gpus_sees_none(bench: RayBench) -> None:
-    script = 'echo "[$CUDA_VISIBLE_DEVICES] $AWS_BATCH_JOB_ID $AWS_BATCH_JOB_NUM_NODES"'
-    handle = bench.launch(bench.gang(script, hosts=("n2",), is_gang=False))
-    assert [node.exit_code for node in bench.ended(handle)] == [0]
-    assert f"[] {bench.job} " in bench.log()
-
-
 def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(bench: RayBench) -> None:
     first = bench.ready(bench.gang(POLITE))
     driver = bench.driver()
@@ -145,21 +138,6 @@ def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_run
     assert node.words.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
     assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.words
     assert bench.lines() == [] and read_outcome(bench.run, bench.job, 1, 0) is None
-
-
-def test_a_rank_and_a_supervisor_that_are_killed(bench: RayBench) -> None:
-    handle = bench.ready(bench.gang(f"echo $$ > $MUSTER_STORE/rank-$NODE_RANK; {WAIT}"))
-    os.kill(int((bench.store.path / "rank-1").read_text()), signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "the rank's end")
-    assert bench.engine.observe(handle)[1].exit_code == 137
-    assert bench.outcome(1).reason == "rank 1 was killed by SIGKILL"
-    rank = int((bench.store.path / "rank-2").read_text())
-    os.kill(parent(rank), signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[2].running, 20, "the supervisor's end")
-    await_end(rank)  # it dies with it
-    status = bench.engine.observe(handle)
-    assert (status[2].exit_code, status[0].running) == (137, True)
-    assert read_outcome(bench.run, bench.job, 1, 2) is None
 
 
 def test_a_controller_that_starts_again_finds_the_gang(bench: RayBench) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
-from tests.conftest import Serving, wait_for
+from tests.conftest import PATIENCE, Serving, wait_for
 from tests.support.faults.full_disk import fill
 from tests.support.processes import end_all, gang_members
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
@@ -101,7 +101,7 @@ def test_slow_writes_do_not_hold_up_training(server: Serving) -> None:
     wait_for(lambda: raw_iterations(server, job["run"])[-1] > reached + 30, 30, "progress while the writer waits")
     assert not answers, "it was acknowledged before it was durable"
     writer.strike(signal.SIGCONT)
-    asking.join(30)
+    asking.join(30 * PATIENCE)
     assert answers and answers[0].startswith("checkpoint ")
     writer.strike(signal.SIGKILL)
     died = server.muster("checkpoint", job["id"]).stdout

@@ -246,17 +246,6 @@ def test_small_steps_move_the_tip_where_they_say() -> None:
     assert (errors[20] < 0.75 * errors[0]).all()
 
 
-def test_a_constant_action_moves_the_tip_in_its_direction_alone() -> None:
-    task = made(Planar, worlds=1, damping=0.01)
-    begin = tip(task.observations[0].tolist())
-    for _ in range(10):
-        task.step(torch.tensor([[-0.5, 0.0, 0.0]]))
-    for _ in range(10):  # let the servos arrive
-        task.step(torch.zeros(1, 3))
-    moved = tip(task.observations[0].tolist()) - begin
-    assert -0.105 < moved[0] < -0.06 and abs(moved[1]) < 0.01
-
-
 class Heavy(Planar):
     """The planar arm upright: its joints turn about -y, from x to z, and its weight pulls it down."""
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.support.worker.robots import GO1
-from tests.support.worker.sensing import Reference, go1, scene, step, walker
+from tests.support.worker.sensing import Reference, scene, step, walker
 from worker.simulation.capture import CapturedStep
 from worker.simulation.sensors.contact import (
     ContactArrays,
@@ -242,38 +241,6 @@ def test_what_is_touched_may_be_the_ground_an_object_or_anything() -> None:
     for _ in range(60):
         step(fixed, on_shelf, on_ground)
     assert on_shelf.arrays.last_air_time.numpy().min() > 0 and not on_ground.arrays.contact_time.numpy().any()
-
-
-def test_contact_forces_of_the_feet_of_go1() -> None:
-    context = scene({"robot": go1()}, 1, timestep=0.005, cone="pyramidal", njmax=300, nconmax=150)
-    feet = ContactSensor(geoms="*_foot_collision").build(context)
-    rest = ContactSensor(bodies=["trunk", "*_hip", "*_thigh"]).build(context)
-    assert feet.names == ("FR_foot_collision", "FL_foot_collision", "RR_foot_collision", "RL_foot_collision")
-    reference = Reference(go1())
-    total = 0.0
-    for _ in range(40):
-        reference.take(context, 0)
-        contacts = reference.contacts()
-        step(context, feet, rest)
-        for column, name in enumerate(feet.names):
-            force = on_geoms(contacts, {name}, {"floor"})[1]
-            np.testing.assert_allclose(feet.arrays.forces.numpy()[0, column], force, rtol=1e-2, atol=0.5)
-            total += force[2]
-    assert total > 100 and len(rest.names) == 9
-
-
-def test_the_feet_of_a_go1_that_stands_carry_its_weight() -> None:
-    context = scene({"robot": GO1}, 2, substeps=4, timestep=0.005, ground=True, cone="pyramidal", nconmax=300)
-    feet = ContactSensor(bodies="*_calf", fine=True).build(context)
-    rest = ContactSensor(bodies=["trunk", "*_hip", "*_thigh"], against=None, together=True).build(context)
-    targets, view = np.zeros((2, 12), np.float32), context.views["robot"]
-    targets[:, view.actuators] = view.defaults
-    context.worlds.arrays.controls.assign(targets)
-    for _ in range(60):
-        step(context, feet, rest)
-    weight = 9.81 * context.worlds.solver.mj_model.body_mass.sum()
-    np.testing.assert_allclose(feet.arrays.forces.numpy()[:, :, 2].sum(1), weight, rtol=0.02)
-    assert feet.arrays.contact_time.numpy().min() > 0.2 and not rest.arrays.contact_time.numpy().any()
 
 
 @pytest.mark.parametrize(

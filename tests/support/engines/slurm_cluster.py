@@ -173,7 +173,7 @@ class SlurmCluster:
 
     def run(self, *command: str, check: bool = True) -> str:
         """A Slurm command's output."""
-        done = subprocess.run(command, env=self.environment(), capture_output=True, text=True, timeout=60)
+        done = subprocess.run(command, env=self.environment(), capture_output=True, text=True, timeout=30 * PATIENCE)
         assert done.returncode == 0 or not check, f"{command}: {done.stderr}"
         return done.stdout.strip()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
-from tests.conftest import REPOSITORY, Serving
+from tests.conftest import PATIENCE, REPOSITORY, Serving
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 
 SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
@@ -39,7 +39,7 @@ def same_bits(store: Path, first: str, second: str) -> str:
         env={**os.environ, "MUSTER_STORE": str(store)},
         capture_output=True,
         text=True,
-        timeout=180,
+        timeout=60 * PATIENCE,
     )
     assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
     return compared.stdout

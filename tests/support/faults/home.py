@@ -109,7 +109,7 @@ class Home:
             cwd=REPOSITORY,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=60 * PATIENCE,
         )
         return (json.loads(done.stdout) if done.returncode == 0 else None), done.stderr.strip()
 

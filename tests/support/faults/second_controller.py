@@ -12,6 +12,7 @@ from typing import Any
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from tests.conftest import wait_for
+from tests.support.definitions import container, multinode
 from tests.support.faults.home import Home
 from tests.support.processes import end_all
 
@@ -79,20 +80,8 @@ def _race(clients: list[Client], environment: dict[str, str], attempts: int, apa
 
 
 def _definition(environment: dict[str, str], attempts: int) -> dict[str, Any]:
-    container = {
-        "image": "muster",
-        "command": [sys.executable, "-c", SCRIPT],
-        "environment": [{"name": name, "value": value} for name, value in environment.items()],
-        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
-    }
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
-    retry = {"attempts": attempts}
-    return {
-        "jobDefinitionName": "shared",
-        "type": "multinode",
-        "nodeProperties": properties,
-        "retryStrategy": retry,
-    }
+    needs = container([sys.executable, "-c", SCRIPT], env=environment)
+    return multinode("shared", needs, retryStrategy={"attempts": attempts})
 
 
 def _ended(homes: list[Home], run: str) -> list[dict[str, Any]] | None:

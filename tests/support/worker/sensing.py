@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -135,16 +132,3 @@ class Reference:
                 names = [self.model.geom(int(geom)).name for geom in contact.geom]
                 found.append((names[0], names[1], contact.frame.reshape(3, 3).T @ force[:3]))
         return found
-
-
-def go1() -> str:
-    """Go1 of the installed ``mjlab`` without what is only seen, on a floor, with a motor for each joint."""
-    package = importlib.util.find_spec("mjlab")
-    assert package is not None and package.submodule_search_locations  # a requirement of the tests
-    file = Path(package.submodule_search_locations[0], "asset_zoo/robots/unitree_go1/xmls/go1.xml")
-    text = re.sub(r'<mesh [^>]*/>|<geom class="visual"[^>]*/>', "", file.read_text())
-    joints = re.findall(r'<joint name="(\w+)"', text)
-    motors = "".join(f'<motor name="{joint}" joint="{joint}" gear="20"/>' for joint in joints)
-    floor = '<worldbody><geom name="floor" type="plane" size="5 5 0.1"/>'
-    text = text.replace("<worldbody>", floor, 1).replace("</mujoco>", f"<actuator>{motors}</actuator></mujoco>")
-    return text.replace("<compiler", '<option timestep="0.005" cone="pyramidal"/><compiler', 1)
