@@ -74,9 +74,8 @@ def test_another_service_is_refused_as_it_would_say(
 
 
 def test_requests_that_are_not_signed_or_signed_in_the_address_are_told_too(server: Serving) -> None:
-    unsigned = boto3.client(
-        "sts", endpoint_url=server.url, region_name="us-east-1", config=Config(signature_version=UNSIGNED)
-    )
+    unsigned_as = Config(signature_version=UNSIGNED)
+    unsigned = boto3.client("sts", endpoint_url=server.url, region_name="us-east-1", config=unsigned_as)
     with pytest.raises(ClientError, match="this is Muster"):
         unsigned.assume_role_with_web_identity(RoleArn="a" * 20, RoleSessionName="me", WebIdentityToken="token")
     signed = boto3.client(

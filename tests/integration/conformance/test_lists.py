@@ -66,10 +66,8 @@ def test_filters_see_all_states_newest_first(batch: Batch, parked: str) -> None:
     ]:
         with refused(message):
             batch.api.list_jobs(jobQueue=parked, filters=filters)
-    typed = aws(
-        *(batch.server.url, "batch", "list-jobs", "--job-queue", parked),
-        *("--filters", "name=JOB_NAME,values=q-train*"),
-    )
+    filters = ("--filters", "name=JOB_NAME,values=q-train*")
+    typed = aws(batch.server.url, "batch", "list-jobs", "--job-queue", parked, *filters)
     assert [each["jobName"] for each in typed["jobSummaryList"]] == ["q-trainer", "q-train2", "Q-Train"]
 
 
@@ -102,9 +100,8 @@ def test_pages_follow_each_other_without_gap_or_repeat(batch: Batch, parked: str
     queues = batch.api.get_paginator("describe_job_queues").paginate(PaginationConfig={"PageSize": 1})
     names = [each["jobQueueName"] for page in queues for each in page["jobQueues"]]
     assert names == sorted(set(names)) and {"default", parked} <= set(names)
-    compute_environments = batch.api.get_paginator("describe_compute_environments").paginate(
-        PaginationConfig={"PageSize": 1}
-    )
+    paginator = batch.api.get_paginator("describe_compute_environments")
+    compute_environments = paginator.paginate(PaginationConfig={"PageSize": 1})
     names = [each["computeEnvironmentName"] for page in compute_environments for each in page["computeEnvironments"]]
     assert names == sorted(set(names)) and parked in names
     front_of_queue = wait_for(lambda: len(found := batch.front(parked)) == 100 and found, what="a whole snapshot")

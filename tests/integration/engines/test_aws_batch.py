@@ -133,9 +133,8 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
 def test_aws_gets_the_request_of_the_plan(bench: AwsBench) -> None:
     sent: dict[str, dict[str, Any]] = {}
     for client, name in ((bench.engine._batch, "RegisterJobDefinition"), (bench.engine._submitting, "SubmitJob")):
-        client.meta.events.register(
-            f"provide-client-params.batch.{name}", lambda params, name=name, **_: sent.update({name: params})
-        )
+        note = lambda params, name=name, **_: sent.update({name: params})  # noqa: E731
+        client.meta.events.register(f"provide-client-params.batch.{name}", note)
     gang = bench.gang(nodes=2, timeout=100)
     plan = bench.engine.plan(gang)
     bench.launch(gang)

@@ -31,11 +31,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Tried to parse AWS")
 
 TEMPLATE = REPOSITORY / "containers" / "aws" / "muster.yaml"
 REGION = "us-east-1"
-NO_CONFIGURATION = {
-    "AWS_CONFIG_FILE": os.devnull,
-    "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
-    "AWS_EC2_METADATA_DISABLED": "true",
-}
+NO_CONFIGURATION = dict.fromkeys(("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"), os.devnull)
+NO_CONFIGURATION["AWS_EC2_METADATA_DISABLED"] = "true"
 # moto does not split the default of a list, and knows few images
 PARAMETERS = ["--parameter", "InstanceTypes=g6.12xlarge", "--parameter", "WorkstationImage=ami-12c6146b"]
 NO_STACK = "muster: there is no stack {} in us-east-1; create it with `muster aws up`\n"

@@ -31,9 +31,8 @@ def registry(tmp_path: Path) -> Iterator[str]:
         pytest.skip("NO docker-registry: make push is not tested")
     port = free_port()
     (tmp_path / "config.yml").write_text(CONFIGURATION.format(root=tmp_path / "images", port=port))
-    serving = subprocess.Popen(
-        ["docker-registry", "serve", str(tmp_path / "config.yml")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    command = ["docker-registry", "serve", str(tmp_path / "config.yml")]
+    serving = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def answers() -> bool:
         try:
@@ -93,9 +92,8 @@ def make_cluster(folder: Path, *arguments: str) -> tuple[subprocess.CompletedPro
     told = folder / "told"
     told.write_text("")
     env = {**os.environ, "PATH": f"{double.parent}:{os.environ['PATH']}", "TOLD": str(told)}
-    done = subprocess.run(
-        ["make", "cluster", *arguments], cwd=folder, env=env, capture_output=True, text=True, timeout=120
-    )
+    command = ["make", "cluster", *arguments]
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=120)
     return done, told.read_text().splitlines()
 
 

@@ -126,12 +126,8 @@ def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, 
 def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0004")
     facts = {**OLD, "status": "FAILED", "attempts_allowed": 1}
-    found = [
-        ("a", "lab", "key x/1/2", 1),
-        ("a", "default", None, 2),
-        ("b", "default", None, 1),
-        ("c", "lab", None, None),
-    ]
+    found = [("a", "lab", "key x/1/2", 1), *((run, "default", None, epoch) for run, epoch in (("a", 2), ("b", 1)))]
+    found.append(("c", "lab", None, None))
     rows = [
         {"id": f"j{i}", "created_at": i, "run": run, "queue": queue, "idempotency_key": key, "first_epoch": epoch}
         for i, (run, queue, key, epoch) in enumerate(found)

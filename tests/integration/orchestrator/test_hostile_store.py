@@ -111,9 +111,8 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
 def test_no_change_of_a_run_and_no_stored_spec_makes_an_answer_long(
     inside: Server, http: httpx.Client, runs: Path
 ) -> None:
-    bomb = ", ".join(
-        ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
-    )
+    levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
+    bomb = ", ".join(["a0: &a0 [x, x, x, x, x, x, x, x]", *levels])
     said = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
     assert "anchors and aliases (&a0) are not accepted here" in said and len(said) < 400
     train = {**SPEC["train"], "task": "my:Task", "config": {"text": "x" * 100_000}}  # type: ignore[dict-item]

@@ -121,10 +121,8 @@ def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old:
     database = Database(old)
     with database.session() as session:
         first, second = session.scalars(select(Job).where(Job.name == "failed")).one().attempts
-        assert [node.placement for node in first.nodes] == [
-            Placement("h", ("GPU-a", "GPU-b"), 0.0, 0),
-            Placement("h", (), 0.0, 0),
-        ]
+        placements = [Placement("h", gpus, 0.0, 0) for gpus in (("GPU-a", "GPU-b"), ())]
+        assert [node.placement for node in first.nodes] == placements
         assert (first.nodes[0].devices, first.nodes[0].reason) == (("7",), "a\\x00b\\ud800")
         assert first.nodes[1].devices is None
         assert second.nodes == []

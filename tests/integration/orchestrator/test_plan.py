@@ -154,12 +154,10 @@ def test_an_option_of_an_engine_that_is_misspelt_is_refused_when_the_tag_is_made
         tags = {"muster:engine": "slurm", "muster:partiton": "gpu"}
         slurm = {"computeEnvironmentName": "cluster", "type": "UNMANAGED"}
         said = refused("CreateComputeEnvironment", **slurm, tags=tags)
-        assert (
-            "muster:partiton: a compute environment of the slurm engine has no such option; did you mean part" in said
-        )
-        assert "no such engine; did you mean slurm?" in refused(
-            "CreateComputeEnvironment", **slurm, tags={"muster:engine": "slrum"}
-        )
+        assert "muster:partiton: a compute environment of the slurm engine has no such option" in said
+        assert "; did you mean part" in said
+        said = refused("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slrum"})
+        assert "no such engine; did you mean slurm?" in said
         client.batch("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slurm", "muster:partition": "gpu"})
         tagged = refused("TagResource", resourceArn=f"{arn}compute-environment/cluster", tags={"muster:nice": "low"})
         assert "tag muster:nice is 'low', not a whole number" in tagged

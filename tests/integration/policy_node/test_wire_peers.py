@@ -161,9 +161,7 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
                 return found if len(found) == 2 else []
 
             ours, theirs = wait_for(announced, 20, "the tokens of the server and of the client")
-        assert ours.split("/")[-4:] == theirs.split("/")[-4:], (
-            "name, type, hash and quality of service are written alike"
-        )
+        assert ours.split("/")[-4:] == theirs.split("/")[-4:], "name, type, hash and quality of service"
         assert client.call(structure_needs_at_least_one_member=0) is not None, "the answer"
         assert client.call(structure_needs_at_least_one_member=0) is not None, "the next one"
         with open_session(running.endpoint, None) as session:
@@ -217,9 +215,8 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
         node = Node(session, MESSAGES, name="confused")
         wrong = node.publisher("joint_states", TWIST)
         right = node.publisher("joint_states", JOINT_STATE)
-        raw = session.declare_publisher(
-            f"0/joint_states/sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}"
-        )
+        kind = f"sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}"
+        raw = session.declare_publisher(f"0/joint_states/{kind}")
 
         def told() -> bool:
             wrong.publish(MESSAGES.twist((0.0,) * 3, (0.0,) * 3))
@@ -275,9 +272,8 @@ def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares
             if "/NN/%/%/muster_policy" in str(sample.key_expr):
                 (gone if sample.kind == zenoh.SampleKind.DELETE else there).set()
 
-        session.liveliness().declare_subscriber(
-            "@ros2_lv/**", zenoh.handlers.Callback(told, indirect=False), history=True
-        )
+        ear = zenoh.handlers.Callback(told, indirect=False)
+        session.liveliness().declare_subscriber("@ros2_lv/**", ear, history=True)
         assert there.wait(30)
         assert running.end() == 0
         assert gone.wait(10)

@@ -176,9 +176,8 @@ def test_an_unkillable_process_is_named_and_waited_for(pids: Path, monkeypatch: 
     assert shim.wait(20 * PATIENCE) == 137
     assert shim.stderr is not None
     said = shim.stderr.read()
-    assert said.startswith(
-        f"muster: SIGKILL does not end process {stubborn} (sleep), state D: in an uninterruptible wait"
-    )
+    wait = "in an uninterruptible wait"
+    assert said.startswith(f"muster: SIGKILL does not end process {stubborn} (sleep), state D: {wait}")
     assert said.count("\n") == 1, "said once"
 
 
@@ -196,9 +195,8 @@ while time.time() < end:
 
 def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pids: Path, tmp_path: Path) -> None:
     (tmp_path / "chain.py").write_text(CHAIN)
-    shim = start(
-        f"for i in 1 2 3 4; do {sys.executable} -I -S {tmp_path}/chain.py & done; sleep 0.5; kill -9 $$", group
-    )
+    chain = f"{sys.executable} -I -S {tmp_path}/chain.py"
+    shim = start(f"for i in 1 2 3 4; do {chain} & done; sleep 0.5; kill -9 $$", group)
     assert shim.wait(60 * PATIENCE) == 137
     assert not processes_running(str(tmp_path))
 
