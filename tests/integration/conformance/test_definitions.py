@@ -245,11 +245,8 @@ def test_violations_of_the_aws_model_are_refused_in_the_words_of_aws(shared_serv
 
 def test_overrides_are_what_the_job_shows_and_the_definition_stays_as_it_is(batch: Batch, parked: str) -> None:
     definition = batch.multinode("def-kept", "true", target="0:1", env={"TASK": "Cartpole", "SEED": "1"})
-    override = {
-        "command": ["sh", "-c", "exit 3"],
-        "environment": pairs({"TASK": "Ant", "MAX_ITERATIONS": "5"}),
-        "resourceRequirements": [{"type": "MEMORY", "value": "32"}],
-    }
+    override = {"command": ["sh", "-c", "exit 3"], "resourceRequirements": [{"type": "MEMORY", "value": "32"}]}
+    override["environment"] = pairs({"TASK": "Ant", "MAX_ITERATIONS": "5"})
     overrides = {"nodePropertyOverrides": [{"targetNodes": "0:1", "containerOverrides": override}]}
     job = batch.submit(definition, queue=parked, nodeOverrides=overrides)
     shown = batch.describe(f"{job}#1")["container"]

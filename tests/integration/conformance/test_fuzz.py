@@ -38,13 +38,8 @@ IS_LONG = "MUSTER_FUZZ" in os.environ
 
 def share(part: float) -> settings:
     """This part of all examples; the same ones each time, unless many are asked for."""
-    return settings(
-        max_examples=max(1, int(EXAMPLES * part)),
-        derandomize=not IS_LONG,
-        database=None,
-        deadline=None,
-        suppress_health_check=list(HealthCheck),
-    )
+    always: dict[str, Any] = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
+    return settings(max_examples=max(1, int(EXAMPLES * part)), derandomize=not IS_LONG, **always)
 
 
 @pytest.fixture(scope="module")

@@ -81,12 +81,9 @@ def test_pages_follow_each_other_without_gap_or_repeat(batch: Batch, parked: str
     assert "nextToken" not in last and [each["jobId"] for each in last["jobSummaryList"]] == [jobs[0]]
     pages = batch.api.get_paginator("list_jobs").paginate(**by_name, PaginationConfig={"PageSize": 30})
     assert [each["jobId"] for page in pages for each in page["jobSummaryList"]] == jobs[::-1]
-    by_status = wait_for(
-        lambda: (
-            len(found := batch.api.list_jobs(jobQueue=parked, jobStatus="RUNNABLE")["jobSummaryList"]) >= 101 and found
-        ),
-        what="all of them RUNNABLE, on one page",
-    )
+    runnable = lambda: batch.api.list_jobs(jobQueue=parked, jobStatus="RUNNABLE")["jobSummaryList"]  # noqa: E731
+    on_one_page = "all of them RUNNABLE, on one page"
+    by_status = wait_for(lambda: len(found := runnable()) >= 101 and found, what=on_one_page)
     assert {each["jobId"] for each in by_status} >= set(jobs)
     # what comes between two pages moves nothing
     first = batch.api.list_jobs(**by_name, maxResults=50)

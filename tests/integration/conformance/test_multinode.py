@@ -337,9 +337,8 @@ def test_a_timeout_is_sigterm_then_thirty_seconds_then_sigkill_and_no_retry(batc
     assert (detail["isTerminated"], detail["isCancelled"]) == (False, False)
     [attempt] = detail["attempts"]
     assert attempt["container"]["exitCode"] == 137 and detail["timeout"] == {"attemptDurationSeconds": 60}
-    events = batch.logs.get_log_events(
-        logGroupName="/aws/batch/job", logStreamName=attempt["container"]["logStreamName"], startFromHead=True
-    )["events"]
+    stream = {"logGroupName": "/aws/batch/job", "logStreamName": attempt["container"]["logStreamName"]}
+    events = batch.logs.get_log_events(**stream, startFromHead=True)["events"]
     [asked] = [event["timestamp"] for event in events if event["message"] == "asked to leave"]
     assert attempt["stoppedAt"] - asked >= 29_000, "it had 30 s to leave"
     assert batch.describe(f"{overdue}#1")["container"]["exitCode"] == 143, "the child left when it was asked"

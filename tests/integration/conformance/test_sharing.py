@@ -155,10 +155,8 @@ def test_the_share_with_less_use_goes_first_and_a_reservation_is_kept_free(batch
     wait_for(lambda: len(batch.front("q-used")) == 3, what="three that wait")
     assert "uses 3 of the 3 CPUs" in batch.reason(mine[2], "2 active shares")
     shown = batch.api.get_job_queue_snapshot(jobQueue="q-used")["queueUtilization"]["fairshareUtilization"]
-    held = {
-        each["shareIdentifier"]: {unit["capacityUnit"]: unit["quantity"] for unit in each["capacityUsage"]}["VCPU"]
-        for each in shown["topCapacityUtilization"]
-    }
+    used = {each["shareIdentifier"]: each["capacityUsage"] for each in shown["topCapacityUtilization"]}
+    held = {share: next(u["quantity"] for u in units if u["capacityUnit"] == "VCPU") for share, units in used.items()}
     assert held == {"mine": 2.0, "yours": 1.0} and shown["activeShareCount"] == 2
     gate(tmp_path, "go")
     assert {batch.wait(job)["status"] for job in (*mine, *yours)} == {"SUCCEEDED"}

@@ -105,9 +105,8 @@ def test_an_arrays_children_know_their_index_and_decide_its_end(batch: Batch, tm
     parent = batch.describe(job)
     assert parent["status"] == "PENDING" and parent["arrayProperties"]["size"] == 3
     assert parent["startedAt"] == min(batch.describe(f"{job}:{index}")["startedAt"] for index in range(3))
-    assert set(parent["arrayProperties"]["statusSummary"]) == {
-        *("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
-    }
+    states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
+    assert set(parent["arrayProperties"]["statusSummary"]) == set(states)
     gate(tmp_path, "go")
     parent = batch.wait(job)
     assert parent["status"] == "FAILED" and "1 of 3" in parent["statusReason"]
@@ -159,10 +158,8 @@ def test_children_come_one_by_one_in_a_sequential_array(batch: Batch, tmp_path: 
 
 
 def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
-    first = batch.submit(
-        batch.single("one-before", f"[ {INDEX} = 0 ] || {UNTIL.format('go')}", env={"GATE": str(tmp_path)}),
-        arrayProperties={"size": 2},
-    )
+    before = batch.single("one-before", f"[ {INDEX} = 0 ] || {UNTIL.format('go')}", env={"GATE": str(tmp_path)})
+    first = batch.submit(before, arrayProperties={"size": 2})
     waits = {"dependsOn": [{"jobId": first, "type": "N_TO_N"}]}
     second = batch.submit(batch.single("one-after", "true"), arrayProperties={"size": 2}, **waits)
     last = batch.submit(batch.single("one-last", "true"), dependsOn=[{"jobId": second}])
@@ -248,12 +245,8 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         ([{"onExitCode": "0", **END}, {"onReason": "*", **END}], 1),  # the documentation's catch-all
         ([{"onExitCode": "0", **END}], 3),  # what TorchX sends
     ]
-    jobs = [
-        batch.submit(
-            definition, retryStrategy={"attempts": 3, **({"evaluateOnExit": conditions} if conditions else {})}
-        )
-        for conditions, _ in cases
-    ]
+    evaluated = [{"evaluateOnExit": conditions} if conditions else {} for conditions, _ in cases]
+    jobs = [batch.submit(definition, retryStrategy={"attempts": 3, **each}) for each in evaluated]
     for job, (conditions, attempts) in zip(jobs, cases, strict=True):
         detail = batch.wait(job)
         codes = [attempt["container"]["exitCode"] for attempt in detail["attempts"]]
@@ -319,12 +312,8 @@ def test_a_submission_with_a_key_may_be_sent_twice(batch: Batch, parked: str) ->
     with keyed(batch, "not a key"), refused("idempotency key"):
         send()
     found = batch.api.list_jobs(jobQueue=parked, filters=[{"name": "JOB_NAME", "values": ["one-keyed"]}])
-    assert (
-        len(found["jobSummaryList"]) == 4
-        and not batch.api.list_jobs(jobQueue=parked, filters=[{"name": "JOB_NAME", "values": ["one-other"]}])[
-            "jobSummaryList"
-        ]
-    )
+    other = batch.api.list_jobs(jobQueue=parked, filters=[{"name": "JOB_NAME", "values": ["one-other"]}])
+    assert len(found["jobSummaryList"]) == 4 and not other["jobSummaryList"]
 
 
 def test_the_command_may_come_with_the_submission(batch: Batch) -> None:

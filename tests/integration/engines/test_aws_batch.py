@@ -112,11 +112,9 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     assert amounts == {"VCPU": "4", "MEMORY": "4096", "GPU": "2"}, "AWS takes whole vCPUs only"
     assert container["linuxParameters"]["sharedMemorySize"] == 2048
     assert container["linuxParameters"]["devices"][0]["hostPath"] == "/dev/infiniband/uverbs0"
-    assert container["volumes"][0]["efsVolumeConfiguration"] == {
-        "fileSystemId": "fs-1",
-        "transitEncryption": "ENABLED",
-        "authorizationConfig": {"accessPointId": "fsap-1", "iam": "ENABLED"},
-    }
+    access = {"accessPointId": "fsap-1", "iam": "ENABLED"}
+    volume = {"fileSystemId": "fs-1", "transitEncryption": "ENABLED", "authorizationConfig": access}
+    assert container["volumes"][0]["efsVolumeConfiguration"] == volume
     assert container["mountPoints"][0]["containerPath"] == str(bench.volume.path)
     assert container["logConfiguration"]["options"] == {"awslogs-group": "/aws/batch/job"}
     assert definition["retryStrategy"] == {"attempts": 1} and submission["timeout"] == {"attemptDurationSeconds": 700}

@@ -44,13 +44,8 @@ class Account:
 
     def __init__(self, url: str, home: Path) -> None:
         self.url, self.home = url, home
-        self.env = {
-            **NO_CONFIGURATION,
-            "AWS_ACCESS_KEY_ID": "any",
-            "AWS_SECRET_ACCESS_KEY": "any",
-            "AWS_DEFAULT_REGION": REGION,
-            "AWS_ENDPOINT_URL": url,
-        }
+        self.env = {**NO_CONFIGURATION, "AWS_DEFAULT_REGION": REGION, "AWS_ENDPOINT_URL": url}
+        self.env |= dict.fromkeys(("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"), "any")
 
     def client(self, service: str) -> Any:
         key = {"aws_access_key_id": "a", "aws_secret_access_key": "b"}
@@ -276,9 +271,9 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
         [stack] = cloudformation_backends["123456789012"][REGION].stacks.values()
         stack.status = "ROLLBACK_COMPLETE"
         again = account.muster("up", "--yes", *PARAMETERS)
-        assert again.returncode == 1 and again.stderr == (
-            "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; remove it with `muster aws down`, then try again\n"
-        )
+        said = "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; "
+        assert again.returncode == 1
+        assert again.stderr == f"{said}remove it with `muster aws down`, then try again\n"
         gone = account.muster("down", "--yes")
         assert gone.returncode == 0, gone.stderr
         assert f"file system {volume}, with all runs and checkpoints, stays" in gone.stdout

@@ -51,9 +51,9 @@ def make(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_image_is_pushed_under_its_version_and_latest(registry: str, docker_client: Any) -> None:
-    docker_client.api.import_image_from_data(
-        b"\0" * 10240, repository="muster-test-push", tag="1", changes=["LABEL org.opencontainers.image.version=1.2.3"]
-    )
+    image = {"repository": "muster-test-push", "tag": "1"}
+    labels = ["LABEL org.opencontainers.image.version=1.2.3"]
+    docker_client.api.import_image_from_data(b"\0" * 10240, **image, changes=labels)
     done = make(f"REGISTRY={registry}/robots", "IMAGE=muster-test-push:1")
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("digest: sha256:") == 2

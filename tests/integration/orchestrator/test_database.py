@@ -128,10 +128,8 @@ def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, o
     facts = {**OLD, "status": "FAILED", "attempts_allowed": 1}
     found = [("a", "lab", "key x/1/2", 1), *((run, "default", None, epoch) for run, epoch in (("a", 2), ("b", 1)))]
     found.append(("c", "lab", None, None))
-    rows = [
-        {"id": f"j{i}", "created_at": i, "run": run, "queue": queue, "idempotency_key": key, "first_epoch": epoch}
-        for i, (run, queue, key, epoch) in enumerate(found)
-    ]
+    columns = ("run", "queue", "idempotency_key", "first_epoch")
+    rows = [{"id": f"j{i}", "created_at": i, **dict(zip(columns, row, strict=True))} for i, row in enumerate(found)]
     insert(url, "jobs", [{**facts, **row} for row in rows])
     with opened().session() as session:
         runs = {run.name: (run.queue, run.owner) for run in session.scalars(select(RunRecord))}

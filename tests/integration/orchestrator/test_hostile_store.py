@@ -154,10 +154,8 @@ def damaged_home(home: Path) -> Path:
     """A home whose database was written by a controller, with zeros over the pages of the table of jobs."""
     database = Database.at(home)
     with database.session() as session:
-        session.add_all(
-            Job(id=f"j{n}", name="j", queue="default", definition="d", request={}, node_properties=NODES, run=f"r{n}")
-            for n in range(500)
-        )
+        facts = {"name": "j", "queue": "default", "definition": "d", "request": {}, "node_properties": NODES}
+        session.add_all(Job(id=f"j{n}", run=f"r{n}", **facts) for n in range(500))
     with database.engine.connect() as connection:
         connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
         size = connection.exec_driver_sql("PRAGMA page_size").scalar_one()

@@ -108,10 +108,8 @@ def test_an_image_that_would_not_run_is_refused_where_the_compute_environment_sa
 
 def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment_allows(inside: Server) -> None:
     resources = {"type": "EC2", "maxvCpus": 1, "subnets": ["none"]}
-    environments: dict[str, dict[str, Any]] = {
-        "small": {"type": "MANAGED", "computeResources": resources},
-        "elsewhere": {"type": "UNMANAGED", "tags": {"muster:hosts": "another"}},
-    }
+    environments: dict[str, dict[str, Any]] = {"small": {"type": "MANAGED", "computeResources": resources}}
+    environments["elsewhere"] = {"type": "UNMANAGED", "tags": {"muster:hosts": "another"}}
     train = {"task": "Cartpole", "worlds": 6, "iterations": 2}
     document = {"name": "fits", "nodes": 3, "resources": {"cpus": 0.4, "memory": 16}, "train": train}
     refusals = {

@@ -57,13 +57,8 @@ def read(path: Path) -> list[int]:
 
 
 def start(script: str, group: str, tied_to: int = 0, **env: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        shimmed(["sh", "-c", script], group, tied_to=tied_to),
-        env={**os.environ, **env},
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    command, pipe = shimmed(["sh", "-c", script], group, tied_to=tied_to), subprocess.PIPE
+    return subprocess.Popen(command, env={**os.environ, **env}, stderr=pipe, text=True, start_new_session=True)
 
 
 def known(shim: subprocess.Popen[str], group: str) -> NodeProcesses:

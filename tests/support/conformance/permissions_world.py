@@ -115,9 +115,8 @@ class World:
     def native_call(self, key: str, operation: Operation, body: dict[str, Any] | None = None) -> httpx.Response:
         method, _, path = operation.partition(" ")
         path = path.format(reference=self.job, name=self.run, number=1)
-        return self.http.request(
-            method, self.url + path, json=body, headers={"Authorization": f"Bearer {self.tokens[key]}"}
-        )
+        bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
+        return self.http.request(method, self.url + path, json=body, headers=bearer)
 
     def delete_key(self, key: str) -> httpx.Response:
         """Delete a key that was just made."""

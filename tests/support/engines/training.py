@@ -34,12 +34,8 @@ def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str)
 
 def same_bits(store: Path, first: str, second: str) -> str:
     """What ``worker.bitwise_diff`` says of two runs, which must be equal."""
-    compared = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.bitwise_diff", first, second],
-        env={**os.environ, "MUSTER_STORE": str(store)},
-        capture_output=True,
-        text=True,
-        timeout=180,
-    )
+    command = [sys.executable, "-P", "-m", "worker.bitwise_diff", first, second]
+    env = {**os.environ, "MUSTER_STORE": str(store)}
+    compared = subprocess.run(command, env=env, capture_output=True, text=True, timeout=180)
     assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
     return compared.stdout
