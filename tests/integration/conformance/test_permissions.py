@@ -105,48 +105,44 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
     job = {"jobName": "x", "jobQueue": "robots", "jobDefinition": world.definition}
     disabled = {"type": "UNMANAGED", "state": "DISABLED"}
     of, empty = Operation, {"fairsharePolicy": {}}
-    found = {
-        of.REGISTER_JOB_DEFINITION: aws(
-            of.REGISTER_JOB_DEFINITION, **{**definition(""), "jobDefinitionName": registered}
-        ),
-        of.DESCRIBE_JOB_DEFINITIONS: aws(of.DESCRIBE_JOB_DEFINITIONS, jobDefinitions=[world.definition]),
-        of.DEREGISTER_JOB_DEFINITION: aws(of.DEREGISTER_JOB_DEFINITION, jobDefinition=lambda: f"{registered()}:1"),
-        of.SUBMIT_JOB: aws(of.SUBMIT_JOB, **job),
-        of.DESCRIBE_JOBS: aws(of.DESCRIBE_JOBS, jobs=[world.job]),
-        of.LIST_JOBS: aws(of.LIST_JOBS, jobQueue="robots", filters=[{"name": "JOB_NAME", "values": ["theirs"]}]),
-        of.TERMINATE_JOB: aws(of.TERMINATE_JOB, jobId=world.job, reason="x"),
-        of.CANCEL_JOB: aws(of.CANCEL_JOB, jobId=world.job, reason="x"),
-        of.TERMINATE_JOBS: aws(of.TERMINATE_JOBS, jobs=[world.job], reason="x"),
-        of.CANCEL_JOBS: aws(of.CANCEL_JOBS, jobs=[world.job], reason="x"),
-        of.CREATE_JOB_QUEUE: aws(of.CREATE_JOB_QUEUE, jobQueueName=world.fresh, **queue),
-        of.DESCRIBE_JOB_QUEUES: aws(of.DESCRIBE_JOB_QUEUES),
-        of.UPDATE_JOB_QUEUE: aws(of.UPDATE_JOB_QUEUE, jobQueue="robots", priority=9),
-        of.DELETE_JOB_QUEUE: aws(
-            of.DELETE_JOB_QUEUE,
+    requests: dict[Operation, dict[str, Any]] = {
+        of.REGISTER_JOB_DEFINITION: {**definition(""), "jobDefinitionName": registered},
+        of.DESCRIBE_JOB_DEFINITIONS: dict(jobDefinitions=[world.definition]),
+        of.DEREGISTER_JOB_DEFINITION: dict(jobDefinition=lambda: f"{registered()}:1"),
+        of.SUBMIT_JOB: dict(**job),
+        of.DESCRIBE_JOBS: dict(jobs=[world.job]),
+        of.LIST_JOBS: dict(jobQueue="robots", filters=[{"name": "JOB_NAME", "values": ["theirs"]}]),
+        of.TERMINATE_JOB: dict(jobId=world.job, reason="x"),
+        of.CANCEL_JOB: dict(jobId=world.job, reason="x"),
+        of.TERMINATE_JOBS: dict(jobs=[world.job], reason="x"),
+        of.CANCEL_JOBS: dict(jobs=[world.job], reason="x"),
+        of.CREATE_JOB_QUEUE: dict(jobQueueName=world.fresh, **queue),
+        of.DESCRIBE_JOB_QUEUES: {},
+        of.UPDATE_JOB_QUEUE: dict(jobQueue="robots", priority=9),
+        of.DELETE_JOB_QUEUE: dict(
             jobQueue=lambda: world.made("CreateJobQueue", "jobQueueName", **queue, state="DISABLED"),
         ),
-        of.GET_JOB_QUEUE_SNAPSHOT: aws(of.GET_JOB_QUEUE_SNAPSHOT, jobQueue="robots"),
-        of.CREATE_COMPUTE_ENVIRONMENT: aws(
-            of.CREATE_COMPUTE_ENVIRONMENT, computeEnvironmentName=world.fresh, type="UNMANAGED"
-        ),
-        of.DESCRIBE_COMPUTE_ENVIRONMENTS: aws(of.DESCRIBE_COMPUTE_ENVIRONMENTS),
-        of.UPDATE_COMPUTE_ENVIRONMENT: aws(of.UPDATE_COMPUTE_ENVIRONMENT, computeEnvironment="local", state="ENABLED"),
-        of.DELETE_COMPUTE_ENVIRONMENT: aws(
-            of.DELETE_COMPUTE_ENVIRONMENT,
+        of.GET_JOB_QUEUE_SNAPSHOT: dict(jobQueue="robots"),
+        of.CREATE_COMPUTE_ENVIRONMENT: dict(computeEnvironmentName=world.fresh, type="UNMANAGED"),
+        of.DESCRIBE_COMPUTE_ENVIRONMENTS: {},
+        of.UPDATE_COMPUTE_ENVIRONMENT: dict(computeEnvironment="local", state="ENABLED"),
+        of.DELETE_COMPUTE_ENVIRONMENT: dict(
             computeEnvironment=lambda: world.made("CreateComputeEnvironment", "computeEnvironmentName", **disabled),
         ),
-        of.CREATE_SCHEDULING_POLICY: aws(of.CREATE_SCHEDULING_POLICY, name=world.fresh, fairsharePolicy={}),
-        of.DESCRIBE_SCHEDULING_POLICIES: aws(of.DESCRIBE_SCHEDULING_POLICIES, arns=[]),
-        of.LIST_SCHEDULING_POLICIES: aws(of.LIST_SCHEDULING_POLICIES),
-        of.UPDATE_SCHEDULING_POLICY: aws(of.UPDATE_SCHEDULING_POLICY, arn=policy, **empty),
-        of.DELETE_SCHEDULING_POLICY: aws(of.DELETE_SCHEDULING_POLICY, arn=policy),
-        of.TAG_RESOURCE: aws(of.TAG_RESOURCE, resourceArn=f"{ARN}job/{world.job}", tags={"a": "b"}),
-        of.UNTAG_RESOURCE: aws(of.UNTAG_RESOURCE, resourceArn=f"{ARN}job/{world.job}", tagKeys=["a"]),
-        of.LIST_TAGS_FOR_RESOURCE: aws(of.LIST_TAGS_FOR_RESOURCE, resourceArn=f"{ARN}job/{world.job}"),
-        of.GET_LOG_EVENTS: aws(of.GET_LOG_EVENTS, **group, logStreamName=world.stream),
-        of.FILTER_LOG_EVENTS: aws(of.FILTER_LOG_EVENTS, **group, filterPattern='"robots line"'),
-        of.DESCRIBE_LOG_STREAMS: aws(of.DESCRIBE_LOG_STREAMS, **group),
-        of.DESCRIBE_LOG_GROUPS: aws(of.DESCRIBE_LOG_GROUPS),
+        of.CREATE_SCHEDULING_POLICY: dict(name=world.fresh, fairsharePolicy={}),
+        of.DESCRIBE_SCHEDULING_POLICIES: dict(arns=[]),
+        of.LIST_SCHEDULING_POLICIES: {},
+        of.UPDATE_SCHEDULING_POLICY: dict(arn=policy, **empty),
+        of.DELETE_SCHEDULING_POLICY: dict(arn=policy),
+        of.TAG_RESOURCE: dict(resourceArn=f"{ARN}job/{world.job}", tags={"a": "b"}),
+        of.UNTAG_RESOURCE: dict(resourceArn=f"{ARN}job/{world.job}", tagKeys=["a"]),
+        of.LIST_TAGS_FOR_RESOURCE: dict(resourceArn=f"{ARN}job/{world.job}"),
+        of.GET_LOG_EVENTS: dict(**group, logStreamName=world.stream),
+        of.FILTER_LOG_EVENTS: dict(**group, filterPattern='"robots line"'),
+        of.DESCRIBE_LOG_STREAMS: dict(**group),
+        of.DESCRIBE_LOG_GROUPS: {},
+    }
+    others: dict[Operation, Callable[[str], httpx.Response]] = {
         of.START_LIVE_TAIL: lambda key: live_tail(world, key),
         of.CREATE_LEAGUE: lambda key: world.native_call(
             key, of.CREATE_LEAGUE, {"name": world.fresh(), "track": ["oval"]}
@@ -167,7 +163,8 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of.DISQUALIFY: {"reason": "x"},
         of.TEST_WEBHOOK: {},
     }
-    return {each: found.get(each) or of_ours(each, bodies.get(each)) for each in Operation}
+    others |= {each: aws(each, **request) for each, request in requests.items()}
+    return {each: others.get(each) or of_ours(each, bodies.get(each)) for each in Operation}
 
 
 def live_tail(world: World, key: str) -> httpx.Response:
