@@ -93,23 +93,34 @@ def _written_out(text: str) -> str:
 class Serving:
     """A ``muster serve`` subprocess. ``with`` closes it."""
 
+    command: tuple[str, ...] = (MUSTER,)
+    token: str | None = None
+    errors: Path | None = None
+    """Where its standard error is kept: a pipe by default."""
+
     def __init__(self, home: Path, *options: str) -> None:
         self.home, self.options = home, options
         self.start()
 
     def start(self) -> None:
-        self.process = subprocess.Popen(
-            [MUSTER, "serve", "--port", "0", *self.options],
-            env={**os.environ, "MUSTER_HOME": str(self.home)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        env = {**os.environ, "MUSTER_HOME": str(self.home), **({"MUSTER_TOKEN": self.token} if self.token else {})}
+        with open(self.errors or os.devnull, "ab") as errors:
+            self.process = subprocess.Popen(
+                [*self.command, "serve", "--port", "0", *self.options],
+                env=env,
+                stdout=subprocess.PIPE,
+                stderr=errors if self.errors else subprocess.PIPE,
+                text=True,
+            )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        assert line.startswith("Muster serves "), line + (self.process.stderr.read() if self.process.stderr else "")
+        assert line.startswith("Muster serves "), line + self._complaint()
         self.url = line.split()[2]
-        self.client = Client(self.url)
+        self.client = Client(self.url, self.token)
+
+    def _complaint(self) -> str:
+        assert self.process.stderr is not None or self.errors is not None
+        return self.errors.read_text() if self.errors else self.process.stderr.read()  # type: ignore[union-attr]
 
     def kill(self) -> None:
         """SIGKILL, as a crash would end it."""

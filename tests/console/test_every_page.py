@@ -37,28 +37,11 @@ def places(console: Console) -> dict[str, str]:
     said = submit_gang(console.client, f"print({HOSTILE!r}); raise ValueError({HOSTILE!r})", name="said", cpus="0.5")
     await_status(console.client, said, "FAILED")
     training = console.client.post("/api/runs/taught/resume", {"set": ["train.iterations=20"]})["jobId"]
-    return {
-        "jobs": "/",
-        "training": f"/jobs/{training}",
-        "command": f"/jobs/{said}",
-        "submit": "/submit",
-        "wizard": "/submit/task/Racer",
-        "yaml": "/submit/yaml",
-        "runs": "/runs",
-        "run": "/runs/taught",
-        "compare": "/compare?run=taught",
-        "queues": "/queues",
-        "queue": "/queues?queue=lab",
-        "keys": "/keys",
-        "models": "/models",
-        "model": "/models/fast",
-        "leagues": "/leagues",
-        "league": "/leagues/cup",
-        "entry": "/leagues/cup/entries/1",
-        "tracks": "/tracks",
-        "track": "/tracks/oval",
-        "missing": "/jobs/none",
-    }
+    lists = {each: f"/{each}" for each in ("submit", "runs", "queues", "keys", "models", "leagues", "tracks")}
+    runs = {"run": "/runs/taught", "compare": "/compare?run=taught", "model": "/models/fast", "track": "/tracks/oval"}
+    jobs = {"jobs": "/", "training": f"/jobs/{training}", "command": f"/jobs/{said}", "missing": "/jobs/none"}
+    forms = {"wizard": "/submit/task/Racer", "yaml": "/submit/yaml", "queue": "/queues?queue=lab"}
+    return {**lists, **runs, **jobs, **forms, "league": "/leagues/cup", "entry": "/leagues/cup/entries/1"}
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

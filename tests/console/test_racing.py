@@ -32,13 +32,8 @@ def test_an_edited_reward_function_is_checked_trained_and_raced_in_a_league(serv
 
 def corrects_the_reward_function(person: Person) -> None:
     page = person.goto("/submit/task/Racer")
-    for name, value in {
-        "name": "speedy",
-        "resources.memory": "2GiB",
-        "train.worlds": "8",
-        "train.iterations": "2",
-        "train.seed": "1",
-    }.items():
+    train = {"train.worlds": "8", "train.iterations": "2", "train.seed": "1"}
+    for name, value in {"name": "speedy", "resources.memory": "2GiB", **train}.items():
         page.locator(f'[name="{name}"]').fill(value)
     editor = page.locator('textarea[name="train.config.reward_function"]')
     editor.fill(WRONG)

@@ -12,13 +12,8 @@ from tests.conftest import Serving
 from tests.support.console.person import People, Person
 from tests.support.console.training import ended, job_of, state_of, submit
 
-SMALL = {
-    "name": "pole",
-    "resources.memory": "1GiB",
-    "train.worlds": "4",
-    "train.iterations": "100000",
-    "train.seed": "1",
-}
+TRAIN = {"train.worlds": "4", "train.iterations": "100000", "train.seed": "1"}
+SMALL = {"name": "pole", "resources.memory": "1GiB", **TRAIN}
 
 
 @pytest.fixture(scope="module")

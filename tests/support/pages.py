@@ -29,7 +29,12 @@ def run_page(page: str, directory: Path, then: str = "") -> str:
     if taken():
         pytest.skip(f"PORT {PORT}, WHICH THE PAGE USES, IS TAKEN ON THIS MACHINE")
     clone = directory / "muster"
-    shutil.copytree(REPOSITORY, clone, ignore=shutil.ignore_patterns(".git", ".venv", ".*cache", "build", "__pycache__"), symlinks=True)
+    shutil.copytree(
+        REPOSITORY,
+        clone,
+        ignore=shutil.ignore_patterns(".git", ".venv", ".*cache", "build", "__pycache__"),
+        symlinks=True,
+    )
     environment = clone / ".venv"
     environment.mkdir()
     for entry in Path(sys.executable).parent.parent.iterdir():

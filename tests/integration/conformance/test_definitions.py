@@ -25,9 +25,8 @@ def properties(nodes: int, *ranges: dict[str, Any], main: int = 0) -> dict[str, 
 
 
 def test_every_registration_is_a_revision_and_the_latest_active_one_counts(batch: Batch, parked: str) -> None:
-    first = batch.api.register_job_definition(
-        jobDefinitionName="def-revised", type="multinode", nodeProperties=properties(2, node_range("0:1"))
-    )
+    request = {"jobDefinitionName": "def-revised", "type": "multinode"}
+    first = batch.api.register_job_definition(**request, nodeProperties=properties(2, node_range("0:1")))
     second = batch.multinode("def-revised", "true")
     assert first["jobDefinitionName"] == "def-revised" and first["revision"] == 1
     assert first["jobDefinitionArn"] == f"{PREFIX}job-definition/def-revised:1"
@@ -66,9 +65,8 @@ def test_describing_shows_states_and_every_revision_by_name_number_or_arn(batch:
     assert [number for number, _ in revisions(jobDefinitionName="def-shown", status="ACTIVE")] == [4, 2, 1]
     assert revisions(jobDefinitions=["def-shown:3", arns[0]]) == [(3, "INACTIVE"), (1, "ACTIVE")]
     assert revisions(jobDefinitionName="def-unknown") == revisions(jobDefinitions=["def-unknown:1"]) == []
-    pages = batch.api.get_paginator("describe_job_definitions").paginate(
-        jobDefinitionName="def-shown", PaginationConfig={"PageSize": 3}
-    )
+    found = batch.api.get_paginator("describe_job_definitions")
+    pages = found.paginate(jobDefinitionName="def-shown", PaginationConfig={"PageSize": 3})
     assert [[each["revision"] for each in page["jobDefinitions"]] for page in pages] == [[4, 3, 2], [1]]
     with refused("at most 100"):
         batch.api.describe_job_definitions(jobDefinitions=["def-shown:1"] * 101)
@@ -247,11 +245,8 @@ def test_violations_of_the_aws_model_are_refused_in_the_words_of_aws(shared_serv
 
 def test_overrides_are_what_the_job_shows_and_the_definition_stays_as_it_is(batch: Batch, parked: str) -> None:
     definition = batch.multinode("def-kept", "true", target="0:1", env={"TASK": "Cartpole", "SEED": "1"})
-    override = {
-        "command": ["sh", "-c", "exit 3"],
-        "environment": pairs({"TASK": "Ant", "MAX_ITERATIONS": "5"}),
-        "resourceRequirements": [{"type": "MEMORY", "value": "32"}],
-    }
+    override = {"command": ["sh", "-c", "exit 3"], "resourceRequirements": [{"type": "MEMORY", "value": "32"}]}
+    override["environment"] = pairs({"TASK": "Ant", "MAX_ITERATIONS": "5"})
     overrides = {"nodePropertyOverrides": [{"targetNodes": "0:1", "containerOverrides": override}]}
     job = batch.submit(definition, queue=parked, nodeOverrides=overrides)
     shown = batch.describe(f"{job}#1")["container"]

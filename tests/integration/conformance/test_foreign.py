@@ -74,18 +74,12 @@ def test_another_service_is_refused_as_it_would_say(
 
 
 def test_requests_that_are_not_signed_or_signed_in_the_address_are_told_too(server: Serving) -> None:
-    unsigned = boto3.client(
-        "sts", endpoint_url=server.url, region_name="us-east-1", config=Config(signature_version=UNSIGNED)
-    )
+    unsigned_as = Config(signature_version=UNSIGNED)
+    unsigned = boto3.client("sts", endpoint_url=server.url, region_name="us-east-1", config=unsigned_as)
     with pytest.raises(ClientError, match="this is Muster"):
         unsigned.assume_role_with_web_identity(RoleArn="a" * 20, RoleSessionName="me", WebIdentityToken="token")
-    signed = boto3.client(
-        *("s3", "us-east-1"),
-        endpoint_url=server.url,
-        aws_access_key_id="any",
-        aws_secret_access_key="any",
-        config=Config(signature_version="s3v4"),
-    )
+    key = {"aws_access_key_id": "any", "aws_secret_access_key": "any", "config": Config(signature_version="s3v4")}
+    signed = boto3.client("s3", "us-east-1", endpoint_url=server.url, **key)
     answer = httpx.get(signed.generate_presigned_url("get_object", Params={"Bucket": "b", "Key": "k"}))
     assert answer.status_code == 501 and "<Code>NotImplemented</Code>" in answer.text
 
@@ -139,10 +133,9 @@ def test_arns_of_other_accounts_regions_and_services_are_refused(batch: Batch, p
 
 def test_a_job_of_the_api_starts_in_an_empty_directory_with_few_variables(batch: Batch) -> None:
     script = "ls -A; pwd; touch left-behind; ls -A; ls -A $HOME; env"
-    jobs = [
-        batch.submit(batch.single("iso-any", script, env={"MINE": "1"})),
-        batch.submit(batch.multinode("iso-muster", script, 1, container={"image": "muster"})),
-    ]
+    definitions = (batch.single("iso-any", script, env={"MINE": "1"}),)
+    definitions += (batch.multinode("iso-muster", script, 1, container={"image": "muster"}),)
+    jobs = [batch.submit(each) for each in definitions]
     for job in jobs:
         assert batch.wait(job)["status"] == "SUCCEEDED"
         directory, *listed = [line for line in batch.lines(job) if "=" not in line]

@@ -16,12 +16,10 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-import boto3
 import httpx
 import pytest
 import requests
 import schemathesis
-from botocore.config import Config
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
@@ -31,6 +29,7 @@ from tests.support.conformance import fuzz_requests as good
 from tests.support.conformance import fuzzing
 from tests.support.conformance.fuzzed import TOKEN, Fuzzed
 from tests.support.conformance.fuzzing import Call
+from tests.support.conformance.keys import client
 from tests.support.processes import processes_of
 
 EXAMPLES = int(os.environ.get("MUSTER_FUZZ", "300"))
@@ -39,13 +38,8 @@ IS_LONG = "MUSTER_FUZZ" in os.environ
 
 def share(part: float) -> settings:
     """This part of all examples; the same ones each time, unless many are asked for."""
-    return settings(
-        max_examples=max(1, int(EXAMPLES * part)),
-        derandomize=not IS_LONG,
-        database=None,
-        deadline=None,
-        suppress_health_check=list(HealthCheck),
-    )
+    always: dict[str, Any] = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
+    return settings(max_examples=max(1, int(EXAMPLES * part)), derandomize=not IS_LONG, **always)
 
 
 @pytest.fixture(scope="module")
@@ -79,56 +73,34 @@ def test_single_faults(fuzzed: Fuzzed) -> None:
         fuzzed.send(fuzzing.call_of(operation, request))
 
 
-@share(0.35)
-@given(call=fuzzing.batch_calls(spoil=False))
-def test_batch_requests_within_the_schema(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
+DRAWN = {
+    "Batch, within the schema": (0.35, fuzzing.batch_calls(spoil=False)),
+    "Batch, with faults": (0.3, fuzzing.batch_calls(spoil=True)),
+    "logs": (0.12, fuzzing.logs_calls()),
+    "tags": (0.08, fuzzing.tag_calls()),
+    "stray paths": (0.05, fuzzing.stray_calls()),
+    "resume": (0.05, fuzzing.resume_calls()),
+    "clone": (0.03, fuzzing.clone_calls()),
+}
+"""Kinds of drawn requests: which part of all they are."""
 
 
-@share(0.3)
-@given(call=fuzzing.batch_calls(spoil=True))
-def test_batch_requests_with_faults(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
+@pytest.mark.parametrize("kind", DRAWN)
+def test_requests_of_every_kind(fuzzed: Fuzzed, kind: str) -> None:
+    part, calls = DRAWN[kind]
 
+    def send(call: Call) -> None:
+        fuzzed.send(call)
 
-@share(0.12)
-@given(call=fuzzing.logs_calls())
-def test_logs_requests(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
-
-
-@share(0.08)
-@given(call=fuzzing.tag_calls())
-def test_tag_requests(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
-
-
-@share(0.05)
-@given(call=fuzzing.stray_calls())
-def test_stray_paths(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
-
-
-@share(0.05)
-@given(call=fuzzing.resume_calls())
-def test_resume_requests(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
-
-
-@share(0.03)
-@given(call=fuzzing.clone_calls())
-def test_clone_requests(fuzzed: Fuzzed, call: Call) -> None:
-    fuzzed.send(call)
+    share(part)(given(call=calls)(send))()
 
 
 def test_the_native_api_by_its_own_schema(fuzzed: Fuzzed) -> None:
-    schema = schemathesis.openapi.from_url(
-        f"{fuzzed.url}/api/openapi.json", headers={"Authorization": f"Bearer {TOKEN}"}
-    )
+    bearer = {"Authorization": f"Bearer {TOKEN}"}
+    schema = schemathesis.openapi.from_url(f"{fuzzed.url}/api/openapi.json", headers=bearer)
     operations = [each.ok() for each in schema.get_all_operations()]
-    known = st.sampled_from(
-        (None, None, fuzzed.names["gang"], "gang", fuzzed.names["run"], f"{fuzzed.names['array']}:1")
-    )
+    names = fuzzed.names
+    known = st.sampled_from((None, None, names["gang"], "gang", names["run"], f"{names['array']}:1"))
     with requests.Session() as session:
         session.trust_env = False
 
@@ -136,7 +108,7 @@ def test_the_native_api_by_its_own_schema(fuzzed: Fuzzed) -> None:
             for key in case.path_parameters if name else ():
                 case.path_parameters[key] = name
             case.query.pop("follow", None)  # the answer goes on until the job is over
-            sent = {"session": session, "headers": {"Authorization": f"Bearer {TOKEN}"}, "timeout": 60}
+            sent = {"session": session, "headers": bearer, "timeout": 60}
             answer = case.call(base_url=fuzzed.url, **sent)
             case.validate_response(answer, checks=[schemathesis.checks.not_a_server_error])
             fuzzed.counts[answer.status_code] += 1
@@ -189,17 +161,10 @@ def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed
     key = KeyStore(fuzzed.home).create("reader")
     statuses = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
     for _ in range(2):
-        batch = boto3.client(
-            "batch",
-            endpoint_url=fuzzed.url,
-            region_name="us-east-1",
-            aws_access_key_id=key.access_key_id,
-            aws_secret_access_key=key.secret,
-            config=Config(retries={"max_attempts": 0}),
-        )
+        batch = client(fuzzed.url, key.access_key_id, key.secret)
 
-        def pages(operation: str, member: str, client: Any = batch, **request: Any) -> list[Any]:
-            return [each for page in client.get_paginator(operation).paginate(**request) for each in page[member]]
+        def pages(operation: str, member: str, batch: Any = batch, **request: Any) -> list[Any]:
+            return [each for page in batch.get_paginator(operation).paginate(**request) for each in page[member]]
 
         assert pages("describe_compute_environments", "computeEnvironments")
         assert pages("describe_job_definitions", "jobDefinitions")

@@ -55,9 +55,8 @@ def test_others_are_served_during_attacks(target: tuple[Fuzzed, Target], name: s
         assert server.wait(jobs[-1])["status"] == "SUCCEEDED"
 
     rng = random.Random(f"{name} {os.environ.get('MUSTER_FUZZ', '')}")
-    sent = CLASSES[name](
-        victim, COUNT if name in ("expansion", "hangs up") else max(COUNT, 2 * DESCRIPTORS), rng, meanwhile
-    )
+    count = COUNT if name in ("expansion", "hangs up") else max(COUNT, 2 * DESCRIPTORS)
+    sent = CLASSES[name](victim, count, rng, meanwhile)
     assert jobs and server.log(jobs[-1])[0] == "alive"
     said = (server.home.parent / "stderr").stat().st_size - before
     assert said < MOST_LOG, f"the server wrote {said} bytes"

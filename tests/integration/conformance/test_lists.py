@@ -66,10 +66,8 @@ def test_filters_see_all_states_newest_first(batch: Batch, parked: str) -> None:
     ]:
         with refused(message):
             batch.api.list_jobs(jobQueue=parked, filters=filters)
-    typed = aws(
-        *(batch.server.url, "batch", "list-jobs", "--job-queue", parked),
-        *("--filters", "name=JOB_NAME,values=q-train*"),
-    )
+    filters = ("--filters", "name=JOB_NAME,values=q-train*")
+    typed = aws(batch.server.url, "batch", "list-jobs", "--job-queue", parked, *filters)
     assert [each["jobName"] for each in typed["jobSummaryList"]] == ["q-trainer", "q-train2", "Q-Train"]
 
 
@@ -83,12 +81,9 @@ def test_pages_follow_each_other_without_gap_or_repeat(batch: Batch, parked: str
     assert "nextToken" not in last and [each["jobId"] for each in last["jobSummaryList"]] == [jobs[0]]
     pages = batch.api.get_paginator("list_jobs").paginate(**by_name, PaginationConfig={"PageSize": 30})
     assert [each["jobId"] for page in pages for each in page["jobSummaryList"]] == jobs[::-1]
-    by_status = wait_for(
-        lambda: (
-            len(found := batch.api.list_jobs(jobQueue=parked, jobStatus="RUNNABLE")["jobSummaryList"]) >= 101 and found
-        ),
-        what="all of them RUNNABLE, on one page",
-    )
+    runnable = lambda: batch.api.list_jobs(jobQueue=parked, jobStatus="RUNNABLE")["jobSummaryList"]  # noqa: E731
+    on_one_page = "all of them RUNNABLE, on one page"
+    by_status = wait_for(lambda: len(found := runnable()) >= 101 and found, what=on_one_page)
     assert {each["jobId"] for each in by_status} >= set(jobs)
     # what comes between two pages moves nothing
     first = batch.api.list_jobs(**by_name, maxResults=50)
@@ -102,9 +97,8 @@ def test_pages_follow_each_other_without_gap_or_repeat(batch: Batch, parked: str
     queues = batch.api.get_paginator("describe_job_queues").paginate(PaginationConfig={"PageSize": 1})
     names = [each["jobQueueName"] for page in queues for each in page["jobQueues"]]
     assert names == sorted(set(names)) and {"default", parked} <= set(names)
-    compute_environments = batch.api.get_paginator("describe_compute_environments").paginate(
-        PaginationConfig={"PageSize": 1}
-    )
+    paginator = batch.api.get_paginator("describe_compute_environments")
+    compute_environments = paginator.paginate(PaginationConfig={"PageSize": 1})
     names = [each["computeEnvironmentName"] for page in compute_environments for each in page["computeEnvironments"]]
     assert names == sorted(set(names)) and parked in names
     front_of_queue = wait_for(lambda: len(found := batch.front(parked)) == 100 and found, what="a whole snapshot")

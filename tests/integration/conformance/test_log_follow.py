@@ -112,9 +112,8 @@ def test_a_long_log_comes_in_a_few_pieces_whole_and_in_order(shared_server: Serv
     assert [line["time"] for line in lines] == sorted(line["time"] for line in lines)
     assert len(pieces) < len(lines) / 50, "a line of its own for each would cost a hand-over between threads each"
     positions = {f"1/{line['node']}": line["position"] for line in lines[: len(lines) // 2]}
-    again = httpx.get(
-        f"{shared_server.url}/api/jobs/{job}/logs", params={"positions": json.dumps(positions)}, timeout=60
-    )
+    query = {"positions": json.dumps(positions)}
+    again = httpx.get(f"{shared_server.url}/api/jobs/{job}/logs", params=query, timeout=60)
     assert [json.loads(line) for line in again.text.splitlines()] == lines[len(lines) // 2 :]
     wrong = httpx.get(f"{shared_server.url}/api/jobs/{job}/logs", params={"positions": "[1]"})
     assert wrong.status_code == 400 and "positions: expected a JSON object" in wrong.json()["message"]

@@ -39,9 +39,8 @@ def test_no_malformed_request_is_a_server_error(shared_server: Serving, operatio
 
 @pytest.mark.parametrize("target", [None, "", "Logs_20140328.", "Logs_20140328.__class__"])
 def test_a_request_without_a_known_target_is_refused(shared_server: Serving, target: str | None) -> None:
-    answer = httpx.post(
-        shared_server.url, content=b"{}", headers={"X-Amz-Target": target} if target is not None else {}
-    )
+    headers = {} if target is None else {"X-Amz-Target": target}
+    answer = httpx.post(shared_server.url, content=b"{}", headers=headers)
     assert answer.status_code == 400 and "supported are" in answer.json()["message"]
 
 

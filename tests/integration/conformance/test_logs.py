@@ -186,9 +186,8 @@ def test_streams_are_merged_by_time_and_pages_are_the_same_as_one(shared_server:
     pages = list(logs.get_paginator("filter_log_events").paginate(**query, PaginationConfig={"PageSize": 50}))
     assert [event for page in pages for event in page["events"]] == events
     assert [len(page["events"]) for page in pages] == [50, 50, 50, 30]
-    reverse = logs.get_paginator("filter_log_events").paginate(
-        **query, startFromHead=False, PaginationConfig={"PageSize": 70}
-    )
+    backwards = {"startFromHead": False, "PaginationConfig": {"PageSize": 70}}
+    reverse = logs.get_paginator("filter_log_events").paginate(**query, **backwards)
     assert [event for page in reverse for event in page["events"]] == events[::-1]
     names = [stream_of(shared_server, trio, node) for node in (2, 0)]
     named = logs.filter_log_events(logGroupName=GROUP, logStreamNames=names, filterPattern=query["filterPattern"])
@@ -328,9 +327,8 @@ def test_streams_are_listed_by_their_last_event(shared_server: Serving, logs: An
     append(shared_server, counted, "the newest of all")
     paginator = logs.get_paginator("describe_log_streams")
     for descending in (True, False):
-        pages = paginator.paginate(
-            logGroupName=GROUP, orderBy="LastEventTime", descending=descending, PaginationConfig={"PageSize": 2}
-        )
+        query = {"logGroupName": GROUP, "orderBy": "LastEventTime", "descending": descending}
+        pages = paginator.paginate(**query, PaginationConfig={"PageSize": 2})
         streams = [stream for page in pages for stream in page["logStreams"]]
         times = [stream.get("lastEventTimestamp", 0) for stream in streams]
         assert times == sorted(times, reverse=descending)

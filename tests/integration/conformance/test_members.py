@@ -115,11 +115,8 @@ def members(shape: Any, above: str = "") -> Iterator[str]:
 def test_every_member_of_the_model_has_its_fate() -> None:
     model = botocore.session.Session().get_service_model("batch")
     fates = [*WORKS, *WITHOUT_EFFECT, *REFUSED]
-    found = {
-        path
-        for operation in ("RegisterJobDefinition", "SubmitJob")
-        for path in members(model.operation_model(operation).input_shape)
-    }
+    shapes = [model.operation_model(operation).input_shape for operation in ("RegisterJobDefinition", "SubmitJob")]
+    found = {path for shape in shapes for path in members(shape)}
 
     def fates_of(path: str) -> list[str]:
         return [fate for fate in fates if path == fate or path.startswith(f"{fate}.")]
@@ -155,8 +152,7 @@ def test_unsupported_members_are_refused_by_name(batch: Batch, member: str) -> N
             batch.register("member", kind, **definition)
         return
     arn = batch.register("member", kind, **definition)
-    job = change.get("job") or {
-        "nodeOverrides": {"nodePropertyOverrides": [{"targetNodes": "0:", **change["override"]}]}
-    }
+    overrides = [{"targetNodes": "0:", **change.get("override", {})}]
+    job = change.get("job") or {"nodeOverrides": {"nodePropertyOverrides": overrides}}
     with refused(name):
         batch.submit(arn, **job)

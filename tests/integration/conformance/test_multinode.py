@@ -32,9 +32,8 @@ def overdue(batch: Batch) -> Iterator[str]:
     The API takes no timeout below 60 s, so the start of its attempt is set back in the database instead of waiting.
     """
     script = f'trap "echo asked to leave" TERM; echo ready; [ {NODE} = 0 ] || exec sleep 600; {STAY}'
-    definition = batch.multinode(
-        "mnp-overdue", script, timeout={"attemptDurationSeconds": 60}, retryStrategy={"attempts": 3}
-    )
+    limits = {"timeout": {"attemptDurationSeconds": 60}, "retryStrategy": {"attempts": 3}}
+    definition = batch.multinode("mnp-overdue", script, **limits)
     job = batch.submit(definition)
     batch.wait(job, "RUNNING")
     wait_for(lambda: "ready" in batch.lines(job), what="the trap")
@@ -148,12 +147,10 @@ def test_nodes_are_listed_with_their_index(batch: Batch, tmp_path: Path) -> None
     assert batch.api.list_jobs(multiNodeJobId=job)["jobSummaryList"] == [], "without a status: those that run"
     listed = batch.api.list_jobs(multiNodeJobId=job, jobStatus="SUCCEEDED")["jobSummaryList"]
     assert [each["jobId"] for each in listed] == [f"{job}#{node}" for node in range(3)]
-    assert [each["nodeProperties"] for each in listed] == [
-        {"isMainNode": node == 0, "numNodes": 3, "nodeIndex": node} for node in range(3)
-    ]
-    pages = batch.api.get_paginator("list_jobs").paginate(
-        multiNodeJobId=job, jobStatus="SUCCEEDED", PaginationConfig={"PageSize": 2}
-    )
+    shown = [{"isMainNode": node == 0, "numNodes": 3, "nodeIndex": node} for node in range(3)]
+    assert [each["nodeProperties"] for each in listed] == shown
+    query = {"multiNodeJobId": job, "jobStatus": "SUCCEEDED", "PaginationConfig": {"PageSize": 2}}
+    pages = batch.api.get_paginator("list_jobs").paginate(**query)
     sizes = [[each["nodeProperties"]["nodeIndex"] for each in page["jobSummaryList"]] for page in pages]
     assert sizes == [[0, 1], [2]]
     for query in ({}, {"jobQueue": "default", "multiNodeJobId": job}, {"arrayJobId": job, "multiNodeJobId": job}):
@@ -340,9 +337,8 @@ def test_a_timeout_is_sigterm_then_thirty_seconds_then_sigkill_and_no_retry(batc
     assert (detail["isTerminated"], detail["isCancelled"]) == (False, False)
     [attempt] = detail["attempts"]
     assert attempt["container"]["exitCode"] == 137 and detail["timeout"] == {"attemptDurationSeconds": 60}
-    events = batch.logs.get_log_events(
-        logGroupName="/aws/batch/job", logStreamName=attempt["container"]["logStreamName"], startFromHead=True
-    )["events"]
+    stream = {"logGroupName": "/aws/batch/job", "logStreamName": attempt["container"]["logStreamName"]}
+    events = batch.logs.get_log_events(**stream, startFromHead=True)["events"]
     [asked] = [event["timestamp"] for event in events if event["message"] == "asked to leave"]
     assert attempt["stoppedAt"] - asked >= 29_000, "it had 30 s to leave"
     assert batch.describe(f"{overdue}#1")["container"]["exitCode"] == 143, "the child left when it was asked"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -37,77 +36,41 @@ OWN_LEAGUE = "+ + + + - - -"
 DEFINITION_READ = "+ + + h h h h"
 """Names and commands of definitions are everybody's to see, values only of one's own."""
 
+OF = Operation
 TABLE = {
-    Operation.REGISTER_JOB_DEFINITION: OWN_WRITE,
-    Operation.DESCRIBE_JOB_DEFINITIONS: DEFINITION_READ,
-    Operation.DEREGISTER_JOB_DEFINITION: OWN_WRITE,
-    Operation.SUBMIT_JOB: OWN_WRITE,
-    Operation.DESCRIBE_JOBS: OWN_LIST,
-    Operation.LIST_JOBS: OWN_READ,
-    Operation.TERMINATE_JOB: OWN_WRITE,
-    Operation.CANCEL_JOB: OWN_WRITE,
-    Operation.TERMINATE_JOBS: OWN_WRITES,
-    Operation.CANCEL_JOBS: OWN_WRITES,
-    Operation.CREATE_JOB_QUEUE: SHARED_WRITE,
-    Operation.DESCRIBE_JOB_QUEUES: SHARED_READ,
-    Operation.UPDATE_JOB_QUEUE: SHARED_WRITE,
-    Operation.DELETE_JOB_QUEUE: SHARED_WRITE,
-    Operation.GET_JOB_QUEUE_SNAPSHOT: OWN_READ,
-    Operation.CREATE_COMPUTE_ENVIRONMENT: SHARED_WRITE,
-    Operation.DESCRIBE_COMPUTE_ENVIRONMENTS: SHARED_READ,
-    Operation.UPDATE_COMPUTE_ENVIRONMENT: SHARED_WRITE,
-    Operation.DELETE_COMPUTE_ENVIRONMENT: SHARED_WRITE,
-    Operation.CREATE_SCHEDULING_POLICY: SHARED_WRITE,
-    Operation.DESCRIBE_SCHEDULING_POLICIES: SHARED_READ,
-    Operation.LIST_SCHEDULING_POLICIES: SHARED_READ,
-    Operation.UPDATE_SCHEDULING_POLICY: SHARED_WRITE,
-    Operation.DELETE_SCHEDULING_POLICY: SHARED_WRITE,
-    Operation.TAG_RESOURCE: OWN_WRITE,
-    Operation.UNTAG_RESOURCE: OWN_WRITE,
-    Operation.LIST_TAGS_FOR_RESOURCE: OWN_READ,
-    Operation.GET_LOG_EVENTS: OWN_READ,
-    Operation.FILTER_LOG_EVENTS: OWN_LIST,
-    Operation.DESCRIBE_LOG_STREAMS: OWN_LIST,
-    Operation.DESCRIBE_LOG_GROUPS: SHARED_READ,
-    Operation.START_LIVE_TAIL: OWN_LIST,
-    Operation.READ_HEALTH: SHARED_READ,
-    Operation.READ_DOCUMENTATION: SHARED_READ,
-    Operation.READ_MONITORING: ALL_READ,
-    Operation.READ_CAPACITY: SHARED_READ,
-    Operation.READ_QUEUES: OWN_LIST,
-    Operation.PLAN: OWN_WRITE,
-    Operation.FIT: OWN_WRITE,
-    Operation.FIND_JOBS: OWN_LIST,
-    Operation.READ_JOB: OWN_READ,
-    Operation.READ_JOB_LOGS: OWN_READ,
-    Operation.CHECKPOINT_JOB: OWN_WRITE,
-    Operation.READ_JOB_STACKS: OWN_READ,
-    Operation.LIST_RUNS: OWN_LIST,
-    Operation.READ_RUN: OWN_READ,
-    Operation.READ_CHECKPOINTS: OWN_READ,
-    Operation.READ_METRICS: OWN_READ,
-    Operation.READ_EVALUATIONS: OWN_READ,
-    Operation.RESUME_RUN: OWN_WRITE,
-    Operation.CLONE_RUN: OWN_WRITE,
-    Operation.REGISTER_MODEL: OWN_WRITE,
-    Operation.LIST_MODELS: OWN_LIST,
-    Operation.READ_MODEL: OWN_READ,
-    Operation.LIST_LEAGUES: SHARED_READ,
-    Operation.CREATE_LEAGUE: OWN_LEAGUE,
-    Operation.READ_LEAGUE: SHARED_READ,
-    Operation.READ_LEAGUE_TABLE: SHARED_READ,
-    Operation.READ_ENTRY: SHARED_READ,
-    Operation.RACE: OWN_WRITE,
-    Operation.RERUN_ENTRY: OWN_WRITE,
-    Operation.ENTER_LEAGUE: OWN_WRITE,
-    Operation.DISQUALIFY: OWN_WRITE,
-    Operation.READ_KEYS: ALL_READ,
-    Operation.CREATE_KEY: SHARED_WRITE,
-    Operation.DELETE_KEY: SHARED_WRITE,
-    Operation.LIST_TRACKS: SHARED_READ,
-    Operation.MAKE_TRACK: SHARED_WRITE,
-    Operation.READ_WEBHOOKS: ALL_READ,
-    Operation.TEST_WEBHOOK: SHARED_WRITE,
+    operation: row
+    for row, operations in {
+        OWN_WRITE: (
+            *(OF.REGISTER_JOB_DEFINITION, OF.DEREGISTER_JOB_DEFINITION, OF.SUBMIT_JOB, OF.TERMINATE_JOB),
+            *(OF.CANCEL_JOB, OF.TAG_RESOURCE, OF.UNTAG_RESOURCE, OF.PLAN, OF.FIT, OF.CHECKPOINT_JOB, OF.RESUME_RUN),
+            *(OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.RERUN_ENTRY, OF.ENTER_LEAGUE, OF.DISQUALIFY),
+        ),
+        DEFINITION_READ: (OF.DESCRIBE_JOB_DEFINITIONS,),
+        OWN_LIST: (
+            *(OF.DESCRIBE_JOBS, OF.FILTER_LOG_EVENTS, OF.DESCRIBE_LOG_STREAMS, OF.START_LIVE_TAIL, OF.READ_QUEUES),
+            *(OF.FIND_JOBS, OF.LIST_RUNS, OF.LIST_MODELS),
+        ),
+        OWN_READ: (
+            *(OF.LIST_JOBS, OF.GET_JOB_QUEUE_SNAPSHOT, OF.LIST_TAGS_FOR_RESOURCE, OF.GET_LOG_EVENTS, OF.READ_JOB),
+            *(OF.READ_JOB_LOGS, OF.READ_JOB_STACKS, OF.READ_RUN, OF.READ_CHECKPOINTS, OF.READ_METRICS),
+            *(OF.READ_EVALUATIONS, OF.READ_MODEL),
+        ),
+        OWN_WRITES: (OF.TERMINATE_JOBS, OF.CANCEL_JOBS),
+        SHARED_WRITE: (
+            *(OF.CREATE_JOB_QUEUE, OF.UPDATE_JOB_QUEUE, OF.DELETE_JOB_QUEUE, OF.CREATE_COMPUTE_ENVIRONMENT),
+            *(OF.UPDATE_COMPUTE_ENVIRONMENT, OF.DELETE_COMPUTE_ENVIRONMENT, OF.CREATE_SCHEDULING_POLICY),
+            *(OF.UPDATE_SCHEDULING_POLICY, OF.DELETE_SCHEDULING_POLICY, OF.CREATE_KEY, OF.DELETE_KEY, OF.MAKE_TRACK),
+            OF.TEST_WEBHOOK,
+        ),
+        SHARED_READ: (
+            *(OF.DESCRIBE_JOB_QUEUES, OF.DESCRIBE_COMPUTE_ENVIRONMENTS, OF.DESCRIBE_SCHEDULING_POLICIES),
+            *(OF.LIST_SCHEDULING_POLICIES, OF.DESCRIBE_LOG_GROUPS, OF.READ_HEALTH, OF.READ_DOCUMENTATION),
+            *(OF.READ_CAPACITY, OF.LIST_LEAGUES, OF.READ_LEAGUE, OF.READ_LEAGUE_TABLE, OF.READ_ENTRY, OF.LIST_TRACKS),
+        ),
+        ALL_READ: (OF.READ_MONITORING, OF.READ_KEYS, OF.READ_WEBHOOKS),
+        OWN_LEAGUE: (OF.CREATE_LEAGUE,),
+    }.items()
+    for operation in operations
 }
 ARN = "arn:aws:batch:us-east-1:000000000000:"
 
@@ -115,10 +78,10 @@ ARN = "arn:aws:batch:us-east-1:000000000000:"
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     world = World(tmp_path_factory.mktemp("home"))
-    yield world
-    for each in (*world.clients.values(), world.http):
-        each.close()
-    world.server.close()
+    with world.server:
+        yield world
+        for each in (*world.clients.values(), world.http):
+            each.close()
 
 
 def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]]:
@@ -134,95 +97,74 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         """The name of a new definition of the key ``robots``."""
         return world.register("robots", world.fresh()).rpartition("/")[2].partition(":")[0]
 
-    group, order = {"logGroupName": members.LOG_GROUP}, [{"order": 1, "computeEnvironment": "local"}]
+    def policy() -> str:
+        return world.made("CreateSchedulingPolicy", "name", fairsharePolicy={})
+
+    group = {"logGroupName": members.LOG_GROUP}
+    queue = {"priority": 1, "computeEnvironmentOrder": [{"order": 1, "computeEnvironment": "local"}]}
     job = {"jobName": "x", "jobQueue": "robots", "jobDefinition": world.definition}
     disabled = {"type": "UNMANAGED", "state": "DISABLED"}
-    of = Operation
-    found = [
-        aws(of.REGISTER_JOB_DEFINITION, **{**definition(""), "jobDefinitionName": registered}),
-        aws(of.DESCRIBE_JOB_DEFINITIONS, jobDefinitions=[world.definition]),
-        aws(of.DEREGISTER_JOB_DEFINITION, jobDefinition=lambda: f"{registered()}:1"),
-        aws(of.SUBMIT_JOB, **job),
-        aws(of.DESCRIBE_JOBS, jobs=[world.job]),
-        aws(of.LIST_JOBS, jobQueue="robots", filters=[{"name": "JOB_NAME", "values": ["theirs"]}]),
-        aws(of.TERMINATE_JOB, jobId=world.job, reason="x"),
-        aws(of.CANCEL_JOB, jobId=world.job, reason="x"),
-        aws(of.TERMINATE_JOBS, jobs=[world.job], reason="x"),
-        aws(of.CANCEL_JOBS, jobs=[world.job], reason="x"),
-        aws(of.CREATE_JOB_QUEUE, jobQueueName=world.fresh, priority=1, computeEnvironmentOrder=order),
-        aws(of.DESCRIBE_JOB_QUEUES),
-        aws(of.UPDATE_JOB_QUEUE, jobQueue="robots", priority=9),
-        aws(
-            of.DELETE_JOB_QUEUE,
-            jobQueue=lambda: world.made(
-                "CreateJobQueue", "jobQueueName", priority=1, computeEnvironmentOrder=order, state="DISABLED"
-            ),
+    of, empty = Operation, {"fairsharePolicy": {}}
+    requests: dict[Operation, dict[str, Any]] = {
+        of.REGISTER_JOB_DEFINITION: {**definition(""), "jobDefinitionName": registered},
+        of.DESCRIBE_JOB_DEFINITIONS: dict(jobDefinitions=[world.definition]),
+        of.DEREGISTER_JOB_DEFINITION: dict(jobDefinition=lambda: f"{registered()}:1"),
+        of.SUBMIT_JOB: dict(**job),
+        of.DESCRIBE_JOBS: dict(jobs=[world.job]),
+        of.LIST_JOBS: dict(jobQueue="robots", filters=[{"name": "JOB_NAME", "values": ["theirs"]}]),
+        of.TERMINATE_JOB: dict(jobId=world.job, reason="x"),
+        of.CANCEL_JOB: dict(jobId=world.job, reason="x"),
+        of.TERMINATE_JOBS: dict(jobs=[world.job], reason="x"),
+        of.CANCEL_JOBS: dict(jobs=[world.job], reason="x"),
+        of.CREATE_JOB_QUEUE: dict(jobQueueName=world.fresh, **queue),
+        of.DESCRIBE_JOB_QUEUES: {},
+        of.UPDATE_JOB_QUEUE: dict(jobQueue="robots", priority=9),
+        of.DELETE_JOB_QUEUE: dict(
+            jobQueue=lambda: world.made("CreateJobQueue", "jobQueueName", **queue, state="DISABLED"),
         ),
-        aws(of.GET_JOB_QUEUE_SNAPSHOT, jobQueue="robots"),
-        aws(of.CREATE_COMPUTE_ENVIRONMENT, computeEnvironmentName=world.fresh, type="UNMANAGED"),
-        aws(of.DESCRIBE_COMPUTE_ENVIRONMENTS),
-        aws(of.UPDATE_COMPUTE_ENVIRONMENT, computeEnvironment="local", state="ENABLED"),
-        aws(
-            of.DELETE_COMPUTE_ENVIRONMENT,
+        of.GET_JOB_QUEUE_SNAPSHOT: dict(jobQueue="robots"),
+        of.CREATE_COMPUTE_ENVIRONMENT: dict(computeEnvironmentName=world.fresh, type="UNMANAGED"),
+        of.DESCRIBE_COMPUTE_ENVIRONMENTS: {},
+        of.UPDATE_COMPUTE_ENVIRONMENT: dict(computeEnvironment="local", state="ENABLED"),
+        of.DELETE_COMPUTE_ENVIRONMENT: dict(
             computeEnvironment=lambda: world.made("CreateComputeEnvironment", "computeEnvironmentName", **disabled),
         ),
-        aws(of.CREATE_SCHEDULING_POLICY, name=world.fresh, fairsharePolicy={}),
-        aws(of.DESCRIBE_SCHEDULING_POLICIES, arns=[]),
-        aws(of.LIST_SCHEDULING_POLICIES),
-        aws(
-            of.UPDATE_SCHEDULING_POLICY,
-            arn=lambda: world.made("CreateSchedulingPolicy", "name", fairsharePolicy={}),
-            fairsharePolicy={},
+        of.CREATE_SCHEDULING_POLICY: dict(name=world.fresh, fairsharePolicy={}),
+        of.DESCRIBE_SCHEDULING_POLICIES: dict(arns=[]),
+        of.LIST_SCHEDULING_POLICIES: {},
+        of.UPDATE_SCHEDULING_POLICY: dict(arn=policy, **empty),
+        of.DELETE_SCHEDULING_POLICY: dict(arn=policy),
+        of.TAG_RESOURCE: dict(resourceArn=f"{ARN}job/{world.job}", tags={"a": "b"}),
+        of.UNTAG_RESOURCE: dict(resourceArn=f"{ARN}job/{world.job}", tagKeys=["a"]),
+        of.LIST_TAGS_FOR_RESOURCE: dict(resourceArn=f"{ARN}job/{world.job}"),
+        of.GET_LOG_EVENTS: dict(**group, logStreamName=world.stream),
+        of.FILTER_LOG_EVENTS: dict(**group, filterPattern='"robots line"'),
+        of.DESCRIBE_LOG_STREAMS: dict(**group),
+        of.DESCRIBE_LOG_GROUPS: {},
+    }
+    others: dict[Operation, Callable[[str], httpx.Response]] = {
+        of.START_LIVE_TAIL: lambda key: live_tail(world, key),
+        of.CREATE_LEAGUE: lambda key: world.native_call(
+            key, of.CREATE_LEAGUE, {"name": world.fresh(), "track": ["oval"]}
         ),
-        aws(of.DELETE_SCHEDULING_POLICY, arn=lambda: world.made("CreateSchedulingPolicy", "name", fairsharePolicy={})),
-        aws(of.TAG_RESOURCE, resourceArn=f"{ARN}job/{world.job}", tags={"a": "b"}),
-        aws(of.UNTAG_RESOURCE, resourceArn=f"{ARN}job/{world.job}", tagKeys=["a"]),
-        aws(of.LIST_TAGS_FOR_RESOURCE, resourceArn=f"{ARN}job/{world.job}"),
-        aws(of.GET_LOG_EVENTS, **group, logStreamName=world.stream),
-        aws(of.FILTER_LOG_EVENTS, **group, filterPattern='"robots line"'),
-        aws(of.DESCRIBE_LOG_STREAMS, **group),
-        aws(of.DESCRIBE_LOG_GROUPS),
-        lambda key: live_tail(world, key),
-        of_ours(of.READ_HEALTH),
-        of_ours(of.READ_DOCUMENTATION),
-        of_ours(of.READ_MONITORING),
-        of_ours(of.READ_CAPACITY),
-        of_ours(of.READ_QUEUES),
-        of_ours(of.PLAN, {"definition": definition("x"), "queue": "robots"}),
-        of_ours(of.FIT, {"definition": definition("x"), "queue": "robots"}),
-        of_ours(of.FIND_JOBS),
-        of_ours(of.READ_JOB),
-        of_ours(of.READ_JOB_LOGS),
-        of_ours(of.CHECKPOINT_JOB),
-        of_ours(of.READ_JOB_STACKS),
-        of_ours(of.LIST_RUNS),
-        of_ours(of.READ_RUN),
-        of_ours(of.READ_CHECKPOINTS),
-        of_ours(of.READ_METRICS),
-        of_ours(of.READ_EVALUATIONS),
-        of_ours(of.RESUME_RUN, {}),
-        of_ours(of.CLONE_RUN, {"name": "x"}),
-        of_ours(of.REGISTER_MODEL, {"name": "x"}),
-        of_ours(of.LIST_MODELS),
-        of_ours(of.READ_MODEL),
-        of_ours(of.LIST_LEAGUES),
-        lambda key: world.native_call(key, of.CREATE_LEAGUE, {"name": world.fresh(), "track": ["oval"]}),
-        of_ours(of.READ_LEAGUE),
-        of_ours(of.READ_LEAGUE_TABLE),
-        of_ours(of.READ_ENTRY),
-        of_ours(of.RACE, {"model": world.run}),
-        of_ours(of.RERUN_ENTRY, {}),
-        of_ours(of.ENTER_LEAGUE, {"model": world.run, "job": world.job}),
-        of_ours(of.DISQUALIFY, {"reason": "x"}),
-        of_ours(of.READ_KEYS),
-        lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
-        lambda key: world.delete_key(key),
-        of_ours(of.LIST_TRACKS),
-        lambda key: world.native_call(key, of.MAKE_TRACK, {"name": world.fresh(), "seed": 7}),
-        of_ours(of.READ_WEBHOOKS),
-        of_ours(of.TEST_WEBHOOK, {}),
-    ]
-    return dict(zip(Operation, found, strict=True))
+        of.CREATE_KEY: lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
+        of.DELETE_KEY: world.delete_key,
+        of.MAKE_TRACK: lambda key: world.native_call(key, of.MAKE_TRACK, {"name": world.fresh(), "seed": 7}),
+    }
+    bodies: dict[Operation, dict[str, Any]] = {
+        of.PLAN: {"definition": definition("x"), "queue": "robots"},
+        of.FIT: {"definition": definition("x"), "queue": "robots"},
+        of.RESUME_RUN: {},
+        of.CLONE_RUN: {"name": "x"},
+        of.REGISTER_MODEL: {"name": "x"},
+        of.RACE: {"model": world.run},
+        of.RERUN_ENTRY: {},
+        of.ENTER_LEAGUE: {"model": world.run, "job": world.job},
+        of.DISQUALIFY: {"reason": "x"},
+        of.TEST_WEBHOOK: {},
+    }
+    others |= {each: aws(each, **request) for each, request in requests.items()}
+    return {each: others.get(each) or of_ours(each, bodies.get(each)) for each in Operation}
 
 
 def live_tail(world: World, key: str) -> httpx.Response:
@@ -247,12 +189,8 @@ def printing(world: World) -> Iterator[None]:
     gate = world.server.home / "gate"
     ids = []
     for queue in ("robots", "lab"):
-        changes = {
-            "name": "printing",
-            "environment": {},
-            "command": ["sh", "-c", f"until [ -e {gate} ]; do echo {queue} line; sleep 0.05; done"],
-        }
-        ids.append(world.native("admin", queue, **changes)[0])
+        command = ["sh", "-c", f"until [ -e {gate} ]; do echo {queue} line; sleep 0.05; done"]
+        ids.append(world.native("admin", queue, name="printing", environment={}, command=command)[0])
         world.server.wait(ids[-1], "RUNNING")
     yield
     gate.touch()
@@ -310,12 +248,8 @@ def refused(text: str, call: Callable[..., Any], *arguments: Any, **request: Any
 def submission(name: str, queue: str, **environment: str) -> dict[str, Any]:
     pairs = [{"name": key, "value": value} for key, value in environment.items()]
     overrides = [{"targetNodes": "0:", "containerOverrides": {"environment": pairs}}]
-    return {
-        "jobName": "x",
-        "jobQueue": queue,
-        "jobDefinition": name,
-        "nodeOverrides": {"nodePropertyOverrides": overrides},
-    }
+    job = {"jobName": "x", "jobQueue": queue, "jobDefinition": name}
+    return {**job, "nodeOverrides": {"nodePropertyOverrides": overrides}}
 
 
 def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_source(world: World) -> None:
@@ -327,12 +261,10 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
     foreign = f"run {world.run} belongs to job queue robots"
     refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_RUN=world.run))
     named = definition("named")
-    named["nodeProperties"]["nodeRangeProperties"][0]["container"]["environment"].append(
-        {"name": "MUSTER_RUN", "value": world.run}
-    )
+    container = named["nodeProperties"]["nodeRangeProperties"][0]["container"]
+    container["environment"].append({"name": "MUSTER_RUN", "value": world.run})
     inside = world.register("lab", "named", **named)
     refused(foreign, lab.batch, "SubmitJob", jobName="x", jobQueue="lab", jobDefinition=inside)
-    container = named["nodeProperties"]["nodeRangeProperties"][0]["container"]
     lab.batch("RegisterJobDefinition", jobDefinitionName="single", type="container", containerProperties=container)
     refused(foreign, lab.batch, "SubmitJob", jobName="x", jobQueue="lab", jobDefinition="single")
     for change in ("name=labs2", "queue=lab"):
@@ -348,11 +280,9 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
     train = {"train": {"task": "Cartpole", "worlds": 4, "iterations": 9}, "evaluation": {"every": 1, "queue": "robots"}}
     elsewhere = submission(own, "lab", MUSTER_SPEC=json.dumps({"name": "x", **train}))
     refused("it concerns job queue robots", lab.batch, "SubmitJob", **elsewhere)
-    to_come = {
-        **submission(own, "lab", MUSTER_SPEC='{"evaluate": {"run": "not-yet"}}'),
-        "dependsOn": [{"jobId": waits}],
-    }
-    refused("run not-yet belongs to no known job queue", lab.batch, "SubmitJob", **to_come)
+    to_come = submission(own, "lab", MUSTER_SPEC='{"evaluate": {"run": "not-yet"}}')
+    unknown = "run not-yet belongs to no known job queue"
+    refused(unknown, lab.batch, "SubmitJob", **to_come, dependsOn=[{"jobId": waits}])
     waiting = {"jobName": "x", "jobQueue": "lab", "jobDefinition": own, "dependsOn": [{"jobId": world.job}]}
     refused("job theirs .* belongs to job queue robots", lab.batch, "SubmitJob", **waiting)
     assert epoch.read_bytes() == before
@@ -366,11 +296,8 @@ def test_a_definition_of_another_key_is_used_only_where_its_tag_names_the_queue(
     arn = world.register("admin", "common")
     request = {"jobName": "x", "jobQueue": "lab", "jobDefinition": "common"}
     refused("job definition common was registered by key admin.*muster:queues", lab.batch, "SubmitJob", **request)
-    httpx.post(
-        f"{world.url}/v1/tags/{arn}",
-        json={"tags": {"muster:queues": "other lab"}},
-        headers={"Authorization": f"Bearer {TOKEN}"},
-    ).raise_for_status()
+    tags, bearer = {"muster:queues": "other lab"}, {"Authorization": f"Bearer {TOKEN}"}
+    httpx.post(f"{world.url}/v1/tags/{arn}", json={"tags": tags}, headers=bearer).raise_for_status()
     lab.batch("SubmitJob", **request)
     refused("key lab may use", lab.batch, "RegisterJobDefinition", **definition("common"))
     refused("key robots may use", world.clients["robots"].batch, "SubmitJob", **{**request, "jobQueue": "robots"})
@@ -390,11 +317,7 @@ def test_names_of_others_are_not_told_by_errors_and_not_found_by_name(world: Wor
     assert lab.get("/api/capacity")["queues"] == ["lab"]
     assert world.server.muster("queues").returncode == 1  # without a key
     for key, names in (("lab", {"lab"}), ("admin", {"default", "lab", "robots"})):
-        os.environ["MUSTER_TOKEN"] = world.tokens[key]
-        try:
-            shown = json.loads(world.server.muster("queues", "--json").stdout)
-        finally:
-            del os.environ["MUSTER_TOKEN"]
+        shown = json.loads(world.server.muster("queues", "--json", MUSTER_TOKEN=world.tokens[key]).stdout)
         assert {queue["jobQueueName"] for queue in shown} >= names and ("robots" in str(shown)) is (key == "admin")
 
 
@@ -410,12 +333,8 @@ def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> N
     assert world.clients["robots"].get("/api/runs/moved")["queue"] == "robots"
     refused("run moved belongs to job queue robots", world.clients["lab"].get, "/api/runs/moved")
     own = world.register("robots", "continuing")
-    refused(
-        "no known job queue",
-        world.clients["robots"].batch,
-        "SubmitJob",
-        **submission(own, "robots", MUSTER_RUN="older"),
-    )
-    job = world.clients["admin"].batch("SubmitJob", **submission(own, "robots", MUSTER_RUN="older"))["jobId"]
+    older = submission(own, "robots", MUSTER_RUN="older")
+    refused("no known job queue", world.clients["robots"].batch, "SubmitJob", **older)
+    job = world.clients["admin"].batch("SubmitJob", **older)["jobId"]
     world.server.wait(job, "SUCCEEDED")
     assert world.clients["robots"].get("/api/runs/older")["queue"] == "robots"

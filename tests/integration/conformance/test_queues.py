@@ -27,9 +27,8 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
         "securityGroupIds": ["sg-none"],
         "instanceRole": "none",
     }
-    created = batch.api.create_compute_environment(
-        computeEnvironmentName="q-ce", type="MANAGED", computeResources=resources, tags={"a": "1"}
-    )
+    request = {"computeEnvironmentName": "q-ce", "type": "MANAGED", "tags": {"a": "1"}}
+    created = batch.api.create_compute_environment(**request, computeResources=resources)
     assert created["computeEnvironmentArn"] == f"{PREFIX}compute-environment/q-ce"
     arn = created["computeEnvironmentArn"]
     [shown] = batch.api.describe_compute_environments(computeEnvironments=[arn])["computeEnvironments"]
@@ -40,9 +39,8 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
     batch.queue("q-on-ce", "q-ce")
     with refused("q-ce is ENABLED"):
         batch.api.delete_compute_environment(computeEnvironment="q-ce")
-    batch.api.update_compute_environment(
-        computeEnvironment=arn, state="DISABLED", computeResources={"maxvCpus": 4, "desiredvCpus": 2}
-    )
+    fewer = {"maxvCpus": 4, "desiredvCpus": 2}
+    batch.api.update_compute_environment(computeEnvironment=arn, state="DISABLED", computeResources=fewer)
     [shown] = batch.api.describe_compute_environments(computeEnvironments=["q-ce"])["computeEnvironments"]
     assert shown["computeResources"] == {**resources, "maxvCpus": 4, "desiredvCpus": 2}
     assert shown["state"] == "DISABLED"
@@ -67,12 +65,7 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
 
 
 def test_a_queue_from_its_creation_to_its_end(batch: Batch, parked: str) -> None:
-    limit = {
-        "reason": NO_ROOM,
-        "state": "RUNNABLE",
-        "maxTimeSeconds": 600,
-        "action": "CANCEL",
-    }
+    limit = {"reason": NO_ROOM, "state": "RUNNABLE", "maxTimeSeconds": 600, "action": "CANCEL"}
     arn = batch.api.create_job_queue(
         jobQueueName="q-lives",
         priority=7,
@@ -175,17 +168,13 @@ def test_a_job_that_is_stuck_at_the_head_is_cancelled_by_its_queues_limit(server
 
 
 def test_a_scheduling_policy_can_be_replaced_but_not_taken_away(batch: Batch, parked: str) -> None:
-    fair = {
-        "shareDecaySeconds": 3600,
-        "computeReservation": 10,
-        "shareDistribution": [{"shareIdentifier": "A*", "weightFactor": 0.5}],
-    }
+    shares = [{"shareIdentifier": "A*", "weightFactor": 0.5}]
+    fair = {"shareDecaySeconds": 3600, "computeReservation": 10, "shareDistribution": shares}
     arn = batch.api.create_scheduling_policy(name="q-fair", fairsharePolicy=fair, tags={"a": "1"})["arn"]
     other = batch.api.create_scheduling_policy(name="q-fair-2", fairsharePolicy={})["arn"]
     assert arn == f"{PREFIX}scheduling-policy/q-fair"
-    [shown] = batch.api.describe_scheduling_policies(arns=[arn, f"{PREFIX}scheduling-policy/q-none"])[
-        "schedulingPolicies"
-    ]
+    asked = [arn, f"{PREFIX}scheduling-policy/q-none"]
+    [shown] = batch.api.describe_scheduling_policies(arns=asked)["schedulingPolicies"]
     assert shown == {"name": "q-fair", "arn": arn, "fairsharePolicy": fair, "tags": {"a": "1"}}
     with refused("q-fair exists already"):
         batch.api.create_scheduling_policy(name="q-fair", fairsharePolicy={})

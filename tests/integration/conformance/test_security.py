@@ -282,10 +282,8 @@ def test_garbage_in_headers_is_refused_in_one_line(
     served: Serving, key: Key, authorization: bytes, date: bytes
 ) -> None:
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ").encode()
-    headers = [
-        (b"Authorization", authorization.replace(b"%s", key.access_key_id.encode())),
-        (b"X-Amz-Date", date.replace(b"{now}", now)),
-    ]
+    signature = authorization.replace(b"%s", key.access_key_id.encode())
+    headers = [(b"Authorization", signature), (b"X-Amz-Date", date.replace(b"{now}", now))]
     answer = httpx.post(f"{served.url}/v1/describejobs", headers=headers, content=b"\x00\xff")
     assert answer.status_code == 403 and answer.headers["x-amzn-errortype"] in SIGNATURE_ERRORS, answer.text
     assert "\n" not in answer.json()["message"]

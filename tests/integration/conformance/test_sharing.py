@@ -61,13 +61,10 @@ def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch,
     too_wide = batch.submit(wide, queue="q-low")
     impossible = batch.submit(gang)
     pending = batch.submit(plain, queue="q-low", dependsOn=[{"jobId": head}])
-    free = (
-        f"{NO_ROOM} - needs 1 node with 0.5 CPUs, 0 GPUs, 16 MiB in all; compute environment q-one-cpu may use 0 CPUs"
-    )
+    needs = "needs 1 node with 0.5 CPUs, 0 GPUs, 16 MiB in all"
+    free = f"{NO_ROOM} - {needs}; compute environment q-one-cpu may use 0 CPUs"
     assert batch.reason(head, NO_ROOM) == f"{free} more at this time until job q-holds ({first[:8]}) ends"
-    behind = (
-        f"2nd in queue q-low, behind job q-plain ({head[:8]}), which needs 1 node with 0.5 CPUs, 0 GPUs, 16 MiB in all"
-    )
+    behind = f"2nd in queue q-low, behind job q-plain ({head[:8]}), which {needs}"
     assert batch.reason(second, "2nd") == behind
     assert batch.reason(too_wide, "MISCONFIGURATION") == (
         "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 1 node with 2 CPUs, 0 GPUs, 16 MiB in all; "
@@ -76,10 +73,8 @@ def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch,
     said = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
     assert "the largest host has 8 CPUs, " in said
     assert batch.reason(pending, "waits for the success") == f"waits for the success of job {head}"
-    listed = {
-        each["jobId"]: each["statusReason"]
-        for each in batch.api.list_jobs(jobQueue="q-low", jobStatus="RUNNABLE")["jobSummaryList"]
-    }
+    page = batch.api.list_jobs(jobQueue="q-low", jobStatus="RUNNABLE")
+    listed = {each["jobId"]: each["statusReason"] for each in page["jobSummaryList"]}
     assert set(listed) == {head, second, too_wide} and listed[second] == behind
     batch.api.terminate_job(jobId=impossible, reason="over")
     batch.api.terminate_job(jobId=too_wide, reason="over")
@@ -160,10 +155,8 @@ def test_the_share_with_less_use_goes_first_and_a_reservation_is_kept_free(batch
     wait_for(lambda: len(batch.front("q-used")) == 3, what="three that wait")
     assert "uses 3 of the 3 CPUs" in batch.reason(mine[2], "2 active shares")
     shown = batch.api.get_job_queue_snapshot(jobQueue="q-used")["queueUtilization"]["fairshareUtilization"]
-    held = {
-        each["shareIdentifier"]: {unit["capacityUnit"]: unit["quantity"] for unit in each["capacityUsage"]}["VCPU"]
-        for each in shown["topCapacityUtilization"]
-    }
+    used = {each["shareIdentifier"]: each["capacityUsage"] for each in shown["topCapacityUtilization"]}
+    held = {share: next(u["quantity"] for u in units if u["capacityUnit"] == "VCPU") for share, units in used.items()}
     assert held == {"mine": 2.0, "yours": 1.0} and shown["activeShareCount"] == 2
     gate(tmp_path, "go")
     assert {batch.wait(job)["status"] for job in (*mine, *yours)} == {"SUCCEEDED"}

@@ -23,45 +23,32 @@ ATTEMPT, INDEX = "$AWS_BATCH_JOB_ATTEMPT", "$AWS_BATCH_JOB_ARRAY_INDEX"
 def test_a_container_job_has_a_container_and_knows_nothing_of_nodes(batch: Batch) -> None:
     script = "env | grep -E '^AWS_(BATCH|EXECUTION)'; echo $WHO $WHAT; exit 4"
     definition = batch.single("one-shape", script, env={"WHO": "nobody", "WHAT": "works"})
-    override = {
-        "environment": pairs({"WHO": "I"}),
-        "resourceRequirements": [{"type": "VCPU", "value": "0.2"}],
-    }
+    override = {"environment": pairs({"WHO": "I"}), "resourceRequirements": [{"type": "VCPU", "value": "0.2"}]}
     job = batch.submit(definition, containerOverrides=override, parameters={"unused": "1"}, propagateTags=True)
     detail = batch.wait(job)
     said = batch.lines(job)
     variables = dict(line.split("=", 1) for line in said if line.startswith("AWS_"))
     assert variables.pop("AWS_EXECUTION_ENV")
-    assert variables == {
-        "AWS_BATCH_JOB_ID": job,
-        "AWS_BATCH_JOB_ATTEMPT": "1",
-        "AWS_BATCH_CE_NAME": "local",
-        "AWS_BATCH_JQ_NAME": "default",
-    }
+    place = {"AWS_BATCH_CE_NAME": "local", "AWS_BATCH_JQ_NAME": "default"}
+    assert variables == {"AWS_BATCH_JOB_ID": job, "AWS_BATCH_JOB_ATTEMPT": "1", **place}
     assert "I works" in said
     assert not {"nodeProperties", "nodeDetails", "arrayProperties"} & detail.keys()
     assert detail["container"]["exitCode"] == detail["attempts"][0]["container"]["exitCode"] == 4
     assert detail["container"]["environment"] == pairs({"WHO": "I", "WHAT": "works"})
-    assert detail["container"]["resourceRequirements"] == [
-        {"type": "VCPU", "value": "0.2"},
-        {"type": "MEMORY", "value": "16"},
-    ]
+    needs = [{"type": "VCPU", "value": "0.2"}, {"type": "MEMORY", "value": "16"}]
+    assert detail["container"]["resourceRequirements"] == needs
     assert (detail["status"], detail["statusReason"]) == ("FAILED", EXITED)
     assert detail["parameters"] == {"unused": "1"} and detail["propagateTags"] is True
     assert batch.api.describe_jobs(jobs=[f"{job}#0", f"{job}:0"])["jobs"] == []
-    [summary] = [
-        each
-        for each in batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
-        if each["jobId"] == job
-    ]
+    listed = batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
+    [summary] = [each for each in listed if each["jobId"] == job]
     assert "nodeProperties" not in summary and summary["container"]["exitCode"] == 4
 
 
 def test_parameters_replace_references_the_submissions_before_the_definitions(batch: Batch, parked: str) -> None:
     words = ["echo", "Ref::task", "Ref::seed", "Ref::task"]
-    definition = batch.single(
-        "one-refers", "", container={"command": words}, parameters={"task": "Cartpole", "seed": "1"}
-    )
+    given = {"task": "Cartpole", "seed": "1"}
+    definition = batch.single("one-refers", "", container={"command": words}, parameters=given)
 
     def command(**request: Any) -> list[str]:
         return list(batch.describe(batch.submit(definition, queue=parked, **request))["container"]["command"])
@@ -77,14 +64,12 @@ def test_parameters_replace_references_the_submissions_before_the_definitions(ba
 def test_empty_structures_count_as_absent(batch: Batch, parked: str) -> None:
     """Luigi sends them all."""
     names = ("arrayProperties", "retryStrategy", "timeout", "containerOverrides", "nodeOverrides", "parameters")
-    definition = batch.single(
-        "one-luigi", "true", retryStrategy={"attempts": 2}, timeout={"attemptDurationSeconds": 90}
-    )
+    limits = {"retryStrategy": {"attempts": 2}, "timeout": {"attemptDurationSeconds": 90}}
+    definition = batch.single("one-luigi", "true", **limits)
     detail = batch.describe(batch.submit(definition, queue=parked, dependsOn=[], **{name: {} for name in names}))
     assert detail["retryStrategy"]["attempts"] == 2 and detail["timeout"] == {"attemptDurationSeconds": 90}
-    changed = batch.submit(
-        definition, queue=parked, retryStrategy={"attempts": 3}, timeout={"attemptDurationSeconds": 60}
-    )
+    limits = {"retryStrategy": {"attempts": 3}, "timeout": {"attemptDurationSeconds": 60}}
+    changed = batch.submit(definition, queue=parked, **limits)
     detail = batch.describe(changed)
     assert detail["retryStrategy"]["attempts"] == 3 and detail["timeout"] == {"attemptDurationSeconds": 60}
 
@@ -120,9 +105,8 @@ def test_an_arrays_children_know_their_index_and_decide_its_end(batch: Batch, tm
     parent = batch.describe(job)
     assert parent["status"] == "PENDING" and parent["arrayProperties"]["size"] == 3
     assert parent["startedAt"] == min(batch.describe(f"{job}:{index}")["startedAt"] for index in range(3))
-    assert set(parent["arrayProperties"]["statusSummary"]) == {
-        *("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
-    }
+    states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
+    assert set(parent["arrayProperties"]["statusSummary"]) == set(states)
     gate(tmp_path, "go")
     parent = batch.wait(job)
     assert parent["status"] == "FAILED" and "1 of 3" in parent["statusReason"]
@@ -140,11 +124,8 @@ def test_an_arrays_children_know_their_index_and_decide_its_end(batch: Batch, tm
         assert child["arrayProperties"]["index"] == index and child["jobArn"].endswith(f":job/{job}:{index}")
         assert child["container"]["exitCode"] == (5 if index == 1 else 0) and child["tags"] == {"of": "array"}
         variables = {line for line in batch.lines(f"{job}:{index}") if line.startswith("AWS_")}
-        assert variables == {
-            f"AWS_BATCH_JOB_ID={job}:{index}",
-            f"AWS_BATCH_JOB_ARRAY_INDEX={index}",
-            "AWS_BATCH_JOB_ARRAY_SIZE=3",
-        }
+        own = {"ID": f"{job}:{index}", "ARRAY_INDEX": index, "ARRAY_SIZE": 3}
+        assert variables == {f"AWS_BATCH_JOB_{name}={value}" for name, value in own.items()}
     by_name = batch.api.list_jobs(jobQueue="default", filters=[{"name": "JOB_NAME", "values": ["one-array"]}])
     assert [each["jobId"] for each in by_name["jobSummaryList"]] == [job], "a queue shows the array, not its children"
     assert by_name["jobSummaryList"][0]["arrayProperties"]["size"] == 3
@@ -177,13 +158,10 @@ def test_children_come_one_by_one_in_a_sequential_array(batch: Batch, tmp_path: 
 
 
 def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
-    first = batch.submit(
-        batch.single("one-before", f"[ {INDEX} = 0 ] || {UNTIL.format('go')}", env={"GATE": str(tmp_path)}),
-        arrayProperties={"size": 2},
-    )
-    second = batch.submit(
-        batch.single("one-after", "true"), arrayProperties={"size": 2}, dependsOn=[{"jobId": first, "type": "N_TO_N"}]
-    )
+    before = batch.single("one-before", f"[ {INDEX} = 0 ] || {UNTIL.format('go')}", env={"GATE": str(tmp_path)})
+    first = batch.submit(before, arrayProperties={"size": 2})
+    waits = {"dependsOn": [{"jobId": first, "type": "N_TO_N"}]}
+    second = batch.submit(batch.single("one-after", "true"), arrayProperties={"size": 2}, **waits)
     last = batch.submit(batch.single("one-last", "true"), dependsOn=[{"jobId": second}])
     assert batch.wait(f"{second}:0")["status"] == "SUCCEEDED"
     held = batch.describe(f"{second}:1")
@@ -210,10 +188,8 @@ def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
 )
 def test_impossible_arrays_are_refused(batch: Batch, parked: str, change: dict[str, Any], message: str) -> None:
     definition = batch.single("one-refused", "true")
-    known = {
-        "ARRAY": batch.submit(definition, queue=parked, arrayProperties={"size": 2}),
-        "JOB": batch.submit(definition, queue=parked),
-    }
+    array = batch.submit(definition, queue=parked, arrayProperties={"size": 2})
+    known = {"ARRAY": array, "JOB": batch.submit(definition, queue=parked)}
     if "dependsOn" in change:
         names = [{**each, "jobId": known[each["jobId"]]} if each else each for each in change["dependsOn"]]
         change = {**change, "dependsOn": names}
@@ -269,12 +245,8 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         ([{"onExitCode": "0", **END}, {"onReason": "*", **END}], 1),  # the documentation's catch-all
         ([{"onExitCode": "0", **END}], 3),  # what TorchX sends
     ]
-    jobs = [
-        batch.submit(
-            definition, retryStrategy={"attempts": 3, **({"evaluateOnExit": conditions} if conditions else {})}
-        )
-        for conditions, _ in cases
-    ]
+    evaluated = [{"evaluateOnExit": conditions} if conditions else {} for conditions, _ in cases]
+    jobs = [batch.submit(definition, retryStrategy={"attempts": 3, **each}) for each in evaluated]
     for job, (conditions, attempts) in zip(jobs, cases, strict=True):
         detail = batch.wait(job)
         codes = [attempt["container"]["exitCode"] for attempt in detail["attempts"]]
@@ -340,12 +312,8 @@ def test_a_submission_with_a_key_may_be_sent_twice(batch: Batch, parked: str) ->
     with keyed(batch, "not a key"), refused("idempotency key"):
         send()
     found = batch.api.list_jobs(jobQueue=parked, filters=[{"name": "JOB_NAME", "values": ["one-keyed"]}])
-    assert (
-        len(found["jobSummaryList"]) == 4
-        and not batch.api.list_jobs(jobQueue=parked, filters=[{"name": "JOB_NAME", "values": ["one-other"]}])[
-            "jobSummaryList"
-        ]
-    )
+    other = batch.api.list_jobs(jobQueue=parked, filters=[{"name": "JOB_NAME", "values": ["one-other"]}])
+    assert len(found["jobSummaryList"]) == 4 and not other["jobSummaryList"]
 
 
 def test_the_command_may_come_with_the_submission(batch: Batch) -> None:
@@ -366,6 +334,5 @@ def test_a_container_definition_needs_no_image_of_ours_and_refuses_what_is_not_r
         with refused(message):
             batch.register("one-bad", "container", containerProperties=properties)
     with refused("FARGATE is not supported"):
-        batch.register(
-            "one-bad", "container", containerProperties=container("true", {}), platformCapabilities=["FARGATE"]
-        )
+        fargate = {"platformCapabilities": ["FARGATE"]}
+        batch.register("one-bad", "container", containerProperties=container("true", {}), **fargate)

@@ -105,9 +105,8 @@ def test_a_session_reads_the_api_and_changes_nothing_through_it(console: Console
     assert visitor.http.get("/api/jobs").json()["jobs"] == []
     assert "GET /api/jobs" in visitor.page("/api/docs").text
     for path in ("/v1/createjobqueue", "/api/leagues", "/"):
-        answer = visitor.http.post(
-            path, json={}, headers={"Accept": "*/*", "X-Amz-Target": "Logs_20140328.DescribeLogGroups"}
-        )
+        headers = {"Accept": "*/*", "X-Amz-Target": "Logs_20140328.DescribeLogGroups"}
+        answer = visitor.http.post(path, json={}, headers=headers)
         assert answer.status_code == 403 and answer.headers["x-amzn-errortype"] == "MissingAuthenticationToken", path
 
 
@@ -143,9 +142,8 @@ def test_another_web_page_neither_reads_nor_changes_an_open_server(
     for path in ("/", "/jobs/stream", "/api/jobs", "/login", "/static/x/console.js"):
         answer = visitor.http.get(path, headers=headers)
         assert answer.status_code == 403 and "AccessDenied" in answer.text, path
-    changed = visitor.http.post(
-        "/jobs/stop", data={"form_token": token, "job": "x", "confirmed": "yes"}, headers=headers
-    )
+    sent = {"form_token": token, "job": "x", "confirmed": "yes"}
+    changed = visitor.http.post("/jobs/stop", data=sent, headers=headers)
     assert changed.status_code == 403
     link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
     assert visitor.http.get("/", headers=link).status_code == 200, "a link that a person follows"

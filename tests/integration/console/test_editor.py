@@ -70,13 +70,6 @@ def test_tab_indents_and_escape_lets_whoever_has_no_mouse_leave(browser_page: Pa
     expect(code).not_to_be_focused()
 
 
-def test_a_function_that_fails_on_a_sample_is_told_when_its_editor_is_left(browser_page: Page, code: Locator) -> None:
-    code.fill("def reward_function(params):\n    return params['nix']\n")
-    browser_page.locator('[name="name"]').focus()
-    expect(browser_page.locator(MESSAGE)).to_contain_text("KeyError")
-    expect(numbers(code).nth(1)).to_have_class(BAD)
-
-
 def test_the_wizard_leads_by_review_and_yaml_to_jobs(browser_page: Page, code: Locator, shared_server: Serving) -> None:
     code.fill("# </script><script>alert(1)</script>\ndef reward_function(params):\n    return 1.0\n")
     browser_page.locator('[name="name"]').fill("clicked")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +11,7 @@ from orchestrator.domain.errors import ApiError
 from shared_store.layout import Run, Store
 from shared_store.logs import format_line
 from shared_store.metrics import MetricsWriter
-from tests.conftest import Serving, submit_gang, wait_for
+from tests.conftest import submit_gang, wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page, Visitor
 from tests.support.definitions import container, single
@@ -180,30 +178,6 @@ def test_a_page_that_missed_too_much_gets_the_last_lines_and_a_count(
     (window,) = [data for name, data, _ in events if name == "window"]
     assert len(window["lines"]) == 400 and window["skipped"] > 2 << 20
     assert said(window)[-1].startswith("late 19999 ")
-
-
-def test_a_restart_of_the_server_loses_no_line_and_repeats_none(tmp_path: Path) -> None:
-    with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url)) as visitor:
-        script = "import time\nfor i in range(400):\n  print('number', i, flush=True)\n  time.sleep(0.02)\n"
-        job = submit_gang(server.client, script, cpus="0.5")
-        server.wait(job, "RUNNING")
-        lines, last = read_until(visitor, job, '{"i":null,"l":{}}', "number 40")
-        server.kill()
-        server.options = (*server.options, "--port", server.url.rpartition(":")[2])
-        server.start()
-        rest, _ = read_until(visitor, job, last, "number 399")
-        numbers = [text for text in lines + rest if text.startswith("number ")]
-        assert numbers == [f"number {i}" for i in range(400)]
-
-
-def read_until(visitor: Visitor, job: str, last: str, text: str) -> tuple[list[str], str]:
-    """The lines of a stream up to the event that has a text, and its id."""
-    found: list[str] = []
-    for name, data, place in visitor.events(f"/jobs/{job}/stream", **{"Last-Event-ID": last}):
-        found += [line[5] for line in data["lines"]] if name in ("lines", "window") else []
-        if text in found:
-            return found, place
-    raise AssertionError(f"{text} never came; there is {found[-5:]}")
 
 
 def test_the_stream_has_new_iterations_and_tells_of_a_run_that_went_back(

@@ -112,11 +112,9 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     assert amounts == {"VCPU": "4", "MEMORY": "4096", "GPU": "2"}, "AWS takes whole vCPUs only"
     assert container["linuxParameters"]["sharedMemorySize"] == 2048
     assert container["linuxParameters"]["devices"][0]["hostPath"] == "/dev/infiniband/uverbs0"
-    assert container["volumes"][0]["efsVolumeConfiguration"] == {
-        "fileSystemId": "fs-1",
-        "transitEncryption": "ENABLED",
-        "authorizationConfig": {"accessPointId": "fsap-1", "iam": "ENABLED"},
-    }
+    access = {"accessPointId": "fsap-1", "iam": "ENABLED"}
+    volume = {"fileSystemId": "fs-1", "transitEncryption": "ENABLED", "authorizationConfig": access}
+    assert container["volumes"][0]["efsVolumeConfiguration"] == volume
     assert container["mountPoints"][0]["containerPath"] == str(bench.volume.path)
     assert container["logConfiguration"]["options"] == {"awslogs-group": "/aws/batch/job"}
     assert definition["retryStrategy"] == {"attempts": 1} and submission["timeout"] == {"attemptDurationSeconds": 700}
@@ -133,9 +131,8 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
 def test_aws_gets_the_request_of_the_plan(bench: AwsBench) -> None:
     sent: dict[str, dict[str, Any]] = {}
     for client, name in ((bench.engine._batch, "RegisterJobDefinition"), (bench.engine._submitting, "SubmitJob")):
-        client.meta.events.register(
-            f"provide-client-params.batch.{name}", lambda params, name=name, **_: sent.update({name: params})
-        )
+        note = lambda params, name=name, **_: sent.update({name: params})  # noqa: E731
+        client.meta.events.register(f"provide-client-params.batch.{name}", note)
     gang = bench.gang(nodes=2, timeout=100)
     plan = bench.engine.plan(gang)
     bench.launch(gang)

@@ -31,11 +31,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Tried to parse AWS")
 
 TEMPLATE = REPOSITORY / "containers" / "aws" / "muster.yaml"
 REGION = "us-east-1"
-NO_CONFIGURATION = {
-    "AWS_CONFIG_FILE": os.devnull,
-    "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
-    "AWS_EC2_METADATA_DISABLED": "true",
-}
+NO_CONFIGURATION = dict.fromkeys(("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"), os.devnull)
+NO_CONFIGURATION["AWS_EC2_METADATA_DISABLED"] = "true"
 # moto does not split the default of a list, and knows few images
 PARAMETERS = ["--parameter", "InstanceTypes=g6.12xlarge", "--parameter", "WorkstationImage=ami-12c6146b"]
 NO_STACK = "muster: there is no stack {} in us-east-1; create it with `muster aws up`\n"
@@ -47,13 +44,8 @@ class Account:
 
     def __init__(self, url: str, home: Path) -> None:
         self.url, self.home = url, home
-        self.env = {
-            **NO_CONFIGURATION,
-            "AWS_ACCESS_KEY_ID": "any",
-            "AWS_SECRET_ACCESS_KEY": "any",
-            "AWS_DEFAULT_REGION": REGION,
-            "AWS_ENDPOINT_URL": url,
-        }
+        self.env = {**NO_CONFIGURATION, "AWS_DEFAULT_REGION": REGION, "AWS_ENDPOINT_URL": url}
+        self.env |= dict.fromkeys(("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"), "any")
 
     def client(self, service: str) -> Any:
         key = {"aws_access_key_id": "a", "aws_secret_access_key": "b"}
@@ -279,9 +271,9 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
         [stack] = cloudformation_backends["123456789012"][REGION].stacks.values()
         stack.status = "ROLLBACK_COMPLETE"
         again = account.muster("up", "--yes", *PARAMETERS)
-        assert again.returncode == 1 and again.stderr == (
-            "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; remove it with `muster aws down`, then try again\n"
-        )
+        said = "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; "
+        assert again.returncode == 1
+        assert again.stderr == f"{said}remove it with `muster aws down`, then try again\n"
         gone = account.muster("down", "--yes")
         assert gone.returncode == 0, gone.stderr
         assert f"file system {volume}, with all runs and checkpoints, stays" in gone.stdout

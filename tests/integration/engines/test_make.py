@@ -31,9 +31,8 @@ def registry(tmp_path: Path) -> Iterator[str]:
         pytest.skip("NO docker-registry: make push is not tested")
     port = free_port()
     (tmp_path / "config.yml").write_text(CONFIGURATION.format(root=tmp_path / "images", port=port))
-    serving = subprocess.Popen(
-        ["docker-registry", "serve", str(tmp_path / "config.yml")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    command = ["docker-registry", "serve", str(tmp_path / "config.yml")]
+    serving = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def answers() -> bool:
         try:
@@ -52,9 +51,9 @@ def make(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_image_is_pushed_under_its_version_and_latest(registry: str, docker_client: Any) -> None:
-    docker_client.api.import_image_from_data(
-        b"\0" * 10240, repository="muster-test-push", tag="1", changes=["LABEL org.opencontainers.image.version=1.2.3"]
-    )
+    image = {"repository": "muster-test-push", "tag": "1"}
+    labels = ["LABEL org.opencontainers.image.version=1.2.3"]
+    docker_client.api.import_image_from_data(b"\0" * 10240, **image, changes=labels)
     done = make(f"REGISTRY={registry}/robots", "IMAGE=muster-test-push:1")
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("digest: sha256:") == 2
@@ -93,9 +92,8 @@ def make_cluster(folder: Path, *arguments: str) -> tuple[subprocess.CompletedPro
     told = folder / "told"
     told.write_text("")
     env = {**os.environ, "PATH": f"{double.parent}:{os.environ['PATH']}", "TOLD": str(told)}
-    done = subprocess.run(
-        ["make", "cluster", *arguments], cwd=folder, env=env, capture_output=True, text=True, timeout=120
-    )
+    command = ["make", "cluster", *arguments]
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=120)
     return done, told.read_text().splitlines()
 
 

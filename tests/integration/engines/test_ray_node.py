@@ -34,9 +34,8 @@ def contract(tmp_path: Path) -> NodeContract:
     store = Store(tmp_path).open()
     raise_epoch(store.run("run"), 1)
     facts = {"node_index": 0, "node_count": 1, "main_index": 0, "master_address": "127.0.0.1", "master_port": 29500}
-    return NodeContract(
-        job="ray-node", attempt=1, run="run", store=str(tmp_path), epoch=1, job_epoch=1, grace=5.0, **facts
-    )
+    facts |= {"job": "ray-node", "attempt": 1, "run": "run", "store": str(tmp_path), "epoch": 1, "job_epoch": 1}
+    return NodeContract(**facts, grace=5.0)
 
 
 def pids(contract: NodeContract) -> list[int]:

@@ -95,10 +95,7 @@ def test_a_job_goes_to_the_engine_that_it_names_and_else_to_the_first(tmp_path: 
 
         lines(served, "submit", str(spec))
         assert served.wait("where")["queue"] == "default"
-        assert served.log("where") == [
-            f"on {socket.gethostname()}",
-            "node 0 ended: done",
-        ]
+        assert served.log("where") == [f"on {socket.gethostname()}", "node 0 ended: done"]
         job = plain(served, PLAIN, SCRIPT, "docker", **host_files())
         assert served.wait(job)["status"] == "SUCCEEDED", served.detail(job)
         assert served.log(job) == ["on node-0"]

@@ -28,9 +28,8 @@ bench = slurm_bench
 
 def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBench) -> None:
     hosts = bench.engine.capacity().machines
-    assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
-        (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
-    ]
+    found = [(host.name, host.cpus, host.gpus, host.memory, host.single) for host in hosts]
+    assert found == [(f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES]
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
     try:
         assert [host.away for host in SlurmEngine().capacity().machines] == [False, True, False]
@@ -97,9 +96,8 @@ def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, m
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
     monkeypatch.setenv("FROM_THE_CONTROLLER", "kept")
     show = "exec python3 -c \"import os, json; print(json.dumps({**os.environ, 'cwd': os.getcwd()}))\""
-    environments = [
-        {"HARD": hard, "odd.name": "1", "MUSTER_ON_CHILD_FAILURE": "restart", "NODE": str(i)} for i in range(3)
-    ]
+    variables = {"HARD": hard, "odd.name": "1", "MUSTER_ON_CHILD_FAILURE": "restart"}
+    environments = [{**variables, "NODE": str(i)} for i in range(3)]
     gang = bench.gang(
         show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS, title='a "job" \\ é $HOME #1'
     )
@@ -137,9 +135,8 @@ def test_a_node_sees_its_gpus_alone_and_each_job_has_a_port(bench: SlurmBench, m
 
 
 def test_a_single_node_job_and_an_array_s_child_have_no_node_variables(bench: SlurmBench) -> None:
-    handle = bench.launch(
-        bench.gang("env | grep ^AWS_BATCH | sort; exit 3", is_gang=False, array=(4, 9), environments=[{}])
-    )
+    child = {"is_gang": False, "array": (4, 9), "environments": [{}]}
+    handle = bench.launch(bench.gang("env | grep ^AWS_BATCH | sort; exit 3", **child))
     [node] = bench.ended(handle)
     assert node.exit_code == 3
     names = [line.partition("=")[0] for line in bench.log() if line.startswith("AWS_BATCH")]
@@ -203,10 +200,8 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
 
 
 UNEQUAL = {"nodes": 2, "placements": [Placement("a", (), 1, 64), Placement("b", (), 1, 128)]}
-MOUNTED = {
-    "volumes": [{"name": "v", "host": {"sourcePath": "/data"}}],
-    "mountPoints": [{"sourceVolume": "v", "containerPath": "/mnt"}],
-}
+MOUNTED = {"volumes": [{"name": "v", "host": {"sourcePath": "/data"}}]}
+MOUNTED["mountPoints"] = [{"sourceVolume": "v", "containerPath": "/mnt"}]
 
 
 @pytest.mark.parametrize(
@@ -233,9 +228,8 @@ def test_a_gang_that_slurm_refuses_is_refused_in_one_line(bench: SlurmBench, cha
 
 def test_the_script_has_the_options_of_the_queue_and_of_the_job(bench: SlurmBench) -> None:
     options = {"partition": "urgent", "qos": "high", "gpu": "a100", "nice": "100", "hosts": "x"}
-    gang = bench.gang(
-        nodes=2, gpus=2, options=options, timeout=3600, priority=30, title='my "job" é', bus="tcp/1", bus_token="secret"
-    )
+    facts = {"timeout": 3600, "priority": 30, "title": 'my "job" é', "bus": "tcp/1", "bus_token": "secret"}
+    gang = bench.gang(nodes=2, gpus=2, options=options, **facts)
     document = bench.engine.plan(gang).document
     for line in (
         *('--job-name="my \\"job\\" é"', f"--comment={gang.name}", "--nodes=2", "--ntasks-per-node=1", "--mem=64M"),
@@ -293,9 +287,8 @@ def test_a_first_node_without_python_or_store_is_one_line(bench: SlurmBench, mon
         assert not node.running and node.words.endswith("/no/python: No such file or directory"), node
     render = slurm_script.render
     elsewhere = "/nowhere/slurm.out"
-    monkeypatch.setattr(
-        slurm_script, "render", lambda gang: render(gang).replace(slurm_script.output_path(gang), elsewhere)
-    )
+    moved = lambda gang: render(gang).replace(slurm_script.output_path(gang), elsewhere)  # noqa: E731
+    monkeypatch.setattr(slurm_script, "render", moved)
     [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
     assert node.words.startswith("Slurm could not start it on n1: is ")
     assert "file system that all nodes share" in node.words

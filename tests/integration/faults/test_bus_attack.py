@@ -156,12 +156,8 @@ def test_a_node_publishes_below_its_own_key_only(bus: Bus, victim: Victim, mallo
 
 
 def test_a_node_feigns_no_presence_nor_absence_of_another(bus: Bus, victim: Victim, mallory: zenoh.Session) -> None:
-    keys = [
-        presence_key(own(bus), "victim", 1, 0),
-        presence_key(own(bus), "victim", 1, 1),
-        f"{KEY}/alive/é",
-        "muster/*/*/*/alive/*",
-    ]
+    keys = [presence_key(own(bus), "victim", 1, node) for node in (0, 1)]
+    keys += [f"{KEY}/alive/é", "muster/*/*/*/alive/*"]
     tokens = [mallory.liveliness().declare_token(key) for key in keys]
     settled(bus)
     assert not bus.met("victim", 1, 1)
@@ -187,10 +183,8 @@ def test_an_answer_in_another_node_s_name_is_ignored(
         query.drop()
 
     forger = zenoh.handlers.Callback(forge, indirect=False)
-    held = [
-        mallory.declare_queryable(key, forger, complete=complete)
-        for key in (f"{KEY}/command/checkpoint", "muster/*/*/*/command/*")
-    ]
+    keys = (f"{KEY}/command/checkpoint", "muster/*/*/*/command/*")
+    held = [mallory.declare_queryable(key, forger, complete=complete) for key in keys]
     wait_for(lambda: bus.command("victim", 1, 0, "checkpoint", 10) == "checkpoint done" and overheard, 20, "the forger")
     with pytest.raises(BusError, match="node 1 did not answer"):
         bus.command("victim", 1, 1, "checkpoint", 1)
@@ -202,9 +196,8 @@ def test_a_command_that_is_repeated_is_not_carried_out_again(bus: Bus, victim: V
     credential = Credential.parse(bus.token("victim", 1) or "")
     key = f"{KEY}/command/stop"
     payload = json.dumps({"id": "once", "proof": credential.prove("command", key, "once")})
-    answers = [
-        list(bus._session.get(each, payload=payload, timeout=1.0)) for each in (key, key, f"{KEY}/command/stacks")
-    ]
+    keys = (key, key, f"{KEY}/command/stacks")
+    answers = [list(bus._session.get(each, payload=payload, timeout=1.0)) for each in keys]
     assert [len(each) for each in answers] == [1, 0, 0]
     assert victim.done == ["stop"]
 

@@ -39,9 +39,8 @@ def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, mo
         bench.reconciler.start()
         engine, gangs = bench.engine, bench.engine.cluster.gangs
         engine.error = NotYet("no room yet")
-        bench.submit(
-            "job", attempts_allowed=2, node_properties=properties(1, nodes=2, MUSTER_ON_CHILD_FAILURE="restart")
-        )
+        gang = properties(1, nodes=2, MUSTER_ON_CHILD_FAILURE="restart")
+        bench.submit("job", attempts_allowed=2, node_properties=gang)
         bench.explains("job", "no room yet")
         engine.error = None
         assert bench.wait("job", Status.RUNNING).status_reason == "attempt 1 runs on 2 nodes"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from orchestrator.server import Server
 from shared_store.checkpoints import list_checkpoints, retain
 from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang
+from tests.support.definitions import container, multinode
+from tests.support.orchestrator.jobs import FOREVER
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
@@ -51,22 +54,15 @@ class Controller:
         """Submit a training; what runs is a process that sleeps on the one CPU. Returns the job's id once it runs."""
         spec = {**SPEC, "name": name, "train": TRAIN, "evaluation": evaluation}
         variables = {"MUSTER_SPEC": json.dumps(spec), "MUSTER_RUN": name, "MUSTER_ON_CHILD_FAILURE": "restart"}
-        container = {
-            "image": "muster",
-            "command": ["python", "-c", "import time; time.sleep(3600)"],
-            "environment": [{"name": key, "value": value} for key, value in variables.items()],
-            "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "16"}],
-        }
-        properties = {
-            **{"numNodes": 1, "mainNode": 0},
-            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
-        }
-        definition = {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
+        definition = multinode(name, container(["python", "-c", FOREVER], "1", variables))
         registered = self.client.batch("RegisterJobDefinition", **definition)
         asked = {"jobName": name, "jobQueue": "default", "jobDefinition": registered["jobDefinitionArn"]}
         job = str(self.client.batch("SubmitJob", **asked)["jobId"])
         self.wait(job, "RUNNING")
         return job
+
+    def muster(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return call_muster(*arguments, home=self.home)
 
     def wait(self, job: str, *statuses: str) -> None:
         wait_for(lambda: self.client.get(f"/api/jobs/{job}")["status"] in statuses, 20, f"{job} {statuses}")
@@ -125,7 +121,7 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     assert controller.evaluations() == [(20, "FAILED"), (70, "RUNNABLE")]
     assert "run taught: the evaluation of checkpoint 00000020-e1 failed: the test says so" in caplog.text
     assert controller.newest()["passed"] == 1, "40, or 60"
-    shown = " ".join(call_muster("show", training, home=controller.home).stdout.split())
+    shown = " ".join(controller.muster("show", training).stdout.split())
     assert "evaluating: taught@70 by job " in shown and "1 checkpoint passed over" in shown
     controller.save(80)
     assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
@@ -141,22 +137,21 @@ def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate(
     training = controller.train({"every": 1})
     controller.save(10)
     controller.look()
-    listed = call_muster("list", home=controller.home).stdout.splitlines()
+    listed = controller.muster("list").stdout.splitlines()
     assert [line.split()[0] for line in listed[1:-1]] == [training[:8]]
     assert listed[-1] == "1 automatic evaluation is not shown; --all shows it"
     first = controller.newest()["job"]
     controller.end(first)
     controller.save(20)
     controller.look()
-    said = call_muster("list", home=controller.home).stdout
+    said = controller.muster("list").stdout
     assert said.endswith("2 automatic evaluations are not shown; --all shows them\n")
-    every = call_muster("list", "--all", home=controller.home).stdout
-    assert (
-        "evaluates taught@20" in every and "evaluates taught@10; the test says so" in every and "not shown" not in every
-    )
-    told = json.loads(call_muster("list", "--json", home=controller.home).stdout)
+    every = controller.muster("list", "--all").stdout
+    assert "evaluates taught@20" in every and "evaluates taught@10; the test says so" in every
+    assert "not shown" not in every
+    told = json.loads(controller.muster("list", "--json").stdout)
     assert [each.get("automaticEvaluation") for each in told] == ["taught@20", "taught@10", None]
-    shown = " ".join(call_muster("show", first, home=controller.home).stdout.split())
+    shown = " ".join(controller.muster("show", first).stdout.split())
     assert "evaluates: taught@10" in shown and controller.newest()["iteration"] == 20
 
 
@@ -176,13 +171,13 @@ def test_facts_of_a_deleted_run_are_not_shown_for_a_new_run_of_the_same_name(con
     assert controller.newest()["job"] is None and controller.newest()["checkpoint"] is None
     old = controller.client.get(f"/api/jobs/{former}")
     assert old["runIsReplaced"] and old["results"] is None and old["progress"] is None
-    assert "taught (gone; another run has its name now)" in call_muster("show", former, home=controller.home).stdout
+    assert "taught (gone; another run has its name now)" in controller.muster("show", former).stdout
     assert not controller.client.get(f"/api/jobs/{training}")["runIsReplaced"]
 
 
 def test_showing_a_run_names_the_jobs_that_made_it(controller: Controller) -> None:
     job = submit_gang(controller.client, "pass", name="short")
-    refused = call_muster("show", f"short-{job[:8]}", home=controller.home)
+    refused = controller.muster("show", f"short-{job[:8]}")
     line = f"muster: short-{job[:8]} is a run, which job short ({job[:8]}) made; see: muster show {job[:8]}\n"
     assert (refused.returncode, refused.stderr) == (2, line)
 
@@ -244,13 +239,8 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
 def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(
     controller: Controller, caplog: pytest.LogCaptureFixture
 ) -> None:
-    controller.client.batch(
-        "CreateJobQueue",
-        jobQueueName="idle",
-        priority=1,
-        state="ENABLED",
-        computeEnvironmentOrder=[{"order": 1, "computeEnvironment": "local"}],
-    )
+    order = [{"order": 1, "computeEnvironment": "local"}]
+    controller.client.batch("CreateJobQueue", jobQueueName="idle", priority=1, computeEnvironmentOrder=order)
     controller.train({"every": 1, "queue": "idle"})
     controller.client.batch("UpdateJobQueue", jobQueue="idle", state="DISABLED")
     controller.save(10)
@@ -276,37 +266,25 @@ def test_a_queue_that_does_not_take_the_evaluations_is_refused_with_the_training
         controller.train({})
 
 
-@pytest.mark.parametrize("options", [(), ("--dry-run",)])
+NEEDS, UNKNOWN = "evaluation: each node needs 1 CPU, 1 GPU", "evaluation: there is no queue 'nowhere'; there is default"
+
+
 @pytest.mark.parametrize(
-    ("section", "said"),
+    ("line", "section", "said"),
     [
-        ("{every: 2, resources: {gpus: 1}}", "evaluation: each node needs 1 CPU, 1 GPU"),
-        ("{every: 2, queue: nowhere}", "evaluation: there is no queue 'nowhere'; there is default"),
+        ("submit job_specs/cartpole.yaml --set nodes=1", "resources: {gpus: 1}", NEEDS),
+        ("submit job_specs/cartpole.yaml --set nodes=1", "queue: nowhere", UNKNOWN),
+        ("submit job_specs/cartpole.yaml --set nodes=1 --dry-run", "resources: {gpus: 1}", NEEDS),
+        ("submit job_specs/cartpole.yaml --set nodes=1 --dry-run", "queue: nowhere", UNKNOWN),
+        ("resume taught", "resources: {gpus: 1}", NEEDS),
+        ("clone taught --name twin", "resources: {gpus: 1}", NEEDS),
     ],
 )
-def test_evaluations_that_could_never_start_are_refused_with_the_training(
-    controller: Controller, section: str, said: str, options: tuple[str, ...]
-) -> None:
-    done = call_muster(
-        *("submit", "job_specs/cartpole.yaml", "--set", "nodes=1", "--set", f"evaluation={section}"),
-        *options,
-        home=controller.home,
-    )
-    assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
-    with controller.server.reconciler.database.session() as session:
-        assert not session.scalars(select(Job)).all()
-
-
-@pytest.mark.parametrize("command", [("resume", "taught"), ("clone", "taught", "--name", "twin")])
-def test_a_resume_and_a_clone_refuse_evaluations_that_never_start(
-    controller: Controller, command: tuple[str, ...]
-) -> None:
+def test_evaluations_that_never_start_are_refused(controller: Controller, line: str, section: str, said: str) -> None:
     add_run(controller.server.store, "taught")
     controller.save(3)
-    section = "evaluation={every: 2, resources: {gpus: 1}}"
-    done = call_muster(*command, "--set", section, home=controller.home)
-    assert done.returncode == 2 and "evaluation: each node needs 1 CPU, 1 GPU" in done.stderr, done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    done = controller.muster(*line.split(), "--set", f"evaluation={{every: 2, {section}}}")
+    assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
     with controller.server.reconciler.database.session() as session:
         assert not session.scalars(select(Job)).all()
 

@@ -275,7 +275,6 @@ def test_a_clone_with_another_teacher_holds_the_new_teacher(full: Serving, store
     add_checkpoint(store, "pupil-of-two", 1, b"pupil", algorithm="rsl_rl", settings=settings)
     clone(full, "pupil-of-two", "of-another", "--set", "train.rsl_rl.teacher_checkpoint=taught@3")
     assert held(store.run("of-another"), "taught") == [b"three"] and weights(store.run("of-another")) == b"pupil"
-    said = refusal(
-        full, "clone", "pupil-of-two", "--name", "of-none", "--set", "train.rsl_rl.teacher_checkpoint=taught@4"
-    )
+    change = "train.rsl_rl.teacher_checkpoint=taught@4"
+    said = refusal(full, "clone", "pupil-of-two", "--name", "of-none", "--set", change)
     assert "run taught has no checkpoint of iteration 4" in said

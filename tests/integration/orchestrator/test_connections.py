@@ -6,7 +6,6 @@ import contextlib
 import os
 import resource
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -32,22 +31,14 @@ HALF = b"POST /v1/submitjob HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Le"
 
 
 class Limited(Serving):
-    """A server that can't have more open files than many a login shell; what it logs is in ``log_file``."""
+    """A server that can't have more open files than many a login shell; what it logs is in ``errors``."""
+
+    command = ("prlimit", f"--nofile={DESCRIPTORS}:{DESCRIPTORS}", MUSTER)
 
     def start(self) -> None:
         self.home.mkdir(parents=True)
-        self.log_file = self.home / "serve.log"
-        with open(self.log_file, "wb") as log:
-            self.process = subprocess.Popen(
-                ["prlimit", f"--nofile={DESCRIPTORS}:{DESCRIPTORS}", MUSTER, "serve", "--port", "0", *self.options],
-                env={**os.environ, "MUSTER_HOME": str(self.home)},
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-            )
-        assert self.process.stdout is not None
-        self.url = self.process.stdout.readline().split()[2]
-        self.client = Client(self.url)
+        self.errors = self.home / "serve.log"
+        super().start()
 
 
 def half_open(url: str, sent: bytes = HALF) -> socket.socket:
@@ -59,9 +50,7 @@ def half_open(url: str, sent: bytes = HALF) -> socket.socket:
 
 def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp_path: Path) -> None:
     raise_descriptor_limit()  # this process holds the other ends
-    server = Limited(tmp_path / "home", "--cpus", "4")
-    opened: list[socket.socket] = []
-    try:
+    with Limited(tmp_path / "home", "--cpus", "4") as server, contextlib.ExitStack() as stack:
         gate = tmp_path / "gate"
         talker = f"import time, pathlib\nprint('first')\nwhile not pathlib.Path({str(gate)!r}).exists(): time.sleep(0.1)\nprint('last')"
         followed = server.gang(talker)
@@ -75,7 +64,8 @@ def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp
         followers = [threading.Thread(target=follow, args=(lines,), daemon=True) for lines in seen]
         for follower in followers:
             follower.start()
-        opened = [half_open(server.url) for _ in range(HALF_OPEN)]
+        for _ in range(HALF_OPEN):
+            stack.enter_context(half_open(server.url))
         jobs = [server.gang("print('ran')", name=f"job-{number}") for number in range(6)]
         with httpx.Client(base_url=server.url, timeout=60) as fresh:
             assert fresh.get("/healthz").json()["status"] == "ok"
@@ -85,13 +75,9 @@ def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp
             follower.join(180)
         assert all({"first", "last"} <= set(lines) for lines in seen), "a follower was cut"
         assert server.wait(followed)["status"] == "SUCCEEDED"
-        log = server.log_file.read_text()
+        log = server.errors.read_text()  # type: ignore[union-attr]
         assert "have waited longest for their client are closed" in log
         assert len(log.splitlines()) < 10 and "Traceback" not in log, log[:2000]
-    finally:
-        for connection in opened:
-            connection.close()
-        server.close()
 
 
 @pytest.mark.parametrize("sent", [b"", HALF, HALF + b"ngth: 100\r\n\r\n{"])

@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -42,11 +43,6 @@ from tests.support.orchestrator.rows import job
 
 
 @pytest.fixture
-def server(postgresql: postgres.Server) -> postgres.Server:
-    return postgresql
-
-
-@pytest.fixture
 def url(database_url: str) -> str:
     return database_url
 
@@ -65,6 +61,20 @@ def opened(url: str) -> Iterator[Callable[[], Database]]:
         database.close()
 
 
+def insert(url: str, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Rows of an older database, whose columns are known by their names alone."""
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        for row in rows:
+            columns, values = ", ".join(row), ", ".join(f":{name}" for name in row)
+            connection.execute(text(f"INSERT INTO {table} ({columns}) VALUES ({values})"), dict(row))
+    engine.dispose()
+
+
+OLD = {"name": "old", "queue": "default", "definition": "arn", "request": "{}", "node_properties": "{}"}
+"""Of every old job."""
+
+
 @pytest.mark.parametrize("history", ["new", "migrated"])
 def test_a_new_and_a_migrated_database_match_the_tables(url: str, opened: Callable[[], Database], history: str) -> None:
     if history == "migrated":
@@ -80,47 +90,26 @@ def test_a_new_and_a_migrated_database_match_the_tables(url: str, opened: Callab
 
 def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0001")
+    facts = {**OLD, "run": "r", "status": "FAILED", "created_at": 5, "attempts_allowed": 3}
+    insert(url, "jobs", [{"id": "j1", **facts}])
+    insert(url, "attempts", [{"job_id": "j1", "number": 1, "epoch": 1, "nodes": "[]", "created_at": 5, "spent": True}])
     engine = create_engine(url)
     with engine.begin() as connection:
         connection.execute(text("DROP TABLE alembic_version"))  # the first version had no migrations
-        connection.execute(
-            text(
-                "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
-                "attempts_allowed) VALUES ('j1', 'old', 'default', 'arn', '{}', '{}', 'r', 'FAILED', 5, 3)"
-            )
-        )
-        connection.execute(
-            text(
-                "INSERT INTO attempts (job_id, number, epoch, nodes, created_at, spent) VALUES ('j1', 1, 1, '[]', 5, :spent)"
-            ),
-            {"spent": True},
-        )
     engine.dispose()
     with opened().session() as session:
         old = session.get_one(Job, "j1")
         assert [attempt.number for attempt in old.attempts] == [1]
-        assert (old.name, old.attempts_allowed, old.kind, old.tags, old.evaluate_on_exit) == (
-            "old",
-            3,
-            "multinode",
-            {},
-            [],
-        )
+        assert (old.name, old.attempts_allowed, old.kind) == ("old", 3, "multinode")
+        assert (old.tags, old.evaluate_on_exit) == ({}, [])
 
 
 def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0003")
-    engine = create_engine(url)
-    insert = (
-        "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
-        "attempts_allowed, kind, tags, parent) VALUES (:id, 'old', 'default', 'arn', '{}', :properties, :id, 'RUNNABLE', 5, "
-        '3, :kind, \'{"a": "b"}\', :parent)'
-    )
-    with engine.begin() as connection:
-        for each, kind, parent in (("p", "array", None), ("p:0", "container", "p"), ("alone", "container", None)):
-            row = {"id": each, "kind": kind, "parent": parent, "properties": '{"numNodes": 1}'}
-            connection.execute(text(insert), row)
-    engine.dispose()
+    facts = {**OLD, "node_properties": '{"numNodes": 1}', "status": "RUNNABLE", "created_at": 5, "attempts_allowed": 3}
+    family = (("p", "array", None), ("p:0", "container", "p"), ("alone", "container", None))
+    rows = [{"id": name, "run": name, "kind": kind, "parent": parent} for name, kind, parent in family]
+    insert(url, "jobs", [{**facts, "tags": '{"a": "b"}', **row} for row in rows])
     with opened().session() as session:
         stored = dict(session.execute(text("SELECT id, node_properties IS NULL FROM jobs")).tuples().all())
         assert {name: bool(shared) for name, shared in stored.items()} == {"p": False, "p:0": True, "alone": False}
@@ -136,25 +125,12 @@ def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, 
 
 def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, opened: Callable[[], Database]) -> None:
     migrate(url, "upgrade", "0004")
-    engine = create_engine(url)
-    with engine.begin() as connection:
-        for number, (run, queue, key, epoch) in enumerate(
-            [
-                ("a", "lab", "key x/1/2", 1),
-                ("a", "default", None, 2),
-                ("b", "default", None, 1),
-                ("c", "lab", None, None),
-            ]
-        ):
-            connection.execute(
-                text(
-                    "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
-                    "attempts_allowed, idempotency_key, first_epoch) "
-                    "VALUES (:id, 'j', :queue, 'arn', '{}', '{}', :run, 'FAILED', :at, 1, :key, :epoch)"
-                ),
-                {"id": f"j{number}", "at": number, "run": run, "queue": queue, "key": key, "epoch": epoch},
-            )
-    engine.dispose()
+    facts = {**OLD, "status": "FAILED", "attempts_allowed": 1}
+    found = [("a", "lab", "key x/1/2", 1), *((run, "default", None, epoch) for run, epoch in (("a", 2), ("b", 1)))]
+    found.append(("c", "lab", None, None))
+    columns = ("run", "queue", "idempotency_key", "first_epoch")
+    rows = [{"id": f"j{i}", "created_at": i, **dict(zip(columns, row, strict=True))} for i, row in enumerate(found)]
+    insert(url, "jobs", [{**facts, **row} for row in rows])
     with opened().session() as session:
         runs = {run.name: (run.queue, run.owner) for run in session.scalars(select(RunRecord))}
         assert runs == {"a": ("lab", "key x"), "b": ("default", None)}  # c never started: there is no run of it
@@ -195,8 +171,8 @@ def test_a_database_that_is_not_there_is_one_line(tmp_path: Path) -> None:
         Database("nosuch://x/y")
 
 
-def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dead(server: postgres.Server) -> None:
-    url = server.new_database()
+def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dead(postgresql: postgres.Server) -> None:
+    url = postgresql.new_database()
     script = f"from orchestrator.persistence.session import Database; d = Database({url!r}); print('up', flush=True); input()"
     first = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert first.stdout is not None and first.stdout.readline() == b"up\n"
@@ -229,8 +205,8 @@ def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path:
         os.umask(before)
 
 
-def test_a_controller_that_lost_its_database_refuses_writes_alone(server: postgres.Server, tmp_path: Path) -> None:
-    url = server.new_database()
+def test_a_controller_that_lost_its_database_refuses_writes_alone(postgresql: postgres.Server, tmp_path: Path) -> None:
+    url = postgresql.new_database()
     losing = Server(tmp_path, database=url)
     losing.start()
     other, waiter = create_engine(url).connect(), create_engine(url).connect()
@@ -301,10 +277,8 @@ def test_a_stop_during_a_write_of_the_controller_is_processed() -> None:
 
 def test_an_array_keeps_its_children_until_the_last_is_over(opened: Callable[[], Database]) -> None:
     with opened().session() as session:
-        session.add_all(
-            [job("p", status="PENDING", kind="array"), job("p:0", status="FAILED", stopped_at=1, parent="p")]
-        )
-        session.add(job("p:1", status="RUNNING", parent="p"))
+        session.add_all([job("p", status="PENDING", kind="array"), job("p:1", status="RUNNING", parent="p")])
+        session.add(job("p:0", status="FAILED", stopped_at=1, parent="p"))
         session.commit()
         assert forget_before(session, 2000) == 0
         for each in session.scalars(select(Job)):
@@ -332,15 +306,12 @@ def test_an_attempt_is_charged_for_its_use_and_losses(opened: Callable[[], Datab
     def nodes() -> list[Node]:
         return [Node(host="h", gpus=gpus, cpus=4.0, memory=1) for gpus in (("0", "1"), ("2", "3"))]
 
-    failed = Attempt(
-        job_id="a", number=1, epoch=1, nodes=nodes(), created_at=10_000, stopped_at=70_000, ending="failed"
-    )
+    facts = {"job_id": "a", "created_at": 10_000}
+    failed = Attempt(**facts, number=1, epoch=1, nodes=nodes(), stopped_at=70_000, ending="failed")
     charge(failed, run, 70_000)
     assert (failed.gpu_seconds, failed.cpu_seconds) == (240.0, 480.0)
     assert (failed.wasted_gpu_seconds, failed.wasted_cpu_seconds) == (240.0, 480.0), "it had saved nothing"
-    done = Attempt(
-        job_id="a", number=2, epoch=2, nodes=nodes(), created_at=10_000, stopped_at=20_000, ending="succeeded"
-    )
+    done = Attempt(**facts, number=2, epoch=2, nodes=nodes(), stopped_at=20_000, ending="succeeded")
     charge(done, run, 20_000)
     assert (done.gpu_seconds, done.wasted_gpu_seconds) == (40.0, 0.0)
     assert resource_seconds(failed, 70_000) == 240.0
@@ -359,28 +330,19 @@ def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) 
     with opened().session() as session:
         session.add_all([job("aaaa1111", name="x"), job("aaaa2222", name="y"), job("aaaa2222:0", parent="aaaa2222")])
         session.flush()
-        found = {text: find_job(session, text) for text in ("aaaa1111", "y", "aaaa2", "aaaa", "aaa", "aaaa2222:0")}
-    assert {text: each and each.id for text, each in found.items()} == {
-        "aaaa1111": "aaaa1111",
-        "y": "aaaa2222",
-        "aaaa2": "aaaa2222",
-        "aaaa": None,
-        "aaa": None,
-        "aaaa2222:0": "aaaa2222:0",
-    }
+        texts = ("aaaa1111", "y", "aaaa2", "aaaa", "aaa", "aaaa2222:0")
+        found = [(each := find_job(session, text)) and each.id for text in texts]
+    assert found == ["aaaa1111", "aaaa2222", "aaaa2222", None, None, "aaaa2222:0"]
 
 
-def test_a_controller_with_a_lost_lock_takes_it_again_or_names_its_owner(server: postgres.Server) -> None:
-    url = server.new_database()
+def test_a_controller_with_a_lost_lock_takes_it_again_or_names_its_owner(postgresql: postgres.Server) -> None:
+    url = postgresql.new_database()
     database, others = Database(url), create_engine(url)
 
     def cut() -> None:
         with others.connect() as connection:
-            connection.execute(
-                text(
-                    "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND pid != pg_backend_pid()"
-                )
-            )
+            locks = "pg_locks WHERE locktype = 'advisory' AND pid != pg_backend_pid()"
+            connection.execute(text(f"SELECT pg_terminate_backend(pid) FROM {locks}"))
 
     cut()
     database.keep_lock()
@@ -396,10 +358,9 @@ def test_a_controller_with_a_lost_lock_takes_it_again_or_names_its_owner(server:
     others.dispose()
 
 
-def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.Server, tmp_path: Path) -> None:
-    url = server.new_database()
-    serving = Serving(tmp_path / "home", "--cpus", "2", "--database", url)
-    try:
+def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(postgresql: postgres.Server, tmp_path: Path) -> None:
+    url = postgresql.new_database()
+    with Serving(tmp_path / "home", "--cpus", "2", "--database", url) as serving:
         job = serving.gang("print('hello from', __import__('os').environ['MUSTER_RUN'])", nodes=2, name="on-postgres")
         assert serving.wait(job)["status"] == "SUCCEEDED"
         for operation, request in (("DescribeJobs", {"jobs": ["a\0"]}), ("ListJobs", {"jobQueue": "a\0"})):
@@ -408,16 +369,13 @@ def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.
             assert refused.value.status == 400
         running = serving.gang("import time; time.sleep(600)", name="running")
         serving.wait(running, "RUNNING")
-        with server.away():
+        with postgresql.away():
             with pytest.raises(ApiError, match="database postgresql") as away:
                 serving.gang("pass")
             assert away.value.status == 503
             health = f"{serving.url}/healthz"
-            wait_for(
-                lambda: (a := httpx.get(health)).status_code == 503 and "postgresql" in a.json()["message"],
-                30,
-                "its trouble",
-            )
+            trouble = lambda: (a := httpx.get(health)).status_code == 503 and "postgresql" in a.json()["message"]  # noqa: E731
+            wait_for(trouble, 30, "its trouble")
         wait_for(lambda: httpx.get(health).status_code == 200, 30, "that it serves again")
         assert serving.wait(serving.gang("print('again')"))["status"] == "SUCCEEDED"
         assert serving.detail(running)["status"] == "RUNNING"
@@ -429,5 +387,3 @@ def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.
         assert detail["status"] == "SUCCEEDED" and detail["attempts"][0]["cpuSeconds"] > 0
         assert any("hello from on-postgres-" in line for line in serving.log(job))
         assert not (serving.home / "muster.db").exists()
-    finally:
-        serving.close()

@@ -273,10 +273,8 @@ class HungDocker(socketserver.ThreadingUnixStreamServer):
     """A Docker daemon that says what it is, and from then on takes every request and answers none."""
 
     daemon_threads = True
-    answers = {
-        "/version": {"ApiVersion": "1.41", "Version": "20.10"},
-        "/info": {"NCPU": 4, "MemTotal": 2**33, "Name": socket.gethostname()},
-    }
+    info = {"NCPU": 4, "MemTotal": 2**33, "Name": socket.gethostname()}
+    answers = {"/version": {"ApiVersion": "1.41", "Version": "20.10"}, "/info": info}
 
     def __init__(self, path: Path) -> None:
         self.over = threading.Event()

@@ -100,9 +100,8 @@ def test_a_job_from_yaml_is_checked_as_the_command_s_is(full: Serving, tmp_path:
         spec.write_text(json.dumps({"name": "judge", "evaluate": {"run": "taught", **section}}))
         for options in ([], ["--dry-run"]):
             assert said in refusal(full, "submit", str(spec), *options)
-    spec.write_text(
-        '{"name": "judge", "evaluate": {"run": "taught", "checkpoint": "best", "config": {"angle_limit": 0.3}}}'
-    )
+    section = {"run": "taught", "checkpoint": "best", "config": {"angle_limit": 0.3}}
+    spec.write_text(json.dumps({"name": "judge", "evaluate": section}))
     done = full.muster("submit", str(spec), "--json")
     assert done.returncode == 0, done.stderr
     assert full.detail(json.loads(done.stdout)["jobId"])["spec"]["evaluate"]["checkpoint"] == "best"

@@ -91,9 +91,8 @@ def test_a_job_waits_for_room_and_says_why(server: Serving) -> None:
     assert reason == wanted + reason.split("GPUs, ")[2]
     assert reason.endswith(f"free until job big ({first[:8]}) ends")
     impossible = server.gang("pass", nodes=1, cpus="64", name="impossible")
-    reason = wait_for(
-        lambda: (r := server.detail(impossible)["statusReason"]) and "MISCONF" in r and r, what="a reason"
-    )
+    other = lambda: (r := server.detail(impossible)["statusReason"]) and "MISCONF" in r and r  # noqa: E731
+    reason = wait_for(other, what="a reason")
     assert "each node needs 64 CPUs" in reason and "the largest host has 4 CPUs" in reason
     assert server.muster("stop", first).returncode == 0
     assert server.wait(second)["status"] == "SUCCEEDED"
@@ -259,9 +258,8 @@ def test_how_a_gang_ended_is_recorded_for_each_node(tmp_path: Path, monkeypatch:
         wait_for(lambda: len(processes_of(tmp_path)) == 3, 60, "node 1's end")
         assert detail(client, asleep)["status"] == "RUNNING"
         os.kill(int(told[0].split()[1]), signal.SIGKILL)
-        assert await_status(client, asleep, "FAILED")["statusReason"].startswith(
-            "main node: rank 0 was killed by SIGKILL"
-        )
+        reason = await_status(client, asleep, "FAILED")["statusReason"]
+        assert reason.startswith("main node: rank 0 was killed by SIGKILL")
 
 
 IGNORED = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGCHLD, signal.SIGALRM)

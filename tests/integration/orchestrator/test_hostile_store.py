@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,10 @@ from shared_store.log_files import LogWriter
 from shared_store.logs import LogFollower, format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
 from tests.conftest import call_muster, submit_gang, wait_for
+from tests.support.definitions import nodes_of
 
 SPEC = {"name": "a", "train": {"task": "Cartpole", "worlds": 4, "iterations": 2}}
-NODES = {
-    "numNodes": 1,
-    "mainNode": 0,
-    "nodeRangeProperties": [{"targetNodes": "0:", "container": {"command": ["true"]}}],
-}
+NODES = nodes_of({"command": ["true"]})
 DAMAGED: dict[str, bytes] = {
     "zeros": b"\0" * 4096,
     "empty": b"",
@@ -115,10 +111,8 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
 def test_no_change_of_a_run_and_no_stored_spec_makes_an_answer_long(
     inside: Server, http: httpx.Client, runs: Path
 ) -> None:
-    bomb = ", ".join(
-        ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
-    )
-    started = time.monotonic()
+    levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
+    bomb = ", ".join(["a0: &a0 [x, x, x, x, x, x, x, x]", *levels])
     said = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
     assert "anchors and aliases (&a0) are not accepted here" in said and len(said) < 400
     train = {**SPEC["train"], "task": "my:Task", "config": {"text": "x" * 100_000}}  # type: ignore[dict-item]
@@ -127,7 +121,6 @@ def test_no_change_of_a_run_and_no_stored_spec_makes_an_answer_long(
     said = refused(http.post("/api/runs/crafted/resume", json={"set": ["train.config={text: y}"]}))
     assert "train.config.text is" in said and len(said) < 400
     assert "at most 24576" in refused(http.post("/api/runs/a-good/resume", json={"set": ["name=" + "x" * 30_000]}))
-    assert time.monotonic() - started < 30, "a hang"
 
 
 def test_runs_come_in_pages_that_together_hold_each_run_once(http: httpx.Client, runs: Path) -> None:
@@ -161,10 +154,8 @@ def damaged_home(home: Path) -> Path:
     """A home whose database was written by a controller, with zeros over the pages of the table of jobs."""
     database = Database.at(home)
     with database.session() as session:
-        session.add_all(
-            Job(id=f"j{n}", name="j", queue="default", definition="d", request={}, node_properties=NODES, run=f"r{n}")
-            for n in range(500)
-        )
+        facts = {"name": "j", "queue": "default", "definition": "d", "request": {}, "node_properties": NODES}
+        session.add_all(Job(id=f"j{n}", run=f"r{n}", **facts) for n in range(500))
     with database.engine.connect() as connection:
         connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
         size = connection.exec_driver_sql("PRAGMA page_size").scalar_one()
@@ -187,10 +178,8 @@ def test_a_damaged_page_found_while_serving_is_reported_to_each_request(tmp_path
     path = damaged_home(tmp_path)
     database = Database.at(tmp_path)
     for _ in range(2):
-        with (
-            pytest.raises(DatabaseError, match=f"{path} is damaged .*malformed") as refused,
-            database.session() as session,
-        ):
+        damaged = pytest.raises(DatabaseError, match=f"{path} is damaged .*malformed")
+        with damaged as refused, database.session() as session:
             session.scalars(select(Job)).all()
         assert "\n" not in str(refused.value)
     with pytest.raises(DatabaseError, match="is damaged"), database.session() as session:
@@ -221,27 +210,16 @@ def test_a_job_and_its_log_can_be_read_whatever_it_put_in_place_of_its_files(
         assert "said" in lines and "not yours" not in lines
 
 
-def test_an_epoch_that_is_a_pipe_is_damage_and_not_waited_for(tmp_path: Path) -> None:
-    run = Run(tmp_path / "run")
-    run.path.mkdir()
-    os.mkfifo(run.path / "EPOCH")
-    with pytest.raises(DamagedFile, match="EPOCH: not a regular file"):
-        read_epoch(run)
-
-
-def test_a_node_s_log_is_not_written_through_a_link(tmp_path: Path) -> None:
-    target = tmp_path / "target"
-    target.write_text("kept")
-    (tmp_path / "node-0.log").symlink_to(target)
-    with pytest.raises(OSError):
-        LogWriter(tmp_path / "node-0.log")
-    assert target.read_text() == "kept"
-
-
-def test_an_attempt_is_closed_without_touching_what_a_job_put_in_place_of_its_claim(tmp_path: Path) -> None:
+def test_links_and_pipes_that_a_job_put_in_place_of_files_are_neither_followed_nor_waited_for(tmp_path: Path) -> None:
     run, victim = Run(tmp_path / "run"), tmp_path / "victim"
     run.path.mkdir()
     victim.write_text("kept")
+    (tmp_path / "node-0.log").symlink_to(victim)
+    with pytest.raises(OSError):
+        LogWriter(tmp_path / "node-0.log")
+    os.mkfifo(run.path / "EPOCH")
+    with pytest.raises(DamagedFile, match="EPOCH: not a regular file"):
+        read_epoch(run)
     (run.path / "EPOCH.1").symlink_to(victim)
     os.mkfifo(run.path / "EPOCH.2")
     (run.path / "EPOCH.3").mkdir()

@@ -37,9 +37,8 @@ def value(found: Samples, name: str, **labels: str) -> float | None:
 
 @pytest.fixture
 def small(tmp_path: Path) -> Iterator[Serving]:
-    server = Serving(tmp_path / "home", "--cpus", "1")
-    yield server
-    server.close()
+    with Serving(tmp_path / "home", "--cpus", "1") as server:
+        yield server
 
 
 def test_a_scrape_reports_waiting_running_and_ended_jobs_and_their_use(small: Serving) -> None:
@@ -74,11 +73,8 @@ def test_a_scrape_reports_waiting_running_and_ended_jobs_and_their_use(small: Se
     assert value(after, "muster_queue_wait_seconds_count", queue="default") == 2
     waited = value(after, "muster_queue_wait_seconds_sum", queue="default")
     assert waited is not None and waited >= longest  # the second one waited for the first
-    attempts = [
-        attempt
-        for job in (first, second)
-        for attempt in json.loads(small.muster("show", job, "--json").stdout)["attempts"]
-    ]
+    shown = [json.loads(small.muster("show", job, "--json").stdout) for job in (first, second)]
+    attempts = [attempt for each in shown for attempt in each["attempts"]]
     used, lost = (sum(attempt[key] for attempt in attempts) for key in ("cpuSeconds", "wastedCpuSeconds"))
     assert len(attempts) == 3 and used > lost > 0
     assert value(after, "muster_cpu_seconds_total", **own) == pytest.approx(used, abs=0.01)
@@ -98,9 +94,9 @@ def asked_by_the_dashboard() -> set[str]:
     return {name for expression in expressions for name in re.findall(r"muster_\w+", expression)}
 
 
-def test_every_metric_is_in_the_documentation_and_none_else(small: Serving) -> None:
+def test_every_metric_is_in_the_documentation_and_none_else(shared_server: Serving) -> None:
     page = (REPOSITORY / "docs/operations.md").read_text()
-    text = httpx.get(f"{small.url}/metrics").text
+    text = httpx.get(f"{shared_server.url}/metrics").text
     families = set(re.findall(r"^# TYPE (muster_\w+) ", text, re.M)) - {"muster_info"}
     families -= {name for name in families if name.endswith("_created")}
     documented = set(re.findall(r"`(muster_\w+)`", page.partition("### Prometheus")[2].partition("\n## ")[0]))

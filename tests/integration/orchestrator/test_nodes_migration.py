@@ -25,16 +25,8 @@ from tests.support.orchestrator.databases import migrate
 from tests.support.orchestrator.jobs import await_status, detail, serving
 
 DUMP = Path(__file__).parents[2] / "support" / "orchestrator" / "schema_0008.sql"
-BEFORE = {
-    "submitted": "SUBMITTED",
-    "pending": "PENDING",
-    "runnable": "RUNNABLE",
-    "starting": "STARTING",
-    "running": "RUNNING",
-    "done": "SUCCEEDED",
-    "failed": "FAILED",
-    "array": "SUCCEEDED",
-}
+BEFORE = {name: name.upper() for name in ("submitted", "pending", "runnable", "starting", "running", "failed")}
+BEFORE |= {"done": "SUCCEEDED", "array": "SUCCEEDED"}
 """State of each job in the dump."""
 
 
@@ -107,10 +99,8 @@ def test_queues_keep_their_compute_environments_in_order_and_back_again(old: str
     ],
 )
 def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old: str, damaged: str) -> None:
-    kept = [
-        {"index": 0, "host": "h", "gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"},
-        {"index": 1, "host": "h"},
-    ]
+    told = {"gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"}
+    kept = [{"index": 0, "host": "h", **told}, {"index": 1, "host": "h"}]
     written = {1: json.dumps(kept), 2: damaged}
     engine = create_engine(old)
     with engine.begin() as connection:
@@ -121,10 +111,8 @@ def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old:
     database = Database(old)
     with database.session() as session:
         first, second = session.scalars(select(Job).where(Job.name == "failed")).one().attempts
-        assert [node.placement for node in first.nodes] == [
-            Placement("h", ("GPU-a", "GPU-b"), 0.0, 0),
-            Placement("h", (), 0.0, 0),
-        ]
+        placements = [Placement("h", gpus, 0.0, 0) for gpus in (("GPU-a", "GPU-b"), ())]
+        assert [node.placement for node in first.nodes] == placements
         assert (first.nodes[0].devices, first.nodes[0].reason) == (("7",), "a\\x00b\\ud800")
         assert first.nodes[1].devices is None
         assert second.nodes == []

@@ -92,9 +92,8 @@ def test_a_bug_of_an_engine_holds_up_one_job_and_is_logged_once(
     wait_for(lambda: bench.engine.tries[call] > 1, 30, "another try")
     bench.runs_and_ends("good-2")
     tries, passed = bench.engine.tries[call], time.monotonic() - began
-    assert 2 ** (tries - 1) - 1 <= passed, (
-        f"{tries} tries within {passed:.1f} s: each pause doubles, from one second on"
-    )
+    told = f"{tries} tries within {passed:.1f} s: each pause doubles, from one second on"
+    assert 2 ** (tries - 1) - 1 <= passed, told
     tracebacks = [record for record in caplog.records if record.exc_info]
     assert len(tracebacks) == 1 and GOES_WRONG[call] in tracebacks[0].getMessage(), caplog.text
     assert bench.job("bad").status in (Status.STARTING, Status.RUNNING)

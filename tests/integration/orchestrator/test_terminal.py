@@ -32,11 +32,8 @@ def test_everything_that_a_terminal_acts_on_is_shown_escaped() -> None:
 def test_no_text_leaves_a_control_character(text: str) -> None:
     shown = visible(text)
     assert {c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp")} <= {"\t", "\n"}
-    assert {
-        c
-        for c in shown
-        if unicodedata.bidirectional(c) in ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-    } == set()
+    turning = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
+    assert not turning & set(map(unicodedata.bidirectional, shown))
     assert visible(shown) == shown
     coloured = visible(text, colours=True)
     assert "\x1b" not in re.sub(r"\x1b\[[0-9;]*m", "", coloured)
@@ -82,12 +79,8 @@ def test_commands_print_through_the_terminal_only() -> None:
     ways = re.compile(
         r"(?<![\w.])print\(|typer\.echo|click\.echo|sys\.std(out|err)\.write|from rich(\.console)? import.*Console|rprint"
     )
-    found = [
-        f"{path.name}: {line}"
-        for path in folder.glob("*.py")
-        for line in path.read_text().splitlines()
-        if ways.search(line)
-    ]
+    lines = [(path.name, line) for path in folder.glob("*.py") for line in path.read_text().splitlines()]
+    found = [f"{name}: {line}" for name, line in lines if ways.search(line)]
     assert found == [r'terminal.py:     print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)']
 
 

@@ -18,9 +18,7 @@ def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_p
 
     def refused(*arguments: str) -> str:
         done = call_muster("tracks", *arguments, home=home)
-        assert done.returncode == 2 and "Traceback" not in done.stderr and len(done.stderr.splitlines()) == 1, (
-            done.stderr
-        )
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
         return done.stderr
 
     made = call_muster("tracks", "make", "hills", "--seed", "7", "--length", "40", "-o", str(picture), home=home)
@@ -47,9 +45,8 @@ def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_p
     assert swapped.returncode == 0 and "mended:     the borders were swapped" in swapped.stdout, swapped.stderr
     rows[9] = np.nan
     np.save(tmp_path / "broken.npy", rows)
-    assert f"{tmp_path}/broken.npy: centre line: row 9" in refused(
-        "import", str(tmp_path / "broken.npy"), "--name", "broken"
-    )
+    said = refused("import", str(tmp_path / "broken.npy"), "--name", "broken")
+    assert f"{tmp_path}/broken.npy: centre line: row 9" in said
 
     (store.tracks / "copy" / "manifest.json").unlink()
     listed = json.loads(call_muster("tracks", "list", "--json", home=home).stdout)

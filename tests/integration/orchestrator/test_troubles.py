@@ -115,25 +115,15 @@ def test_a_damaged_row_harms_itself_alone(
             said = f"job broken ({broken[:8]}): the job's row in the database is damaged; submit the job again"
             assert (page.status_code, page.json()["message"]) == (409, said)
         assert all(http.get(f"/api/{path}").status_code == 200 for path in (f"jobs/{whole}", "runs", f"runs/{run}"))
-    finally:
         change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", kept, broken)
-
-
-def test_a_job_whose_definition_is_gone_from_the_database_answers_for_itself_alone(
-    inside: Server, http: httpx.Client, ended: tuple[str, str]
-) -> None:
-    broken, whole = ended
-    home = Path(str(inside.reconciler.database.volume))
-    [[kept]] = change(home, "SELECT definition FROM jobs WHERE id = ?", broken)
-    change(home, "UPDATE jobs SET definition = 'gone:9' WHERE id = ?", broken)
-    try:
-        answer = http.post("/v1/describejobs", json={"jobs": [broken, whole]})
-        assert answer.status_code == 200, answer.text
-        first, second = answer.json()["jobs"]
+        [[definition]] = change(home, "SELECT definition FROM jobs WHERE id = ?", broken)
+        change(home, "UPDATE jobs SET definition = 'gone:9' WHERE id = ?", broken)
+        first, second = http.post("/v1/describejobs", json={"jobs": [broken, whole]}).json()["jobs"]
+        change(home, "UPDATE jobs SET definition = ? WHERE id = ?", definition, broken)
         assert first["statusReason"].endswith("; the job's row in the database is damaged")
         assert second["jobId"] == whole and "damaged" not in second.get("statusReason", "")
     finally:
-        change(home, "UPDATE jobs SET definition = ? WHERE id = ?", kept, broken)
+        change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", kept, broken)
 
 
 def status_reason(home: Path, job_id: str) -> str:
@@ -153,9 +143,8 @@ def test_a_start_that_fails_stops_no_other_and_is_tried_again(home: Path, caplog
         blocked.unlink()
         done = await_status(client, first, "SUCCEEDED", "FAILED")
         assert (done["status"], len(done["attempts"])) == ("SUCCEEDED", 1), done["statusReason"]
-    assert [r.getMessage().startswith(f"job {first}: {said}") for r in caplog.records if r.levelname == "ERROR"] == [
-        True
-    ]
+    [told] = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert told.startswith(f"job {first}: {said}")
 
 
 @pytest.mark.parametrize("how", ["moved away", "replaced"])
@@ -173,9 +162,9 @@ def test_without_its_database_the_controller_says_so_and_accepts_nothing_until_i
         if how == "replaced":
             shutil.copy(away, database)
             said = (
-                f"database {database} was replaced by another file while the controller runs; put the former one back, or restart "
-                "the controller to use this one"
+                f"database {database} was replaced by another file while the controller runs; put the former one back, "
             )
+            said += "or restart the controller to use this one"
         health = httpx.get(f"{url}/healthz")
         assert (health.status_code, health.json()["message"]) == (503, said)
         with pytest.raises(ApiError, match=re.escape(said)):

@@ -71,11 +71,8 @@ def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(told: S
         assert is_signed(headers, body) and headers["content-type"] == "application/json"
         message = json.loads(body)
         data, detail = message["data"], told.detail(job)
-        assert (message["type"], data["status"], data["statusReason"]) == (
-            kind,
-            detail["status"],
-            detail["statusReason"],
-        )
+        ended = (kind, detail["status"], detail["statusReason"])
+        assert (message["type"], data["status"], data["statusReason"]) == ended
         assert (data["name"], data["run"], data["queue"]) == (detail["name"], detail["run"], "default")
         assert (data["attempts"], data["stopped"]) == (1, job == stopped)
         assert data["exitCode"] == code or job == stopped
@@ -173,9 +170,8 @@ def test_a_receiver_that_answers_a_byte_at_a_time_is_left_after_the_deadline_of_
 def test_an_unknown_queue_is_told_with_the_nearest_at_the_start(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    file = write_webhooks(
-        tmp_path / "hooks.json", chat={"url": "http://127.0.0.1:1/", "queues": ["default", "defualt"]}
-    )
+    chat = {"url": "http://127.0.0.1:1/", "queues": ["default", "defualt"]}
+    file = write_webhooks(tmp_path / "hooks.json", chat=chat)
     server = Server(tmp_path / "home", cpus=1, webhooks=file)
     server.start()
     server.close()

@@ -27,9 +27,8 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bare") / "environment"
     venv.create(folder, with_pip=True)
     install = [folder / "bin" / "python", "-m", "pip", "install", "-q", "-c", REPOSITORY / "constraints.txt"]
-    done = subprocess.run(
-        [*map(str, install), str(REPOSITORY / "policy_node")], capture_output=True, text=True, timeout=600
-    )
+    command = [*map(str, install), str(REPOSITORY / "policy_node")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     if done.returncode and "Could not find a version" in done.stderr:
         pytest.skip("no package index can be reached here: the bare policy node was NOT tested")
     assert done.returncode == 0, done.stderr

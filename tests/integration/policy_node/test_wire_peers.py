@@ -78,14 +78,8 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 
 def joint_state(knee: float, names: tuple[str, ...] = ("wheel", "knee")) -> Any:
-    return MESSAGES.make(
-        JOINT_STATE,
-        header=MESSAGES.header(0),
-        name=list(names),
-        position=np.array([0.0, 0.1]),
-        velocity=np.array([9.0, knee]),
-        effort=np.zeros(0),
-    )
+    numbers = {"position": np.array([0.0, 0.1]), "velocity": np.array([9.0, knee]), "effort": np.zeros(0)}
+    return MESSAGES.make(JOINT_STATE, header=MESSAGES.header(0), name=list(names), **numbers)
 
 
 def definition(kind: str) -> str:
@@ -143,14 +137,9 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
     bundle = write_bundle(tmp_path / "bundle", contract(SPEED), np.array([[1.0], [0.0]]))
     running = Running(bundle, tmp_path / "log")
     nothing = "uint8 structure_needs_at_least_one_member"
-    client = ROS2ServiceClient(
-        "/muster_policy/reset",
-        RESET,
-        request_definition=nothing,
-        response_definition=nothing,
-        router_ip="127.0.0.1",
-        router_port=running.port,
-    )
+    empty = {"request_definition": nothing, "response_definition": nothing}
+    router = {"router_ip": "127.0.0.1", "router_port": running.port}
+    client = ROS2ServiceClient("/muster_policy/reset", RESET, **empty, **router)
     try:
         assert client.type_hash == MESSAGES.type_hash(RESET)
         with open_session(running.endpoint, None) as session:
@@ -161,9 +150,7 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
                 return found if len(found) == 2 else []
 
             ours, theirs = wait_for(announced, 20, "the tokens of the server and of the client")
-        assert ours.split("/")[-4:] == theirs.split("/")[-4:], (
-            "name, type, hash and quality of service are written alike"
-        )
+        assert ours.split("/")[-4:] == theirs.split("/")[-4:], "name, type, hash and quality of service"
         assert client.call(structure_needs_at_least_one_member=0) is not None, "the answer"
         assert client.call(structure_needs_at_least_one_member=0) is not None, "the next one"
         with open_session(running.endpoint, None) as session:
@@ -182,10 +169,9 @@ def test_messages_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachm
     got: list[zenoh.Sample] = []
     with open_session(running.endpoint, None) as session:
         node = Node(session, MESSAGES, name="sensors")
-        ear = session.declare_subscriber(
-            f"0/joint_commands/sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}",
-            zenoh.handlers.Callback(got.append, indirect=False),
-        )
+        kind = f"sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}"
+        note = zenoh.handlers.Callback(got.append, indirect=False)
+        ear = session.declare_subscriber(f"0/joint_commands/{kind}", note)
         states = node.publisher("joint_states", JOINT_STATE)
 
         def commanded() -> bool:
@@ -217,9 +203,8 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
         node = Node(session, MESSAGES, name="confused")
         wrong = node.publisher("joint_states", TWIST)
         right = node.publisher("joint_states", JOINT_STATE)
-        raw = session.declare_publisher(
-            f"0/joint_states/sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}"
-        )
+        kind = f"sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}"
+        raw = session.declare_publisher(f"0/joint_states/{kind}")
 
         def told() -> bool:
             wrong.publish(MESSAGES.twist((0.0,) * 3, (0.0,) * 3))
@@ -253,11 +238,8 @@ def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares
         log = lambda data, kind, type_hash: said.append(MESSAGES.decode(data, kind).msg)  # noqa: E731
         node.subscribe("/rosout", "rcl_interfaces/msg/Log", log)
         diagnoses: list[Any] = []
-        node.subscribe(
-            "/diagnostics",
-            "diagnostic_msgs/msg/DiagnosticArray",
-            lambda data, kind, type_hash: diagnoses.append(MESSAGES.decode(data, kind)),
-        )
+        diagnose = lambda data, kind, type_hash: diagnoses.append(MESSAGES.decode(data, kind))  # noqa: E731
+        node.subscribe("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", diagnose)
         reset, states = node.publisher("/muster_policy/reset", EMPTY), node.publisher("joint_states", JOINT_STATE)
 
         def diagnosed(acting: bool) -> bool:
@@ -275,9 +257,8 @@ def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares
             if "/NN/%/%/muster_policy" in str(sample.key_expr):
                 (gone if sample.kind == zenoh.SampleKind.DELETE else there).set()
 
-        session.liveliness().declare_subscriber(
-            "@ros2_lv/**", zenoh.handlers.Callback(told, indirect=False), history=True
-        )
+        ear = zenoh.handlers.Callback(told, indirect=False)
+        session.liveliness().declare_subscriber("@ros2_lv/**", ear, history=True)
         assert there.wait(30)
         assert running.end() == 0
         assert gone.wait(10)
@@ -295,9 +276,8 @@ def test_a_taken_port_and_a_missing_router_are_reported_in_one_line(tmp_path: Pa
         options = ["--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}"]
         done = subprocess.run([*command, *options], env=env, capture_output=True, text=True, timeout=60)
     (line,) = done.stderr.strip().splitlines()
-    assert done.returncode == 1 and line.startswith(
-        f"error: --listen {options[1]}: the port is taken; is a router or another node there?"
-    ), done.stderr
+    said = f"error: --listen {options[1]}: the port is taken; is a router or another node there?"
+    assert done.returncode == 1 and line.startswith(said), done.stderr
     nobody = ["--connect", f"tcp/127.0.0.1:{free_port()}", "--duration", "0.5"]
     done = subprocess.run([*command, *nobody], env=env, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and f"no router answers at {nobody[1]}; it is tried again" in done.stdout, done.stderr

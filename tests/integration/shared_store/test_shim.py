@@ -27,18 +27,21 @@ ESCAPE = (
 """Starts two processes in sessions of their own, without the node's environment, and one of them without its parent."""
 
 
-@pytest.fixture(params=["control group", "subreaper alone"])
-def group(request: pytest.FixtureRequest) -> Iterator[str]:
-    """The control group to use; empty for none."""
-    if request.param == "subreaper alone":
-        yield ""
-        return
+@pytest.fixture
+def control_group() -> Iterator[str]:
+    """The path of one that may be made."""
     if not (groups := own_group()):
-        pytest.skip("this process can't make control groups")
+        pytest.skip("this process can't make control groups: run the test as root, or in a delegated group")
     path = f"{groups}/muster-test-{os.getpid()}"
     yield path
     remove_group(path)
     assert not os.path.exists(path)
+
+
+@pytest.fixture(params=["control group", "subreaper alone"])
+def group(request: pytest.FixtureRequest) -> str:
+    """The control group to use; empty for none."""
+    return "" if request.param == "subreaper alone" else str(request.getfixturevalue("control_group"))
 
 
 @pytest.fixture
@@ -54,13 +57,8 @@ def read(path: Path) -> list[int]:
 
 
 def start(script: str, group: str, tied_to: int = 0, **env: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        shimmed(["sh", "-c", script], group, tied_to=tied_to),
-        env={**os.environ, **env},
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    command, pipe = shimmed(["sh", "-c", script], group, tied_to=tied_to), subprocess.PIPE
+    return subprocess.Popen(command, env={**os.environ, **env}, stderr=pipe, text=True, start_new_session=True)
 
 
 def known(shim: subprocess.Popen[str], group: str) -> NodeProcesses:
@@ -98,19 +96,16 @@ def test_the_node_ends_when_its_shim_s_parent_dies(group: str, pids: Path) -> No
     assert not any(alive(pid) for pid in read(pids))
 
 
-def test_with_a_control_group_a_job_that_kills_the_shim_leaves_nothing_either(pids: Path) -> None:
-    if not (groups := own_group()):
-        pytest.skip("this process can't make control groups")
-    group = f"{groups}/muster-test-{os.getpid()}"
-    shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", group)
+def test_with_a_control_group_a_job_that_kills_the_shim_leaves_nothing_either(control_group: str, pids: Path) -> None:
+    shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", control_group)
     wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
-    node = known(shim, group)
+    node = known(shim, control_group)
     shim.kill()
     shim.wait()
     assert any(alive(pid) for pid in read(pids)), "there is something to end"
     assert not end_nodes([node], ["MUSTER_GANG=no-such-gang/1/1"])
     assert not any(alive(pid) for pid in read(pids))
-    assert not os.path.exists(group)
+    assert not os.path.exists(control_group)
 
 
 def test_without_a_group_marked_processes_are_found_and_others_are_left_alone(pids: Path) -> None:
@@ -184,9 +179,8 @@ def test_an_unkillable_process_is_named_and_waited_for(pids: Path, monkeypatch: 
     assert shim.wait(20 * PATIENCE) == 137
     assert shim.stderr is not None
     said = shim.stderr.read()
-    assert said.startswith(
-        f"muster: SIGKILL does not end process {stubborn} (sleep), state D: in an uninterruptible wait"
-    )
+    wait = "in an uninterruptible wait"
+    assert said.startswith(f"muster: SIGKILL does not end process {stubborn} (sleep), state D: {wait}")
     assert said.count("\n") == 1, "said once"
 
 
@@ -204,9 +198,8 @@ while time.time() < end:
 
 def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pids: Path, tmp_path: Path) -> None:
     (tmp_path / "chain.py").write_text(CHAIN)
-    shim = start(
-        f"for i in 1 2 3 4; do {sys.executable} -I -S {tmp_path}/chain.py & done; sleep 0.5; kill -9 $$", group
-    )
+    chain = f"{sys.executable} -I -S {tmp_path}/chain.py"
+    shim = start(f"for i in 1 2 3 4; do {chain} & done; sleep 0.5; kill -9 $$", group)
     assert shim.wait(60 * PATIENCE) == 137
     assert not processes_running(str(tmp_path))
 
@@ -228,32 +221,21 @@ def test_a_child_that_was_just_started_is_found_by_its_marks() -> None:
     await_marks(child.pid)  # of one that is gone it returns
 
 
-def test_the_kernel_ends_a_whole_control_group_at_once_even_one_that_keeps_forking() -> None:
-    if not (groups := own_group()):
-        pytest.skip(
-            "this process can't make control groups of version 2: run the test as root, or in a delegated group"
-        )
-    group = f"{groups}/muster-test-{os.getpid()}"
+def test_the_kernel_ends_a_whole_control_group_at_once_even_one_that_keeps_forking(control_group: str) -> None:
+    group = control_group
     os.mkdir(group)
-    try:
-        if not os.path.exists(f"{group}/cgroup.kill"):
-            pytest.skip(f"kernel {os.uname().release} has no cgroup.kill (Linux 5.14 and later)")
-        script = f'echo $$ > {group}/cgroup.procs; while :; do setsid sh -c "sleep 600 & sleep 0.01" & sleep 0.01; done'
-        with subprocess.Popen(["sh", "-c", script]) as forking:
-            wait_for(lambda: len(members(group)) > 5, 20, "processes in the group")
-            kill_group(group)  # and nothing else: no pid is looked for
-            assert forking.wait(20) == -signal.SIGKILL
-            wait_for(lambda: not members(group), 20, "an empty group")
-    finally:
-        kill_group(group)
-        remove_group(group)
-    assert not os.path.exists(group)
+    if not os.path.exists(f"{group}/cgroup.kill"):
+        pytest.skip(f"kernel {os.uname().release} has no cgroup.kill (Linux 5.14 and later)")
+    script = f'echo $$ > {group}/cgroup.procs; while :; do setsid sh -c "sleep 600 & sleep 0.01" & sleep 0.01; done'
+    with subprocess.Popen(["sh", "-c", script]) as forking:
+        wait_for(lambda: len(members(group)) > 5, 20, "processes in the group")
+        kill_group(group)  # and nothing else: no pid is looked for
+        assert forking.wait(20 * PATIENCE) == -signal.SIGKILL
+        wait_for(lambda: not members(group), 20, "an empty group")
 
 
-def test_only_abandoned_groups_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
-    if not (groups := own_group()):
-        pytest.skip("this process can't make control groups")
-    directory = f"{groups}/muster-test-{os.getpid()}"
+def test_only_abandoned_groups_are_removed(control_group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = control_group
     os.mkdir(directory)
     shim = start("exec sleep 600", f"{directory}/muster-busy")
     node = known(shim, directory)

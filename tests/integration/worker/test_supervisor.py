@@ -183,11 +183,8 @@ def test_no_variable_of_the_installed_torchrun_is_missing(node: Nodes) -> None:
         pytest.skip("torch is not installed")
     agent = Path(torch.submodule_search_locations[0]) / "distributed/elastic/agent/server/local_elastic_agent.py"
     assignments = [each for each in ast.walk(ast.parse(agent.read_text())) if isinstance(each, ast.Assign)]
-    [literal] = [
-        each.value
-        for each in assignments
-        if isinstance(each.value, ast.Dict) and ast.unparse(each.targets[0]) == "worker_env"
-    ]
+    dicts = [each for each in assignments if isinstance(each.value, ast.Dict)]
+    [literal] = [each.value for each in dicts if ast.unparse(each.targets[0]) == "worker_env"]
     names = {ast.literal_eval(key) for key in literal.keys if key} | {"LOCAL_RANK", "TORCHELASTIC_ERROR_FILE"}
     assert "RANK" in names
     [found] = environment_of_ranks(node())

@@ -309,9 +309,8 @@ def test_a_newer_epoch_ends_everything_at_once_and_nothing_is_written(node: Node
     await_end(*pids)
     assert n.lines() == before
     assert n.outcome is None
-    assert n.stderr.read_text() == (
-        "muster supervisor: run run: this attempt has epoch 1, the run now belongs to epoch 2; leaving\n"
-    )
+    left = "this attempt has epoch 1, the run now belongs to epoch 2; leaving"
+    assert n.stderr.read_text() == f"muster supervisor: run run: {left}\n"
 
 
 def test_a_node_of_an_old_attempt_does_not_even_start(node: Nodes, tmp_path: Path) -> None:

@@ -64,16 +64,14 @@ class Batch:
     def wait(self, job: str, *statuses: str, timeout: float = 60) -> dict[str, Any]:
         """The job's (or node's, or child's) detail, once it is in one of ``statuses`` (by default, over)."""
         wanted = statuses or OVER
-        found: dict[str, Any] = wait_for(
-            lambda: (detail := self.describe(job))["status"] in wanted and detail, timeout, f"{job} {wanted}"
-        )
+        there = lambda: (detail := self.describe(job))["status"] in wanted and detail  # noqa: E731
+        found: dict[str, Any] = wait_for(there, timeout, f"{job} {wanted}")
         return found
 
     def reason(self, job: str, part: str) -> str:
         """The job's ``statusReason``, once it contains ``part``."""
-        found: str = wait_for(
-            lambda: part in (text := self.describe(job).get("statusReason", "")) and text, 30, f"{part!r} of {job}"
-        )
+        has = lambda: part in (text := self.describe(job).get("statusReason", "")) and text  # noqa: E731
+        found: str = wait_for(has, 30, f"{part!r} of {job}")
         return found
 
     def lines(self, job: str) -> list[str]:
@@ -96,9 +94,8 @@ class Batch:
     def compute_environment(self, name: str, cpus: int = 8, state: str = "ENABLED") -> str:
         """A compute environment of at most ``cpus``; a DISABLED one holds its jobs RUNNABLE for as long as a test likes."""
         resources = {"type": "EC2", "maxvCpus": cpus, "subnets": ["subnet-none"]}
-        self.api.create_compute_environment(
-            computeEnvironmentName=name, type="MANAGED", state=state, computeResources=resources
-        )
+        facts = {"computeEnvironmentName": name, "type": "MANAGED", "state": state}
+        self.api.create_compute_environment(**facts, computeResources=resources)
         return name
 
     def queue(self, name: str, compute_environment: str, priority: int = 1, **request: Any) -> str:

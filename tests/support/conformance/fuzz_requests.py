@@ -38,10 +38,8 @@ _POOLS = ("fuzz", "local", f"{PREFIX}compute-environment/fuzz", "spare", "made")
 STREAMS = ("gang/<gang>/1/node-0", "gang/<gang>/1/node-1", "single/<single>/1/node-0", "gang/", "gang/<gang>/2/node-0")
 _GROUPS = ("/aws/batch/job", f"{logs.GROUP_ARN}", f"{logs.GROUP_ARN}:*", "/aws", "other")
 TARGETS = ("0:", "0", "0:0", "1:", "0:1", ":1", "1", ":", "5:1", "999999", "0:999999")
-_POSITIONS = (
-    *([], [0], ["a"], ["a", 1], [1, "a"], ["a", "b"], [2**63, "a"], ["\ud800", 1], ["a\0", 1], ["\ud800"], [-1]),
-    [None, {}],
-)
+_POSITIONS = ([], [0], ["a"], ["a", 1], [1, "a"], ["a", "b"], [2**63, "a"])
+_POSITIONS += (["\ud800", 1], ["a\0", 1], ["\ud800"], [-1], [None, {}])
 KNOWN = {
     "jobid": _JOBS,
     "jobs": _JOBS,
@@ -122,15 +120,10 @@ def old(name: str) -> dict[str, Any]:
 
 def ecs(name: str) -> dict[str, Any]:
     """One node, the newer way; with what is checked by a rule of its own."""
-    container = {
-        **_container(),
-        "name": "main",
-        "user": "nobody",
-        "logConfiguration": {"logDriver": "awslogs", "options": {}},
-    }
-    tasks = [
-        {"containers": [container], "taskRoleArn": "any", "volumes": [{"name": "v", "host": {"sourcePath": "/v"}}]}
-    ]
+    log = {"logDriver": "awslogs", "options": {}}
+    container = {**_container(), "name": "main", "user": "nobody", "logConfiguration": log}
+    volumes = [{"name": "v", "host": {"sourcePath": "/v"}}]
+    tasks = [{"containers": [container], "taskRoleArn": "any", "volumes": volumes}]
     return {"jobDefinitionName": name, "type": "container", "ecsProperties": {"taskProperties": tasks}}
 
 
@@ -156,12 +149,8 @@ def policy(name: str) -> dict[str, Any]:
 _SETTINGS = [{"name": "MUSTER_SPEC", "value": "{}"}, {"name": "MUSTER_MIN_NODES", "value": "1"}, {"name": "A"}]
 _OVERRIDE = {"targetNodes": "0:", "containerOverrides": {"command": ["true"], "environment": _SETTINGS}}
 _LIMIT = {"reason": "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY", "state": "RUNNABLE", "maxTimeSeconds": 600}
-_FILTERS = {
-    "JOB_NAME": "f*",
-    "JOB_DEFINITION": "gang*",
-    "BEFORE_CREATED_AT": "99999999999999",
-    "SHARE_IDENTIFIER": "blue",
-}
+_FILTERS = {"JOB_NAME": "f*", "JOB_DEFINITION": "gang*", "SHARE_IDENTIFIER": "blue"}
+_FILTERS["BEFORE_CREATED_AT"] = "99999999999999"
 POLICY = f"{PREFIX}scheduling-policy/fuzz"
 GOOD: dict[str, tuple[dict[str, Any], ...]] = {
     "RegisterJobDefinition": (gang("made"), single("made"), old("made"), ecs("made")),

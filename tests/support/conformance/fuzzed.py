@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -12,9 +10,8 @@ from typing import Any
 import httpx
 import pytest
 
-from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
-from tests.conftest import MUSTER, Serving
+from tests.conftest import Serving
 from tests.support.conformance import fuzz_requests as good
 from tests.support.conformance.fuzzing import Call
 
@@ -26,7 +23,7 @@ KEPT = {"default", "local", "fuzz", "fair", "spare", "made"}
 class Fuzzed(Serving):
     """A server with a token (so that odd Host headers get past the guard), whose errors are kept in a file."""
 
-    command: tuple[str, ...] = (MUSTER,)
+    token = TOKEN
 
     def __init__(self, home: Path, *options: str) -> None:
         self.names: dict[str, str] = {}
@@ -38,19 +35,7 @@ class Fuzzed(Serving):
 
     def start(self) -> None:
         self.errors = self.home.parent / "stderr"
-        with open(self.errors, "ab") as errors:
-            self.process = subprocess.Popen(
-                [*self.command, "serve", "--port", "0", *self.options],
-                env={**os.environ, "MUSTER_HOME": str(self.home), "MUSTER_TOKEN": TOKEN},
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                text=True,
-            )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line.startswith("Muster serves "), line + self.errors.read_text()
-        self.url = line.split()[2]
-        self.client = Client(self.url, TOKEN)
+        super().start()
         self.http = httpx.Client(base_url=self.url, timeout=60, trust_env=False)
 
     def restart(self, *options: str) -> None:
@@ -123,7 +108,7 @@ class Fuzzed(Serving):
 
     def complaints(self) -> str:
         """What the server wrote to its standard error since the last call."""
-        with open(self.errors) as errors:
+        with open(str(self.errors)) as errors:
             errors.seek(self.heard)
             said = errors.read()
             self.heard = errors.tell()

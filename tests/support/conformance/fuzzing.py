@@ -200,9 +200,8 @@ class Call:
         return Call(self.method, target, body, self.headers)
 
 
-_CONTENT_TYPES = (
-    *("application/json", "application/x-amz-json-1.1", "text/plain", "", "application/json; charset=utf-7", "é"),
-)
+_CONTENT_TYPES = ("application/json", "application/x-amz-json-1.1", "text/plain", "")
+_CONTENT_TYPES += ("application/json; charset=utf-7", "é")
 _ODD_HEADERS: tuple[dict[str, str], ...] = (
     {"X-Muster-Idempotency-Key": "again"},
     {"X-Muster-Idempotency-Key": ""},
@@ -250,11 +249,8 @@ def batch_calls(draw: st.DrawFn, spoil: bool) -> Call:
     operation = draw(st.sampled_from([name for name in BATCH for _ in GOOD[name]]))
     requests = valid("batch", operation)
     body = draw(encoded(mutated(requests))) if spoil else json.dumps(draw(requests)).encode()
-    paths = (f"/v1/{operation.lower()}",) * 25 + (
-        f"/v1/{operation}",
-        f"/v1/{operation.lower()}/",
-        f"/v1/%00{operation}",
-    )
+    path = f"/v1/{operation.lower()}"
+    paths = (*[path] * 25, f"/v1/{operation}", f"{path}/", f"/v1/%00{operation}")
     method = draw(st.sampled_from(("POST",) * 40 + ("GET", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH")))
     if not spoil:
         return Call("POST", paths[0], body, draw(st.sampled_from(({}, {}, _ODD_HEADERS[0]))))
@@ -286,16 +282,9 @@ def tag_calls(draw: st.DrawFn) -> Call:
     method = draw(st.sampled_from((*(("GET", "POST", "DELETE") * 5), "PUT", "HEAD")))
     arn = draw(st.one_of(st.sampled_from(_RESOURCES), st.sampled_from(_RESOURCES), st.sampled_from(ODD_TEXTS)))
     plain = arn.encode(errors="surrogatepass")
-    segment = draw(
-        st.sampled_from(
-            (
-                *[quote(plain, safe="")] * 8,
-                quote(plain, safe="/:"),
-                quote(quote(plain, safe="")),
-                quote(plain)[:-2] + "%",
-            )
-        )
-    )
+    quoted = quote(plain, safe="")
+    odd_ones = (quote(plain, safe="/:"), quote(quoted), quote(plain)[:-2] + "%")
+    segment = draw(st.sampled_from((*[quoted] * 8, *odd_ones)))
     keys = [quote(key.encode(errors="surrogatepass")) for key in draw(st.lists(st.sampled_from(ODD_TEXTS), max_size=3))]
     odd = draw(st.sampled_from(("", "", "?tagKeys", "?tagKeys=%ff&=&&", "?tagKeys=k&x=" + "y" * 5000)))
     query = "?" + "&".join(f"tagKeys={key}" for key in ["k", *keys]) if method == "DELETE" and not odd else odd
@@ -312,14 +301,9 @@ _SAFE = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789/%?&=.#:;
 def stray_calls(draw: st.DrawFn) -> Call:
     """Paths that lead nowhere, or somewhere in an odd way."""
     method = draw(st.sampled_from(("GET", "POST", "PUT", "DELETE", "PATCH", "HEAD", "OPTIONS", "TRACE", "BREW")))
-    known = (
-        *("/", "/v1/", "/v1", "/v1/tags/", "/v1//submitjob", "/v1/tags", "/v1/..", "/%2e%2e/", "//", "/api"),
-        *("/api/", "*"),
-    )
-    more = (
-        *("/api/jobs/%00", "/api/jobs/%ff", "/api/jobs/..%2f..", "/api/runs/%2e%2e", "/api/jobs/<gang>%23"),
-        "/healthz/",
-    )
+    known = ("/", "/v1/", "/v1", "/v1/tags/", "/v1//submitjob", "/v1/tags", "/v1/..", "/%2e%2e/")
+    known += ("//", "/api", "/api/", "*", "/healthz/")
+    more = ("/api/jobs/%00", "/api/jobs/%ff", "/api/jobs/..%2f..", "/api/runs/%2e%2e", "/api/jobs/<gang>%23")
     native = ("/api/jobs/<gang>/logs?node=-1", "/api/jobs/<gang>/logs?attempt=99999999999999999999", "/api/runs/<run>")
     target = draw(st.one_of(st.sampled_from((*known, *more, *native)), st.text(_SAFE, max_size=30).map("/{}".format)))
     return Call(method, target, draw(st.binary(max_size=20)), draw(_headers()))
@@ -340,9 +324,8 @@ def resume_calls(draw: st.DrawFn) -> Call:
     """POST …/resume of a run that exists: what goes on behind it is compiled, registered and submitted."""
     changes = draw(st.lists(st.one_of(st.sampled_from(CHANGES), st.sampled_from(ODD_TEXTS)), max_size=2))
     request: dict[str, Any] = {"set": changes}
-    request |= draw(
-        st.sampled_from(({}, {}, {"nodes": 2}, {"nodes": 10**30}, {"checkpoint": 3}, {"checkpoint": -(10**30)}))
-    )
+    changed = ({}, {}, {"nodes": 2}, {"nodes": 10**30}, {"checkpoint": 3}, {"checkpoint": -(10**30)})
+    request |= draw(st.sampled_from(changed))
     if draw(st.booleans()):
         request["directory"] = draw(st.sampled_from(ODD_TEXTS))
     body = draw(encoded(st.one_of(st.just(request), st.just(request), mutated(st.just(request)))))

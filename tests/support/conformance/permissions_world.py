@@ -19,6 +19,7 @@ from shared_store.bundles import seal
 from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Store
 from tests.conftest import Serving
+from tests.support.definitions import container, multinode
 from tests.support.shared_store.leagues import entry
 
 TOKEN = "a-token-for-tests-alone"
@@ -114,9 +115,8 @@ class World:
     def native_call(self, key: str, operation: Operation, body: dict[str, Any] | None = None) -> httpx.Response:
         method, _, path = operation.partition(" ")
         path = path.format(reference=self.job, name=self.run, number=1)
-        return self.http.request(
-            method, self.url + path, json=body, headers={"Authorization": f"Bearer {self.tokens[key]}"}
-        )
+        bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
+        return self.http.request(method, self.url + path, json=body, headers=bearer)
 
     def delete_key(self, key: str) -> httpx.Response:
         """Delete a key that was just made."""
@@ -126,12 +126,4 @@ class World:
 
 
 def definition(name: str) -> dict[str, Any]:
-    container = {
-        "image": "any",
-        "command": ["echo", MARK],
-        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
-        "environment": [{"name": "SECRET", "value": SECRET}],
-    }
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
-    return {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
+    return multinode(name, container(["echo", MARK], env={"SECRET": SECRET}))

@@ -128,9 +128,8 @@ class SlurmCluster:
             program = "slurmctld" if name == "slurmctld" else "slurmd"
             command = [program, "-D", "-f", str(self.conf)] + (["-N", name] if program == "slurmd" else [])
             with open(self.home / f"{name}.out", "ab") as output:
-                self.daemons[name] = subprocess.Popen(
-                    command, env=self.environment(), stdin=subprocess.DEVNULL, stdout=output, stderr=output
-                )
+                pipes = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
+                self.daemons[name] = subprocess.Popen(command, env=self.environment(), **pipes)
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> None:
         """End one daemon as a crash would."""
