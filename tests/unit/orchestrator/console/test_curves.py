@@ -12,7 +12,7 @@ from orchestrator.console.curves import columns, curves_of, number
 from shared_store.layout import Run
 from shared_store.metrics import MetricsWriter
 
-METRICS = 50
+METRICS = 8
 
 
 def record(iteration: int) -> dict[str, Any]:
@@ -22,7 +22,7 @@ def record(iteration: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def long_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """10,000 iterations of 50 metrics."""
+    """10,000 iterations of some metrics."""
     run = Run(tmp_path_factory.mktemp("long"))
     with MetricsWriter(run, 1, 0) as writer:
         for iteration in range(1, 10_001):

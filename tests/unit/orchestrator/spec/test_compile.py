@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orchestrator.domain.gang import gang_needs, target_nodes
-from orchestrator.domain.native_options import NativeOptions
+from orchestrator.domain.native_options import MalformedOptions, NativeOptions
 from orchestrator.domain.resources import Resources
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
@@ -173,6 +173,22 @@ def test_settings_are_those_of_the_main_node() -> None:
 def test_a_gang_may_start_smaller_but_never_without_its_main_node(minimum: str, main: int, expected: int) -> None:
     smaller = container(environment=[{"name": "MUSTER_MIN_NODES", "value": minimum}])
     assert gang_needs(properties(("0:", smaller), main=main)).minimum == expected
+
+
+def ranks(value: str | None) -> dict[str, Any]:
+    return container(environment=[{"name": "MUSTER_RANKS_PER_NODE", "value": value}] if value else [])
+
+
+def test_each_node_has_its_own_number_of_ranks_and_the_name_of_its_container_in_ecs_properties() -> None:
+    given = properties(("0", ranks("2")), ("1", ranks(None)), ("2", ranks("8")), count=3)
+    given["nodeRangeProperties"][1]["ecs"] = "main"
+    assert [(node.ranks, node.ecs) for node in gang_needs(given).nodes] == [(2, None), (1, "main"), (8, None)]
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "two", "1.5", " 2", "9999999"])
+def test_a_number_of_ranks_that_is_none_is_refused(value: str) -> None:
+    with pytest.raises(MalformedOptions, match=f"MUSTER_RANKS_PER_NODE is '{value}'"):
+        gang_needs(properties(("0", ranks("1")), ("1", ranks(value)), count=2))
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(0.01, 64), st.integers(0, 8), st.integers(4, 10**6))
