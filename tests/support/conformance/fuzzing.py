@@ -286,15 +286,9 @@ def tag_calls(draw: st.DrawFn) -> Call:
     method = draw(st.sampled_from((*(("GET", "POST", "DELETE") * 5), "PUT", "HEAD")))
     arn = draw(st.one_of(st.sampled_from(_RESOURCES), st.sampled_from(_RESOURCES), st.sampled_from(ODD_TEXTS)))
     plain = arn.encode(errors="surrogatepass")
+    once = quote(plain, safe="")
     segment = draw(
-        st.sampled_from(
-            (
-                *[quote(plain, safe="")] * 8,
-                quote(plain, safe="/:"),
-                quote(quote(plain, safe="")),
-                quote(plain)[:-2] + "%",
-            )
-        )
+        st.sampled_from((*[once] * 8, quote(plain, safe="/:"), quote(quote(plain, safe="")), quote(plain)[:-2] + "%"))
     )
     keys = [quote(key.encode(errors="surrogatepass")) for key in draw(st.lists(st.sampled_from(ODD_TEXTS), max_size=3))]
     odd = draw(st.sampled_from(("", "", "?tagKeys", "?tagKeys=%ff&=&&", "?tagKeys=k&x=" + "y" * 5000)))

@@ -67,15 +67,12 @@ def test_a_malformed_token_gives_no_endpoint(key: str) -> None:
     assert wire.parse_token(key) is None
 
 
-def test_an_attachment_has_33_bytes() -> None:
+def test_an_attachment_has_33_bytes_and_a_gid_the_halves_of_the_token_s_hash() -> None:
     gid = bytes(range(16))
     data = wire.attachment(1, 0x0102030405060708, gid)
     assert data == b"\x01" + bytes(7) + bytes([8, 7, 6, 5, 4, 3, 2, 1]) + b"\x10" + gid and len(data) == 33
     assert wire.read_attachment(data) == (1, 0x0102030405060708, gid)
     assert wire.read_attachment(data[:-1]) is None and wire.read_attachment(data[:16] + b"\x11" + gid) is None
-
-
-def test_a_gid_is_the_low_half_of_the_token_s_hash_and_then_the_high_half() -> None:
     token = wire.node_token(0, "ab12", 0, "/", "driver")
     number = xxhash.xxh3_128_intdigest(token.encode())
     low, high = number & (2**64 - 1), number >> 64

@@ -83,7 +83,7 @@ def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(r
     assert history(run) == [(1, 1), (2, 1)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 6), st.booleans()), min_size=1, max_size=6))
 def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
     attempts: list[tuple[int, int, bool]],
@@ -101,7 +101,7 @@ def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
         assert history(run) == expected
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 9), st.booleans()), min_size=1, max_size=6))
 def test_a_cached_history_equals_a_newly_read_one_after_any_append(attempts: list[tuple[int, int, bool]]) -> None:
     with tempfile.TemporaryDirectory() as directory:

@@ -106,7 +106,7 @@ def closed(page: Page) -> attempt.Close | None:
 stories = st.builds(told, terms, st.lists(turns, min_size=8, max_size=14))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_saved(story: list[Page]) -> None:
     kept = [page.before.terms.number for page in story for each in page.instructions if isinstance(each, attempt.Keep)]
@@ -125,7 +125,7 @@ def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_sa
                 assert each is page.instructions[-1], "what it leads to is decided on when all else is carried out"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_a_job_that_is_over_stays_over_and_attempts_are_spent_up_to_the_limit(story: list[Page]) -> None:
     allowed = story[0].before.terms.allowed
@@ -138,7 +138,7 @@ def test_a_job_that_is_over_stays_over_and_attempts_are_spent_up_to_the_limit(st
     assert all(each.reason for each in closes)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
     for page in story:
@@ -153,7 +153,7 @@ def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
             assert attempt.WindUp() in page.instructions, "nothing is launched any more"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories, looks)
 def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_reason_or_brings_the_end_about(
     story: list[Page], seen: attempt.Observed
@@ -170,7 +170,7 @@ def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_rea
             assert isinstance(follows[0], attempt.Explain | attempt.MarkRunning) and follows[0].reason
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_an_end_that_was_decided_for_a_launched_gang_stays(story: list[Page]) -> None:
     for page in story:
@@ -179,7 +179,7 @@ def test_an_end_that_was_decided_for_a_launched_gang_stays(story: list[Page]) ->
             assert not any(isinstance(each, attempt.Decide) for each in page.instructions)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_leaving_on_request_and_preemption_spend_no_attempt_and_fail_no_job(story: list[Page]) -> None:
     for page in story:
@@ -195,7 +195,7 @@ def test_leaving_on_request_and_preemption_spend_no_attempt_and_fail_no_job(stor
             assert close.status in (Status.RUNNABLE, Status.SUCCEEDED)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(terms, st.lists(turns, min_size=12, max_size=20))
 def test_a_gang_whose_main_node_is_done_succeeds(terms: attempt.Terms, turns: Sequence[Turn]) -> None:
     done = [NodeEnd(0, "done", 1.0)] * NODES

@@ -130,19 +130,13 @@ def test_target_nodes_of_another_form_are_refused(text: str) -> None:
         target_nodes(text, 4)
 
 
-def test_of_nested_ranges_the_inner_one_counts_in_whatever_order_they_come() -> None:
+def test_of_nested_ranges_the_inner_one_counts_of_equal_ones_the_later_and_each_node_needs_one() -> None:
     outer, inner, one = ("0:", container(command=["outer"])), ("1:2", container(command=["inner"])), ("2", container())
     for ranges in ([outer, inner, one], [one, inner, outer], [inner, outer, one]):
         commands = [node.command for node in gang_needs(properties(*ranges)).nodes]
         assert commands == [("outer",), ("inner",), ("x",), ("outer",)]
-
-
-def test_of_two_equal_ranges_the_later_one_counts_and_one_may_exceed_the_existing_nodes() -> None:
     ranges = [("0:", container(command=["first"])), ("0:9", container(command=["second"]))]
     assert {node.command for node in gang_needs(properties(*ranges)).nodes} == {("second",)}
-
-
-def test_nodes_without_a_range_are_named() -> None:
     with pytest.raises(ValueError, match="cover no node 2; every node from 0 to 3 needs a range"):
         gang_needs(properties(("0:1", container()), ("3", container())))
 
