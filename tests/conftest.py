@@ -16,6 +16,7 @@ from typing import Any, Self
 from unittest.mock import patch as mock_patch
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from orchestrator.cli import main
 from orchestrator.client import Client
@@ -32,6 +33,10 @@ pytest_plugins = [
 MUSTER = str(Path(sys.executable).parent / "muster")
 
 os.environ.setdefault("WARP_CACHE_PATH", str(kernel_cache()))
+
+# A loaded machine draws and runs examples slowly; that is no fault of the test.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 # A picture at the end of each training would take a second of every one of them; test_picture.py has one made.
 os.environ.setdefault("MUSTER_PICTURE", "0")

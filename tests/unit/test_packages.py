@@ -80,9 +80,15 @@ def modules_of(room: str) -> list[Path]:
     return sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
 
 
-def test_every_room_of_the_orchestrator_has_a_layer() -> None:
+def test_every_room_has_a_layer_pure_ones_import_no_adapter_and_only_three_an_http_server() -> None:
     entries = (REPOSITORY / "orchestrator").iterdir()
     assert {entry.stem for entry in entries if not entry.name.startswith("__")} == set(LAYERS)
+    for room in LAYERS:
+        for module in modules_of(room):
+            if room in PURE:
+                assert not imported(module) & ADAPTERS, module
+            elif room not in ("api", "console", "server"):
+                assert not imported(module) & HTTP_SERVER, module
 
 
 @pytest.mark.parametrize("room", LAYERS)
@@ -92,22 +98,10 @@ def test_a_room_of_the_orchestrator_imports_only_the_layers_below_it(room: str) 
             assert parts[1] in {room, *LAYERS[room]}, (module, ".".join(parts))
 
 
-def test_pure_rooms_import_no_adapter_and_only_api_console_and_server_import_an_http_server() -> None:
-    for room in LAYERS:
-        for module in modules_of(room):
-            if room in PURE:
-                assert not imported(module) & ADAPTERS, module
-            elif room not in ("api", "console", "server"):
-                assert not imported(module) & HTTP_SERVER, module
-
-
-def test_the_apis_of_aws_import_nothing_of_the_native_one() -> None:
+def test_the_apis_of_aws_import_nothing_of_the_native_one_and_an_engine_no_other_engine() -> None:
     for room in ("batch", "logs"):
         for module in (REPOSITORY / "orchestrator" / "api" / room).glob("*.py"):
             assert ("api", "native") not in {parts[1:3] for parts in imported_modules(module)}, module
-
-
-def test_an_engine_imports_no_other_engine() -> None:
     engines = REPOSITORY / "orchestrator" / "engines"
     rooms = {path.name for path in engines.iterdir() if path.is_dir() and not path.name.startswith("__")}
     assert {"toolkit", "local", "docker", "ray", "slurm", "aws_batch"} <= rooms

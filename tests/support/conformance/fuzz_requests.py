@@ -13,7 +13,6 @@ from orchestrator.api.arns import PREFIX
 from orchestrator.api.batch import paging
 from orchestrator.api.logs import operations as logs
 
-_DEEP = tuple('{"a":' * depth + "1" + "}" * depth for depth in (90, 300, 900, 3000))
 ODD_TEXTS = (
     *("", " ", "\0", "a\0b", "\n", "\r\n", "\x1b[0m", "\u202e", "é", "Ω" * 64, "😀", "\ud800", "a\udfffb", "\ufeff"),
     *("x" * 128, "x" * 129, "x" * 256, "x" * 1025, "x" * 20_000, "../..", "..", "/", "%2F", "%00", "#", "#0", ":"),
@@ -41,42 +40,22 @@ TARGETS = ("0:", "0", "0:0", "1:", "0:1", ":1", "1", ":", "5:1", "999999", "0:99
 _POSITIONS = ([], [0], ["a"], ["a", 1], [1, "a"], ["a", "b"], [2**63, "a"])
 _POSITIONS += (["\ud800", 1], ["a\0", 1], ["\ud800"], [-1], [None, {}])
 KNOWN = {
-    "jobid": _JOBS,
-    "jobs": _JOBS,
-    "jobqueue": _QUEUES,
-    "jobqueues": _QUEUES,
-    "jobqueuename": _QUEUES,
-    "jobdefinition": _DEFINITIONS,
-    "jobdefinitions": _DEFINITIONS,
+    **dict.fromkeys(("jobid", "jobs"), _JOBS),
+    **dict.fromkeys(("jobqueue", "jobqueues", "jobqueuename"), _QUEUES),
+    **dict.fromkeys(("jobdefinition", "jobdefinitions"), _DEFINITIONS),
     "jobdefinitionname": ("gang", "single", "made"),
-    "computeenvironment": _POOLS,
-    "computeenvironments": _POOLS,
-    "computeenvironmentname": _POOLS,
+    **dict.fromkeys(("computeenvironment", "computeenvironments", "computeenvironmentname"), _POOLS),
     "arn": (f"{PREFIX}scheduling-policy/fuzz", f"{PREFIX}scheduling-policy/made"),
-    "arns": (f"{PREFIX}scheduling-policy/fuzz",),
-    "schedulingpolicyarn": (f"{PREFIX}scheduling-policy/fuzz",),
+    **dict.fromkeys(("arns", "schedulingpolicyarn"), (f"{PREFIX}scheduling-policy/fuzz",)),
     "shareidentifier": ("blue", "red*", "*"),
     "targetnodes": TARGETS,
-    "logstreamname": STREAMS,
-    "logstreamnames": STREAMS,
-    "logstreamnameprefix": STREAMS,
-    "logstreamnameprefixes": STREAMS,
-    "loggroupname": _GROUPS,
-    "loggroupidentifier": _GROUPS,
-    "loggroupidentifiers": _GROUPS,
+    **dict.fromkeys(("logstreamname", "logstreamnames", "logstreamnameprefix", "logstreamnameprefixes"), STREAMS),
+    **dict.fromkeys(("loggroupname", "loggroupidentifier", "loggroupidentifiers"), _GROUPS),
     "filterpattern": ("line", '"a line" -x', "%l[ia]ne+$%", "{ $.x = 1 }", "?a ?b", "%(%", "%[%", "%a{1,999}%"),
     "image": ("any",),
     "command": ("true", "Ref::who"),
     "onexitcode": ("0", "1*", "137"),
-    "nexttoken": (
-        *(paging.encode(each) for each in _POSITIONS),
-        "W10=",
-        f"f{'0' * 56}",
-        "f/0",
-        "b/5",
-        "1/x",
-        "0/gang/",
-    ),
+    "nexttoken": (*map(paging.encode, _POSITIONS), "W10=", f"f{'0' * 56}", "f/0", "b/5", "1/x", "0/gang/"),
     "name": (
         *("GREETING", "MUSTER_SPEC", "MUSTER_STALL_TIMEOUT", "MUSTER_MIN_NODES", "MUSTER_RUN"),
         "MUSTER_ON_CHILD_FAILURE",

@@ -51,43 +51,34 @@ def _send(connection: socket.socket, data: bytes) -> None:
         connection.sendall(data)
 
 
-def half_a_request_line(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
-    """Connections that send the beginning of a request and fall silent."""
-    with connections(target, count) as opened:
-        for each in opened:
-            _send(each, b"GET /healthz HT"[: rng.randrange(16)])
-        meanwhile()
-    return count
+Class = Callable[[Target, int, random.Random, Callable[[], None]], int]
+"""Called with a target, how many to send, random numbers, and what to do while its connections are open; returns how many."""
 
 
-def half_a_header(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
-    """Connections whose headers never end."""
-    with connections(target, count) as opened:
-        for each in opened:
-            _send(each, HEAD + b"X: " + b"y" * rng.randrange(1000))
-        meanwhile()
-    return count
+def _silent(data: Callable[[Target, random.Random], bytes]) -> Class:
+    """Connections that send this and fall silent: the server waits for more, or for somebody to read its answers."""
+
+    def send(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
+        with connections(target, count) as opened:
+            for each in opened:
+                each.setblocking(False)
+                _send(each, data(target, rng))
+            meanwhile()
+        return count
+
+    return send
 
 
-def half_a_body(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
-    """Connections that announce a body, with a token or without, and send half of it."""
-    with connections(target, count) as opened:
-        for each in opened:
-            token = target.authorization if rng.random() < 0.5 else b""
-            _send(each, HEAD + token + b"Content-Length: 1000000\r\n\r\n" + b" " * rng.randrange(5000))
-        meanwhile()
-    return count
+def _half_a_body(target: Target, rng: random.Random) -> bytes:
+    """With a token or without."""
+    token = target.authorization if rng.random() < 0.5 else b""
+    return HEAD + token + b"Content-Length: 1000000\r\n\r\n" + b" " * rng.randrange(5000)
 
 
-def deaf(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
-    """Connections that ask for much, again and again, and never read an answer."""
+def _questions(target: Target, rng: random.Random) -> bytes:
+    """For much, again and again."""
     request = b"GET /api/openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n" + target.authorization + b"\r\n"
-    with connections(target, count) as opened:
-        for each in opened:
-            each.setblocking(False)
-            _send(each, request * rng.randrange(1, 20))
-        meanwhile()
-    return count
+    return request * rng.randrange(1, 20)
 
 
 def hang_up(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
@@ -165,13 +156,12 @@ def foreign_services(target: Target, count: int, rng: random.Random, meanwhile: 
     return count
 
 
-CLASSES: Mapping[str, Callable[[Target, int, random.Random, Callable[[], None]], int]] = {
-    "half a request line": half_a_request_line,
-    "half a header": half_a_header,
-    "half a body": half_a_body,
-    "never reads": deaf,
+CLASSES: Mapping[str, Class] = {
+    "half a request line": _silent(lambda target, rng: b"GET /healthz HT"[: rng.randrange(16)]),
+    "half a header": _silent(lambda target, rng: HEAD + b"X: " + b"y" * rng.randrange(1000)),
+    "half a body": _silent(_half_a_body),
+    "never reads": _silent(_questions),
     "hangs up": hang_up,
     "expansion": expansion,
     "services that are not here": foreign_services,
 }
-"""Each is called with a target, how many to send, random numbers, and what to do while its connections are open; returns how many."""

@@ -40,11 +40,16 @@ def flipped(path: Path) -> None:
     path.write_bytes(bytes(data))
 
 
-def test_a_bundle_passes_its_self_test_and_shows_its_joints(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bundle_passes_its_self_test_and_shows_its_joints_unless_the_domain_is_no_number(
+    bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert main([str(bundle), "--check"]) == 0
     said = capsys.readouterr().out
     assert "Walker of by-hand, checkpoint 00000001-e1: self-test passed, actions differ by" in said
     assert "knee  position [rad] -1.500 to 1.500, default position 0.3000, stiffness 20, damping 1" in said
+    monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
+    assert main([str(bundle), "--check"]) == 1
+    assert capsys.readouterr().err == "error: ROS_DOMAIN_ID=seven: expected a whole number\n"
 
 
 def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: Path) -> None:
@@ -188,11 +193,3 @@ def test_options_that_do_not_fit_are_one_line_without_the_usage(typed: str, caps
     with pytest.raises(SystemExit) as ended:
         main(typed.split())
     assert ended.value.code == 2 and capsys.readouterr().err == f"muster-policy: {line}\n"
-
-
-def test_a_domain_that_is_no_number_is_one_line(
-    bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
-    assert main([str(bundle), "--check"]) == 1
-    assert capsys.readouterr().err == "error: ROS_DOMAIN_ID=seven: expected a whole number\n"

@@ -229,15 +229,11 @@ def test_a_message_of_a_wrong_type_or_of_wrong_bytes_is_ignored_with_one_line(
     heard = Heard(contract())
     (line,) = heard.hear("imu", MESSAGES.twist((0.0,) * 3, (0.0,) * 3), kind, data)
     assert line.startswith(said) and "\n" not in line
-
-
-def test_a_message_of_another_definition_is_ignored_with_one_line() -> None:
-    heard = Heard(contract())
     (there,) = (each for each in heard.inputs.all if each.topic == "imu")
     heard.inputs.hear(there, "/imu")(b"", IMU, "RIHS01_0123")
-    (line,) = heard.inputs.complaints()
-    assert "/imu: message ignored: sensor_msgs/msg/Imu of another definition (RIHS01_0123" in line
-    assert line.endswith("give --distro as the robot has it")
+    other = heard.inputs.complaints()[-1]
+    assert "/imu: message ignored: sensor_msgs/msg/Imu of another definition (RIHS01_0123" in other
+    assert other.endswith("give --distro as the robot has it")
 
 
 UNUSABLE_IMU = {

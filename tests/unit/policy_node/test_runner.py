@@ -131,16 +131,14 @@ def test_a_reset_forgets_the_recurrent_state(tmp_path: Path) -> None:
     assert rig.given[-1] == pytest.approx(0.3 + 0.5 * 0.1)
 
 
-def test_the_end_holds_the_joints_where_the_node_commands_them(rig: Rig) -> None:
+def test_the_end_holds_the_joints_where_the_node_commands_them(rig: Rig, tmp_path: Path) -> None:
+    idle = Rig(tmp_path / "idle")
     rig.step(0.0, knee=0.4)
+    idle.runner.end("the node ends")
+    assert (idle.given, idle.lines, idle.step(0.01, knee=0.4)) == ([], [], False), "before it commanded anything"
     rig.runner.end("the node ends")
     assert rig.lines[-1] == "the node ends: one last command holds the joints where they are"
     assert rig.given[-1] == pytest.approx(0.1) and not rig.step(0.01, knee=0.4)
-
-
-def test_a_node_that_ends_before_it_commanded_anything_says_nothing(rig: Rig) -> None:
-    rig.runner.end("the node ends")
-    assert rig.given == [] and rig.lines == [] and not rig.step(0.01, knee=0.4)
 
 
 def test_commands_stay_within_limits() -> None:
@@ -168,16 +166,15 @@ def test_each_kind_of_command_is_a_message_of_its_own_with_the_robot_s_names() -
     assert "knee" in table[0] and "stiffness 20, damping 1, effort up to 10" in table[0] and "left_wheel" in table[1]
 
 
+SLOW = Action("knee", "position", "rad", 1.0, 0.0, rule="It follows value slowly.")
 NO_JOINTS = {
-    "the policy does not say what its actions are: left, right": {
-        "discrete": True,
+    "does not say what its actions are: left, right": {
         "actions": (),
         "action_names": ("left", "right"),
+        "discrete": True,
     },
-    "the policy does not say what its actions are: knee": {"actions": (), "action_names": ("knee",)},
-    "the command of knee has a rule that the node lacks: It follows value slowly.": {
-        "actions": (Action("knee", "position", "rad", 1.0, 0.0, rule="It follows value slowly."),)
-    },
+    "does not say what its actions are: knee": {"actions": (), "action_names": ("knee",)},
+    "the command of knee has a rule that the node lacks: It follows value slowly.": {"actions": (SLOW,)},
 }
 
 

@@ -140,30 +140,32 @@ def test_a_commit_with_an_old_epoch_is_refused_and_publishes_nothing(run: Run) -
     assert names(run) == ["00000025-e1", "00000050-e2"]
 
 
-def test_an_uncommitted_checkpoint_is_not_listed(run: Run) -> None:
+def test_an_uncommitted_checkpoint_is_not_listed_and_one_that_is_gone_can_not_be_committed(run: Run) -> None:
     assert list_checkpoints(run) == [] and newest_checkpoint(run) is None
     CheckpointWriter(run, 25, 1)
     (run.checkpoints / "notes.txt").write_text("a person's")
     (run.checkpoints / "25-e1").mkdir()
+    assert list_checkpoints(run) == []
+    writer = CheckpointWriter(run, 10, 1)
+    shutil.rmtree(writer.path)
+    with pytest.raises(OSError):
+        writer.commit({})
     assert list_checkpoints(run) == []
 
 
 # -- order and choice -------------------------------------------------------------------------------------------------
 
 
-def test_a_later_epoch_is_newer_whatever_its_iteration(run: Run) -> None:
-    for iteration, epoch in ((50, 1), (25, 2), (100, 1), (5, 10)):
-        commit(run, iteration, epoch)
-    assert names(run) == ["00000050-e1", "00000100-e1", "00000025-e2", "00000005-e10"]
-
-
-def test_latest_is_only_a_hint(run: Run) -> None:
+def test_latest_is_only_a_hint_and_a_later_epoch_is_newer_whatever_its_iteration(run: Run) -> None:
     commit(run, 25)
     commit(run, 50)
     (run.checkpoints / "LATEST").write_text("00000025-e1\n")
     assert newest(run) == "00000050-e1"
     (run.checkpoints / "LATEST").unlink()
     assert newest(run) == "00000050-e1"
+    for iteration, epoch in ((25, 2), (100, 1), (5, 10)):
+        commit(run, iteration, epoch)
+    assert names(run) == ["00000025-e1", "00000050-e1", "00000100-e1", "00000025-e2", "00000005-e10"]
 
 
 def test_a_chosen_checkpoint_stands_until_the_job_has_one_of_its_own(run: Run) -> None:
@@ -354,11 +356,3 @@ def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: R
     (run.checkpoints / "00000010-e1" / "manifest.json").write_text("{")
     commit(run, 40, keep=2)
     assert names(run) == ["00000030-e1", "00000040-e1"]
-
-
-def test_a_checkpoint_that_is_gone_can_not_be_committed(run: Run) -> None:
-    writer = CheckpointWriter(run, 10, 1)
-    shutil.rmtree(writer.path)
-    with pytest.raises(OSError):
-        writer.commit({})
-    assert list_checkpoints(run) == []

@@ -132,14 +132,11 @@ def test_a_missing_or_malformed_variable_is_named_with_its_value(name: str, chan
         assert str(caught.value).startswith(f"{name} is {said}")
 
 
-def test_optional_variables_have_defaults() -> None:
+def test_optional_variables_have_defaults_and_a_single_node_job_has_none_of_nodes() -> None:
     env = {"MUSTER_JOB_ID": "j", "MUSTER_RUN": "r", "MUSTER_STORE": "/s", "MUSTER_EPOCH": "4"}
     assert NodeContract.from_env(env) == NodeContract(
         "j", 1, 0, 1, 0, "127.0.0.1", 29500, "r", "/s", 4, 4, is_gang=False
     )
-
-
-def test_a_single_node_job_has_no_node_variables_and_an_array_s_child_its_index() -> None:
     env = contract(is_gang=False, array=(2, 5)).to_env()
     assert env["AWS_BATCH_JOB_ID"] == "1f2e" and not any("NODE" in name for name in env if name.startswith("AWS"))
     assert (env["AWS_BATCH_JOB_ARRAY_INDEX"], env["AWS_BATCH_JOB_ARRAY_SIZE"]) == ("2", "5")

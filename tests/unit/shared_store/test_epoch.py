@@ -89,18 +89,27 @@ def test_controllers_that_take_epochs_at_once_never_get_the_same(run: Run) -> No
     assert max(claims) >= max(taken) and min(claims) >= read_epoch(run) - 64, "old claims are cleared away"
 
 
-def test_an_epoch_that_another_controller_claimed_but_did_not_publish_is_passed_over(run: Run) -> None:
+def claimed(run: Run, controller: str) -> None:
+    """Epoch 5, which is not published."""
     raise_epoch(run, 4)
-    (run.path / "EPOCH.5").touch()
+    (run.path / "EPOCH.5").write_text(f'{{"controller": "{controller}", "job": "job", "attempt": 1}}')
+
+
+@pytest.mark.parametrize(("controller", "seconds"), [("b", 0.01), ("a", 600.0)])
+def test_an_epoch_that_is_not_published_in_time_is_passed_over_and_one_of_before_a_crash_at_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch, controller: str, seconds: float
+) -> None:
+    monkeypatch.setattr("shared_store.epoch._PUBLICATION", seconds)
+    claimed(run, controller)
     with pytest.raises(StaleEpoch, match="another attempt has epoch 5"):
         raise_epoch(run, 5)
     assert take_epoch(run, 4, Claim("a", "job", 1)) == 6 == read_epoch(run)
 
 
-def test_a_controller_that_claims_second_leaves_the_run_to_the_first(run: Run) -> None:
-    raise_epoch(run, 4)
-    (run.path / "EPOCH.5").write_text('{"controller": "b", "job": "job", "attempt": 1}')
-    first = threading.Timer(0.2, lambda: write_atomic(run.path / "EPOCH", b"5\n"))
+def test_a_controller_that_claims_second_leaves_the_run_to_the_first(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shared_store.epoch._PUBLICATION", 600.0)
+    claimed(run, "b")
+    first = threading.Timer(0.05, lambda: write_atomic(run.path / "EPOCH", b"5\n"))
     first.start()
     with pytest.raises(StaleEpoch, match=r"another controller has just taken run .* with epoch 5"):
         take_epoch(run, 4, Claim("a", "job", 1))
@@ -108,14 +117,6 @@ def test_a_controller_that_claims_second_leaves_the_run_to_the_first(run: Run) -
     assert read_epoch(run) == 5
     with pytest.raises(StaleEpoch, match="has just taken"):
         take_epoch(run, 4, Claim("a", "job", 1))  # decided before the other controller had published
-
-
-def test_an_own_claim_of_before_a_crash_is_passed_over_at_once(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_store.epoch._PUBLICATION", 600.0)
-    claim = Claim("a", "job", 1)
-    raise_epoch(run, 4)
-    (run.path / "EPOCH.5").write_text('{"controller": "a", "job": "other", "attempt": 1}')
-    assert take_epoch(run, 4, claim) == 6
 
 
 def test_of_two_that_publish_at_the_same_instant_one_alone_owns_the_run(run: Run) -> None:

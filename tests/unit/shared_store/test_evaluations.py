@@ -7,17 +7,8 @@ from typing import Any
 
 import pytest
 
+from shared_store import evaluations
 from shared_store.checkpoints import best_checkpoint, list_checkpoints, retain
-from shared_store.evaluations import (
-    by_checkpoint,
-    checkpoint_of,
-    evaluation_is_over,
-    evaluation_name,
-    in_one_line,
-    keep_for_evaluation,
-    lines,
-    list_evaluations,
-)
 from shared_store.files import write_json
 from shared_store.layout import Run, Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
@@ -40,11 +31,13 @@ def evaluate(run: Run, name: str, mean: float, time: float = 1.0, episodes: int 
 
 
 def test_an_evaluation_is_called_after_its_checkpoint_and_its_job() -> None:
-    assert evaluation_name("00000003-e1") == "00000003-e1"
-    assert evaluation_name("00000003-e1", "1f2e3d4c-5b6a") == "00000003-e1-1f2e3d4c"
-    assert evaluation_name("00000003-e1", "1f2e3d4c-5b6a:7") == "00000003-e1-1f2e3d4c-7"
-    assert checkpoint_of("00000003-e1-1f2e3d4c-7") == checkpoint_of("00000003-e1") == "00000003-e1"
-    assert checkpoint_of("notes") is None and checkpoint_of("00000003-e1-../x") is None
+    assert evaluations.evaluation_name("00000003-e1") == "00000003-e1"
+    assert evaluations.evaluation_name("00000003-e1", "1f2e3d4c-5b6a") == "00000003-e1-1f2e3d4c"
+    assert evaluations.evaluation_name("00000003-e1", "1f2e3d4c-5b6a:7") == "00000003-e1-1f2e3d4c-7"
+    assert (
+        evaluations.checkpoint_of("00000003-e1-1f2e3d4c-7") == evaluations.checkpoint_of("00000003-e1") == "00000003-e1"
+    )
+    assert evaluations.checkpoint_of("notes") is None and evaluations.checkpoint_of("00000003-e1-../x") is None
 
 
 def test_evaluations_are_listed_by_time_and_damaged_ones_are_skipped(run: Run) -> None:
@@ -53,7 +46,7 @@ def test_evaluations_are_listed_by_time_and_damaged_ones_are_skipped(run: Run) -
     evaluate(run, "notes", 9.0, time=1.0)
     evaluate(run, "00000006-e1", 3.0, time=1.0, mean_length="long")
     (run.evaluations / "00000006-e1-c.json").write_text("[" * 200)
-    found = list_evaluations(run)
+    found = evaluations.list_evaluations(run)
     assert [(each["name"], each["checkpoint"]) for each in found] == [
         ("00000003-e1-b", "00000003-e1"),
         ("00000009-e1", "00000009-e1"),
@@ -64,9 +57,9 @@ def test_of_a_checkpoint_the_evaluation_of_the_most_episodes_in_its_own_worlds_c
     evaluate(run, "00000003-e1-a", 1.0, time=1.0, episodes=500)
     evaluate(run, "00000003-e1-b", 2.0, time=2.0, episodes=100)
     evaluate(run, "00000003-e1-c", 3.0, time=3.0, episodes=900, config={"randomize": {"friction": [0.5, 0.5]}})
-    assert by_checkpoint(run)["00000003-e1"]["mean_return"] == 1.0
+    assert evaluations.by_checkpoint(run)["00000003-e1"]["mean_return"] == 1.0
     evaluate(run, "00000003-e1-d", 4.0, time=4.0, episodes=500)
-    assert by_checkpoint(run)["00000003-e1"]["mean_return"] == 4.0
+    assert evaluations.by_checkpoint(run)["00000003-e1"]["mean_return"] == 4.0
 
 
 def test_the_best_checkpoint_is_that_of_two_evaluated_ones_and_else_that_of_the_greatest_score(run: Run) -> None:
@@ -101,12 +94,12 @@ def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_s
     add_checkpoint(store, "taught", 12)
     evaluate(run, "00000003-e1-1f2e3d4c", 7.0, keep=False)
     evaluate(run, "00000009-e1-1f2e3d4c", 5.0, keep=False)
-    keep_for_evaluation(run, "00000009-e1")
+    evaluations.keep_for_evaluation(run, "00000009-e1")
     add_checkpoint(store, "taught", 15)
     assert retain(run, keep=1) == ["00000012-e1"]
-    keep_for_evaluation(run, "00000015-e1")
+    evaluations.keep_for_evaluation(run, "00000015-e1")
     assert retain(run, keep=1) == ["00000009-e1"], "one waits at a time"
-    evaluation_is_over(run, "00000015-e1")
+    evaluations.evaluation_is_over(run, "00000015-e1")
     evaluate(run, "00000015-e1-1f2e3d4c", 8.0, keep=False)
     assert retain(run, keep=1) == ["00000003-e1"], "there is a better one"
     assert [each.iteration for each in list_checkpoints(run)] == [6, 15], "of the greatest score, the newest"
@@ -116,26 +109,32 @@ def test_one_line_tells_the_successes_of_a_task_that_declares_them_and_else_how_
     found: dict[str, Any] = {**FIGURES, "mean_return": 96.5, "episodes": 64}
     lasted = "mean episode length 9.0 of 10 (90 %), mean return 96.50 over 64 episodes"
     share = {"count": 62, "share": 62 / 64, "low": 0.9, "high": 1.0}
-    assert in_one_line(found) == in_one_line({**found, "success": None, "success_is": None}) == lasted
-    assert in_one_line({**found, "success": share, "success_is": "the clock ended the episode"}) == lasted
+    assert (
+        evaluations.in_one_line(found)
+        == evaluations.in_one_line({**found, "success": None, "success_is": None})
+        == lasted
+    )
+    assert evaluations.in_one_line({**found, "success": share, "success_is": "the clock ended the episode"}) == lasted
     laps = {"success": share, "success_is": "lap_complete ended the episode", "shown": {"progress": "98.1 %"}}
-    assert in_one_line({**found, **laps}) == (
+    assert evaluations.in_one_line({**found, **laps}) == (
         "62 of 64 episodes succeeded (96.9 %: lap_complete ended the episode), progress 98.1 %, mean length 9.0 steps, mean return 96.50"
     )
 
 
 def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:
     few = {**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}}
-    told = "\n".join(lines(few))
+    told = "\n".join(evaluations.lines(few))
     assert "3 episodes of Cartpole, checkpoint 00000003-e1" in told and "success" not in told
     config = {"randomize": {"friction": [0.4, 0.6]}, "curriculum": {}}
     share = {"share": 0.94, "low": 0.875, "high": 0.972}
     whole = {**few, "episodes": 100, "config": config, "success": share, "success_is": "it stands"}
-    told = "\n".join(lines({**FIGURES, **whole}))
+    told = "\n".join(evaluations.lines({**FIGURES, **whole}))
     assert "with config.randomize.friction: [0.4, 0.6]" in told and "config.curriculum: {}" in told
     assert " ".join(told.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
     term = {"mean": 1.0, "low": 0.5, "high": 1.5, "std": 0.1}
-    rows = list(lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}}))
+    rows = list(
+        evaluations.lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}})
+    )
     heading = next(row for row in rows if row.endswith("std"))
     columns = {len(row) for row in rows if row.startswith(("reward", "metric", "return"))}
     assert columns == {len(heading)}, "they stand"

@@ -33,15 +33,14 @@ def test_a_store_of_a_newer_format_or_a_damaged_one_is_refused(tmp_path: Path, c
     assert str(caught.value).startswith(f"store {tmp_path}: {NOT_A_STORE[content]}")
 
 
-def test_a_path_that_can_not_be_a_directory_is_named_with_the_reason(tmp_path: Path) -> None:
+def test_a_path_becomes_absolute_or_is_named_with_the_reason_why_it_can_be_no_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("")
     path = tmp_path / "file" / "store"
     with pytest.raises(StoreError) as caught:
         Store(path).open()
     assert str(caught.value) == f"store {path}: not writable (Not a directory); choose another with --store"
-
-
-def test_a_relative_path_and_a_home_directory_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/somebody")
     assert Store("store").path == tmp_path / "store"

@@ -222,12 +222,15 @@ def test_processes_that_enter_at_once_get_a_number_each_and_no_more_than_are_all
     assert sorted(entry for each in given for entry in each) == list(range(1, 9))
 
 
-def test_a_league_is_open_from_its_first_moment_and_closed_from_its_last() -> None:
+def test_a_league_is_open_from_its_first_moment_to_its_last_and_the_presets_are_those_of_the_racer() -> None:
     timed = league(opens=1000.0, closes=2000.0)
     assert timed.closed(999.9) == "league cup opens at 1970-01-01 00:16:40 UTC"
     assert timed.closed(1000.0) == timed.closed(1999.9) == ""
     assert timed.closed(2000.0) == "league cup closed at 1970-01-01 00:33:20 UTC"
     assert league().closed(0.0) == league().closed(1e12) == ""
+    from worker.racer.presets import PRESETS
+
+    assert tuple(PRESETS) == tracks.PRESETS
 
 
 @pytest.mark.parametrize(
@@ -266,12 +269,6 @@ def test_the_tracks_of_a_league_can_not_change(store: Store) -> None:
     tracks.add(store, "hills", b"others", {"digest": "second"})
     with pytest.raises(LeagueError, match=r"^league cup: track hills has changed since the league was created$"):
         hilly.check_tracks(store)
-
-
-def test_the_presets_are_those_of_the_racer() -> None:
-    from worker.racer.presets import PRESETS
-
-    assert tuple(PRESETS) == tracks.PRESETS
 
 
 def test_links_out_of_the_store_are_not_followed(store: Store, tmp_path: Path) -> None:

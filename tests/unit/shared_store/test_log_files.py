@@ -20,7 +20,7 @@ START = 1_800_000_000.0
 LIMIT = LEAST_LIMIT
 
 
-def lines_of(first: int, count: int, size: int = 100) -> bytes:
+def lines_of(first: int, count: int, size: int = 650) -> bytes:
     """Lines that carry their number, a millisecond apart."""
     return "".join(
         format_line(START + i / 1000, 0, "o", f"{i:08d} {'x' * size}") for i in range(first, first + count)
@@ -31,7 +31,7 @@ def numbers(texts: list[str]) -> list[int]:
     return [int(text[:8]) for text in texts if text[:8].isdigit()]
 
 
-def more(writer: LogWriter, first: int, end: int, step: int = 500) -> LogWriter:
+def more(writer: LogWriter, first: int, end: int, step: int = 100) -> LogWriter:
     """Write these lines, some at a time."""
     for each in range(first, end, step):
         data = lines_of(each, min(step, end - each))
@@ -53,10 +53,10 @@ def run(tmp_path: Path) -> Run:
 
 
 def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) -> None:
-    path, count = run.log("job", 1, 0), 50_000
-    writer = written(path, 1000)
+    path, count = run.log("job", 1, 0), 10_000
+    writer = written(path, 200)
     assert [segment.path.name for segment in segments_of(path)] == ["node-0.log"], "within its limit it is one file"
-    assert more(writer, 1000, count).lines == count
+    assert more(writer, 200, count).lines == count
     size = sum(segment.path.stat().st_size for segment in segments_of(path))
     assert LIMIT * 0.9 < size <= LIMIT
     texts = drained(run)
@@ -73,9 +73,9 @@ def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) 
 def test_a_follower_that_keeps_up_gets_every_line_once_whatever_is_deleted_behind_it(run: Run) -> None:
     dice, writer, follower = random.Random(3), LogWriter(run.log("job", 1, 0), LIMIT), LogFollower(run, "job")
     count, texts = 0, []
-    while count < 40_000:
-        more = dice.randrange(1, 900)
-        data = lines_of(count, more, dice.randrange(300))
+    while count < 8000:
+        more = dice.randrange(1, 180)
+        data = lines_of(count, more, dice.randrange(1500))
         assert writer.append(data) == len(data)
         count += more
         if dice.random() < 0.9:
@@ -86,28 +86,28 @@ def test_a_follower_that_keeps_up_gets_every_line_once_whatever_is_deleted_behin
 
 
 def test_a_follower_that_falls_behind_learns_how_much_it_missed(run: Run) -> None:
-    writer, follower = written(run.log("job", 1, 0), 6000), LogFollower(run, "job")
+    writer, follower = written(run.log("job", 1, 0), 1200), LogFollower(run, "job")
     before = [line.text for line in follower.drain()]
     position = follower.offsets["1/0"]
-    more(writer, 6000, 50_000)
+    more(writer, 1200, 10_000)
     after = [line.text for line in follower.drain()]
     tail = segments_of(run.log("job", 1, 0))[1]
-    assert numbers(before) == list(range(6000))
+    assert numbers(before) == list(range(1200))
     assert after[0] == left_out(None, tail.start - position, "the log reached its limit")
-    assert numbers(after)[-1] == 49_999 and all(b == a + 1 for a, b in pairwise(numbers(after)))
+    assert numbers(after)[-1] == 9_999 and all(b == a + 1 for a, b in pairwise(numbers(after)))
 
 
 def test_a_restarted_writer_continues_where_the_killed_one_stopped(run: Run) -> None:
     path = run.log("job", 1, 0)
-    written(path, 9000).close()
+    written(path, 1800).close()
     last = segments_of(path)[-1].path
     with open(last, "ab") as file:
         file.write(b"2027-01-15T08:00:00.000000Z 0 o half a li")
     again = LogWriter(path, LIMIT)
-    assert again.lines == 9000
-    again.append(lines_of(9000, 1000))
-    assert again.lines == 10_000
-    assert numbers(drained(run))[-1000:] == list(range(9000, 10_000))
+    assert again.lines == 1800
+    again.append(lines_of(1800, 200))
+    assert again.lines == 2000
+    assert numbers(drained(run))[-200:] == list(range(1800, 2000))
 
 
 def test_a_line_longer_than_a_file_of_the_log_is_kept_whole(run: Run) -> None:
@@ -136,38 +136,38 @@ def fill(run: Run) -> Path:
 def test_a_full_volume_takes_whole_lines_only_and_the_log_goes_on_when_there_is_room(small: Run) -> None:
     path = small.log("job", 1, 0)
     writer = LogWriter(path, 64 << 20)
-    assert writer.append(lines_of(0, 1000)) > 0 and writer.error is None
+    assert writer.append(lines_of(0, 200)) > 0 and writer.error is None
     filler = fill(small)
-    assert writer.append(lines_of(1000, 1000)) == 0 and writer.error is not None
-    assert path.read_bytes() == lines_of(0, 1000)
+    assert writer.append(lines_of(200, 200)) == 0 and writer.error is not None
+    assert path.read_bytes() == lines_of(0, 200)
     filler.unlink()
-    assert writer.append(lines_of(2000, 1000)) == len(lines_of(2000, 1000)) and writer.error is None
-    assert path.read_bytes() == lines_of(0, 1000) + lines_of(2000, 1000)
+    assert writer.append(lines_of(400, 200)) == len(lines_of(400, 200)) and writer.error is None
+    assert path.read_bytes() == lines_of(0, 200) + lines_of(400, 200)
 
 
 def test_half_a_line_that_a_full_volume_took_is_taken_back(small: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LogWriter, "_check_room", lambda *_: None)  # as where a quota ends, which no volume tells
     path = small.log("job", 1, 0)
     writer = LogWriter(path, 64 << 20)
-    writer.append(lines_of(0, 100))
+    writer.append(lines_of(0, 20))
     filler = fill(small)
     os.truncate(filler, filler.stat().st_size - 8192)
-    data = lines_of(100, 1000)
+    data = lines_of(20, 200)
     written = writer.append(data)
     assert 4000 < written < len(data) and data[:written].endswith(b"\n") and writer.error is not None
-    assert path.read_bytes() == lines_of(0, 100) + data[:written]
+    assert path.read_bytes() == lines_of(0, 20) + data[:written]
 
 
 def test_no_log_fills_a_volume_and_on_a_full_one_its_end_is_still_kept(small: Run) -> None:
     writer = LogWriter(small.log("job", 1, 0), 1 << 30)
     volume = os.statvfs(small.path)
-    more(writer, 0, 80_000)
+    more(writer, 0, 16_000)
     assert os.statvfs(small.path).f_bavail > 0.7 * volume.f_bavail
     fill(small)
-    more(writer, 80_000, 100_000)
+    more(writer, 16_000, 20_000)
     texts = drained(small)
     kept = numbers(texts)
-    assert kept[0] == 0 and kept[-1] == 99_999 and sum("left out" in text for text in texts) == 1
+    assert kept[0] == 0 and kept[-1] == 19_999 and sum("left out" in text for text in texts) == 1
 
 
 def test_lines_of_a_node_keep_their_order_when_its_clock_is_set_back(run: Run) -> None:
@@ -181,13 +181,13 @@ def test_lines_of_a_node_keep_their_order_when_its_clock_is_set_back(run: Run) -
 
 
 def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: Run) -> None:
-    sizes = {0: 300, 1: 5, 2: 40}
+    sizes = {0: 3000, 1: 50, 2: 400}
     for node, size in sizes.items():
-        lines = [format_line(START + i + node / 10, node, "o", "z" * size) for i in range(12_000)]
+        lines = [format_line(START + i + node / 10, node, "o", "z" * size) for i in range(1200)]
         LogWriter(run.log("job", 1, node)).append("".join(lines).encode())
     LogWriter(run.log("job", 2, 0)).append(format_line(START, 0, "o", "second attempt").encode())
     lines = list(LogFollower(run, "job").drain())
-    assert len(lines) == 36_001
+    assert len(lines) == 3601
     keys = [(line.attempt, line.time) for line in lines]
     assert keys == sorted(keys)
 
@@ -215,8 +215,8 @@ def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_begin
 def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: Run) -> None:
     path = run.log("job", 1, 0)
     early, writer = LogFile(path, "stream"), LogWriter(path, LIMIT)
-    for first in range(0, 40_000, 7000):
-        more(writer, first, min(first + 7000, 40_000))
+    for first in range(0, 8000, 1400):
+        more(writer, first, min(first + 1400, 8000))
         early.look()
     late = LogFile(path, "stream").look()
     seen = list(early.look().forward())
@@ -234,10 +234,10 @@ def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: R
 
 def test_a_view_survives_the_deletion_of_files_that_it_knows(run: Run) -> None:
     path = run.log("job", 1, 0)
-    writer = written(path, 12_000)
+    writer = written(path, 2400)
     view = LogFile(path, "stream").look()
-    more(writer, 12_000, 40_000)
-    assert numbers([event.text for event in view.forward()])[:3500] == list(range(3500))
+    more(writer, 2400, 8000)
+    assert numbers([event.text for event in view.forward()])[:700] == list(range(700))
 
 
 def test_counting_the_lines_of_a_log_takes_no_memory_of_its_size(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(r
     assert history(run) == [(1, 1), (2, 1)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 6), st.booleans()), min_size=1, max_size=6))
 def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
     attempts: list[tuple[int, int, bool]],
@@ -101,7 +101,7 @@ def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
         assert history(run) == expected
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 9), st.booleans()), min_size=1, max_size=6))
 def test_a_cached_history_equals_a_newly_read_one_after_any_append(attempts: list[tuple[int, int, bool]]) -> None:
     with tempfile.TemporaryDirectory() as directory:
@@ -189,13 +189,13 @@ def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(run: Ru
 
 
 def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(run: Run) -> None:
-    attempt(run, 1, 0, 20_000)
+    attempt(run, 1, 0, 5000)
     found = [iteration for iteration, _ in points(run, 40)]
-    assert len(found) == 40 and found[-1] == 20_000 and found == sorted(set(found))
-    assert max(after - before for before, after in pairwise([0, *found])) < 1500
+    assert len(found) == 40 and found[-1] == 5000 and found == sorted(set(found))
+    assert max(after - before for before, after in pairwise([0, *found])) < 375
     with open(run.metrics / "metrics-e1.jsonl", "a") as file:
-        file.write('{"iteration": 20001, "ep')
-    assert points(run, 40)[-1] == (20_000, 1)
+        file.write('{"iteration": 5001, "ep')
+    assert points(run, 40)[-1] == (5000, 1)
 
 
 def test_a_sample_has_nothing_of_an_abandoned_past_and_ends_with_the_epoch_that_is_asked_for(run: Run) -> None:

@@ -9,34 +9,25 @@ from typing import Any
 
 import pytest
 
+from shared_store import outcomes
 from shared_store.layout import Run
-from shared_store.outcomes import (
-    LONGEST_TEXT,
-    FirstError,
-    Outcome,
-    bounded,
-    first_cause,
-    parse_outcome,
-    read_outcome,
-    write_outcome,
-)
 
-ERROR = FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
-OUTCOME = Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
+ERROR = outcomes.FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
+OUTCOME = outcomes.Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
 
 
 def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(tmp_path: Path) -> None:
     run, long = Run(tmp_path), "begin " + "x" * 10_000_000 + " end"
     error = replace(ERROR, message=long, traceback=long)
-    write_outcome(run, "job", 1, replace(OUTCOME, reason=long, error=error))
-    assert run.outcome("job", 1, 0).stat().st_size < 4 * LONGEST_TEXT
-    outcome = read_outcome(run, "job", 1, 0)
-    assert outcome and outcome.error and outcome == bounded(outcome)
+    outcomes.write_outcome(run, "job", 1, replace(OUTCOME, reason=long, error=error))
+    assert run.outcome("job", 1, 0).stat().st_size < 4 * outcomes.LONGEST_TEXT
+    outcome = outcomes.read_outcome(run, "job", 1, 0)
+    assert outcome and outcome.error and outcome == outcomes.bounded(outcome)
     assert outcome.reason == outcome.error.message
     assert outcome.reason.startswith("begin x") and outcome.reason.endswith("x … (9983690 characters left out)")
     traceback = outcome.error.traceback
     assert traceback.startswith("(9983690 characters left out) …") and traceback.endswith(" end")
-    assert max(len(outcome.reason), len(traceback)) <= LONGEST_TEXT
+    assert max(len(outcome.reason), len(traceback)) <= outcomes.LONGEST_TEXT
 
 
 WRONG: list[dict[str, Any]] = [
@@ -52,7 +43,7 @@ def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict
     path = Run(tmp_path).outcome("job", 1, 0)
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps({**asdict(OUTCOME), **change}))
-    assert read_outcome(Run(tmp_path), "job", 1, 0) is None
+    assert outcomes.read_outcome(Run(tmp_path), "job", 1, 0) is None
 
 
 @pytest.mark.parametrize(
@@ -69,12 +60,12 @@ def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict
     ],
 )
 def test_the_first_that_was_not_asked_to_end_is_the_cause(ends: list[tuple[bool, float]], cause: int) -> None:
-    assert first_cause(ends) == cause
+    assert outcomes.first_cause(ends) == cause
 
 
 def test_an_outcome_is_read_as_it_was_written_and_one_of_an_older_version_was_not_asked() -> None:
     asked = replace(OUTCOME, asked=True)
     written = asdict(asked)
-    assert parse_outcome(written) == asked
+    assert outcomes.parse_outcome(written) == asked
     del written["asked"]
-    assert parse_outcome(written) == OUTCOME
+    assert outcomes.parse_outcome(written) == OUTCOME

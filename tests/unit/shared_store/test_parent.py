@@ -40,7 +40,7 @@ def names(store: Store) -> list[str]:
     return sorted(os.listdir(store.path / "runs"))
 
 
-def test_the_new_run_has_only_the_weights_and_its_lineage(store: Store) -> None:
+def test_the_new_run_has_only_the_weights_and_its_lineage_and_keeps_what_retention_deletes(store: Store) -> None:
     making = new(store)
     making.copy()
     assert len(names(store)) == 2 and not store.run("heir").path.exists(), "nobody sees half of it"
@@ -56,10 +56,6 @@ def test_the_new_run_has_only_the_weights_and_its_lineage(store: Store) -> None:
     lineage: dict[str, Any] = {"run": "source", "checkpoint": "00000003-e1", "iteration": 3}
     assert description["parent"] == {**lineage, "score": 2.0, "score_error": 0.5, "env_steps": 96}
     assert parent_checkpoint(store.run("source")) is None
-
-
-def test_a_clone_keeps_weights_that_the_source_s_retention_deletes(store: Store) -> None:
-    run = heir(store)
     for iteration in (4, 5, 6):
         add_checkpoint(store, "source", iteration, score=9.0)
     assert "00000003-e1" in retain(store.run("source"), 2)

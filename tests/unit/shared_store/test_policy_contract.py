@@ -188,15 +188,12 @@ def test_added_removed_and_moved_names_are_reported_by_name() -> None:
     assert renamed == ["observation 4: speed is gone", "observation 4: speed/pace is new"]
 
 
-def test_numbers_that_a_compiler_rounded_and_what_only_training_is_about_are_no_change() -> None:
+def test_numbers_that_a_compiler_rounded_are_no_change_and_many_differences_are_shortened() -> None:
     assert after(lambda found: found["actions"][0].update(stiffness=20.0000005)) == []
     wider: Callable[[dict[str, Any]], Any] = lambda found: found["commands"][0].update(ranges=[[-2.0, 2.0]])  # noqa: E731
     assert after(wider) == []
     assert differences(CONTRACT, read(document(wider)), ranges=True) == [
         "command velocity: ranges [[-1.0, 1.0]] became [[-2.0, 2.0]]"
     ]
-
-
-def test_many_differences_are_shortened_to_the_first_ones_and_a_count() -> None:
     assert brief(["a", "b"]) == "a; b"
     assert brief([str(index) for index in range(8)]) == "0; 1; 2; 3; 4; and 3 more"

@@ -10,10 +10,13 @@ from shared_store.evaluations import lines
 from shared_store.races import clock, key_of, race_changes, rules_of
 
 
-def test_a_race_without_settings_is_three_laps_that_end_with_the_first_mishap() -> None:
+def test_a_race_is_three_laps_that_end_with_the_first_mishap_with_times_in_milliseconds() -> None:
     expected = {"laps": 3, "continuous": False, "off_track_penalty": 1.0, "crash_penalty": 1.0, "max_resets": 100}
     assert rules_of({"run": "fast"}) == {**expected, "seconds": 1200.0, "ranking": None}
     assert rules_of({"trials": 5, "seconds": 60.0})["laps"] == 5
+    assert [clock(seconds) for seconds in (185 / 15, 59.9996, 61.5, 0.0, None)] == [
+        *("0:12.333", "1:00.000", "1:01.500", "0:00.000", "-")
+    ]
 
 
 def test_the_rules_of_a_race_stand_above_its_config_and_every_lap_begins_at_the_line() -> None:
@@ -38,12 +41,6 @@ def test_the_rules_of_a_race_stand_above_its_config_and_every_lap_begins_at_the_
 )
 def test_an_error_is_reported_by_its_place_in_the_job(path: tuple[str | int, ...], key: str) -> None:
     assert key_of({"track": ["oval"]}, path) == key
-
-
-def test_times_are_minutes_seconds_and_milliseconds() -> None:
-    assert [clock(seconds) for seconds in (185 / 15, 59.9996, 61.5, 0.0, None)] == [
-        *("0:12.333", "1:00.000", "1:01.500", "0:00.000", "-")
-    ]
 
 
 def test_a_race_is_printed_as_a_table_of_its_trials() -> None:

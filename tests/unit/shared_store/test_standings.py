@@ -34,9 +34,14 @@ def test_total_requires_every_lap_and_other_rankings_use_complete_ones(
     assert [driven.counts(ranking) for ranking in ("total", "best", "average")] == [total, best, average]
 
 
-def test_a_race_is_read_with_its_penalties() -> None:
+def test_a_race_is_read_with_its_penalties_and_its_times_are_equal_to_the_millisecond() -> None:
     driven = read_race(race([14.3404, 12.2, None], off_tracks=2, resets=2))
     assert driven == Race(laps=3, times=(14.3404, 12.2), resets=2, off_tracks=2, crashes=0)
+    earlier, later = (read_race(race([time], off_tracks=0)) for time in (12.3404, 12.3396))
+    rows = table([Contender(1, "a", "m@1", earlier), Contender(2, "b", "m@2", later)], "total")
+    assert [(row.rank, row.racer, row.time) for row in rows] == [(1, "a", 12.34), (2, "b", 12.34)]
+    driven = read_race(race([10.46666666666667] * 3))
+    assert (driven.counts("total"), driven.counts("average"), driven.best) == (31_400, 10_467, 10_467)  # not 31401
 
 
 @pytest.mark.parametrize(
@@ -82,14 +87,6 @@ def test_equal_times_are_parted_by_resets_then_off_tracks_then_the_earlier_entry
     ]
     assert [(row.rank, row.entry) for row in table(entries, "total")] == [(1, 3), (2, 4), (3, 2), (4, 1), (5, 5)]
     assert table(list(reversed(entries)), "total") == table(entries, "total")
-
-
-def test_times_are_equal_to_the_millisecond_and_laps_are_added_up_before_they_are_rounded() -> None:
-    earlier, later = (read_race(race([time], off_tracks=0)) for time in (12.3404, 12.3396))
-    rows = table([Contender(1, "a", "m@1", earlier), Contender(2, "b", "m@2", later)], "total")
-    assert [(row.rank, row.racer, row.time) for row in rows] == [(1, "a", 12.34), (2, "b", 12.34)]
-    driven = read_race(race([10.46666666666667] * 3))
-    assert (driven.counts("total"), driven.counts("average"), driven.best) == (31_400, 10_467, 10_467)  # not 31401
 
 
 def test_of_a_racer_the_best_entry_is_ranked() -> None:

@@ -49,7 +49,7 @@ _BRANCHES = st.tuples(
 ).map("".join)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(_BRANCHES, min_size=1, max_size=3).map("|".join).filter(bool), st.text("ab1-.] _", max_size=8))
 def test_a_regex_means_what_it_means_in_python(regex: str, line: str) -> None:
     assert parse(f"%{regex}%")(line) == (re.search(regex, line, re.ASCII | re.DOTALL) is not None)

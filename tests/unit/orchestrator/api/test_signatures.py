@@ -163,7 +163,7 @@ def requests(draw: st.DrawFn) -> Sent:
     return Sent(method, draw(paths), draw(queries), tuple(given_headers), body)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(requests(), places)
 @example(Sent("POST", "/v1/submitjob", "", (("content-type", "application/json"),), b"{}"), ("batch", "us-east-1"))
 @example(
@@ -174,7 +174,7 @@ def test_signatures_of_botocore_are_accepted(store: KeyStore, key: Key, sent: Se
     assert answer_to(signed(sent, signer_of(key, *place)), store) == ACCEPTED
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(
     requests(), places, st.sampled_from(["method", "path", "query", "body", "header"]), st.integers(0, 100), st.data()
 )
@@ -207,7 +207,7 @@ def test_a_request_changed_after_signing_is_accepted_only_where_botocore_would_s
         assert answer_to(after, store) in REFUSALS
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(requests(), places, st.integers(0, 10_000), st.sampled_from("0123456789abcdefghijklmnopqrstuvwxyz"))
 def test_no_character_of_the_authorization_can_be_another(
     store: KeyStore, key: Key, sent: Sent, place: tuple[str, str], number: int, character: str
@@ -224,7 +224,7 @@ def test_no_character_of_the_authorization_can_be_another(
     assert answer in REFUSALS | {"UnknownOperationException"}
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(requests(), places, st.integers(0, 100), st.booleans())
 def test_a_signed_header_can_be_neither_left_out_nor_renamed(
     store: KeyStore, key: Key, sent: Sent, place: tuple[str, str], number: int, renamed: bool
@@ -237,7 +237,7 @@ def test_a_signed_header_can_be_neither_left_out_nor_renamed(
     assert answer_to(replace(before, headers=headers), store) in REFUSALS
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(requests(), places, st.text(LETTERS, max_size=5))
 def test_a_header_of_amazons_that_is_added_after_signing_is_refused(
     store: KeyStore, key: Key, sent: Sent, place: tuple[str, str], value: str
@@ -247,7 +247,7 @@ def test_a_header_of_amazons_that_is_added_after_signing_is_refused(
     assert answer_to(added, store) == "InvalidSignatureException"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(requests(), places)
 def test_a_body_that_botocore_leaves_unsigned_is_refused(
     store: KeyStore, key: Key, sent: Sent, place: tuple[str, str]

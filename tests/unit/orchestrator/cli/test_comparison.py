@@ -31,13 +31,6 @@ def test_runs_that_differ_in_name_and_seed_alone_are_one_group() -> None:
     assert bare[1].label == "b", "nothing says that they are alike"
 
 
-def test_a_group_has_the_spread_of_its_evaluations() -> None:
-    (group,) = grouped([run("a1", 1, [1.0], evaluated=10.0), run("a2", 2, [1.0], evaluated=14.0), run("a3", 3, [])])
-    assert group.describe()["evaluated"] == {"mean": 12.0, "std": pytest.approx(8**0.5)}
-    cells = group.cells()
-    assert cells[0] == "a* (3)" and cells[1] == "1, 2, 3" and "12.00 ± 2.83" in cells and "50.0 %" in cells
-
-
 def test_a_curve_is_the_mean_where_runs_have_records_and_in_proportion_between_them() -> None:
     (group,) = grouped([run("a", 1, [0.0, 10.0, 20.0]), run("b", 2, [4.0, 6.0])])
     curve = group.curve()

@@ -55,12 +55,9 @@ def groups() -> list[tuple[str, Any]]:
     return [(name, command) for name, command in found if hasattr(command, "commands")]
 
 
-def test_every_group_of_commands_refuses_unknown_ones_alike() -> None:
+def test_every_group_refuses_unknown_commands_alike_and_every_command_has_an_example_and_a_summary() -> None:
     assert {name for name, _ in groups()} >= {"models", "keys", "webhooks", "aws"}
     assert [name for name, command in groups() if not isinstance(command, Group)] == []
-
-
-def test_every_command_has_an_example_and_a_summary_of_one_line() -> None:
     every = [(entry.name, load(entry.name)) for entry in ENTRIES]
     every += [(f"{name} {own}", each) for name, group in groups() for own, each in group.commands.items()]
     without = [name for name, command in every if "xample" not in (command.epilog or "") or not command.help]

@@ -24,15 +24,12 @@ def policy(path: Path, matrix: list[list[float]], note: str = "") -> Path:
     return path
 
 
-def test_the_parameters_are_counted_and_the_greatest_difference_is_told(tmp_path: Path) -> None:
+def test_the_greatest_difference_of_parameters_is_told_and_notes_are_none(tmp_path: Path) -> None:
     one = policy(tmp_path / "one", [[1.0, 2.0], [3.0, 4.0]])
     other = policy(tmp_path / "other", [[1.0, 2.25], [2.5, 4.0]])
     assert difference(one, other) == "differ: 6 parameters, by 0.5 at most"
     wider = policy(tmp_path / "wider", [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     assert difference(one, wider) == "differ: 6 parameters became 8, of other names or shapes"
-
-
-def test_files_that_differ_in_their_notes_alone_have_the_same_weights(tmp_path: Path) -> None:
     one = policy(tmp_path / "one", [[1.0, 2.0]])
     other = policy(tmp_path / "other", [[1.0, 2.0]], note="exported once more")
     assert one.read_bytes() != other.read_bytes() and difference(one, other) == ""

@@ -21,14 +21,11 @@ def test_the_files_that_a_job_holds_are_its_code() -> None:
     assert code_of({"name": "a", "command": ["true"], "environment": {"file": "x"}}) == []
 
 
-def test_of_two_texts_the_lines_that_differ_are_shown_with_their_numbers() -> None:
+def test_of_two_texts_the_lines_that_differ_are_shown_of_long_ones_from_their_beginning() -> None:
     changed = CODE.replace("return speed", "return 2 * speed") + "# faster\n"
     assert differences(racer(CODE), racer(changed)) == [
         ("train.config.reward_function.text", "3:     return speed", "3:     return 2 * speed\n4: # faster")
     ]
-
-
-def test_values_of_one_line_and_very_long_texts_are_shown_from_their_beginning() -> None:
     assert differences({"seed": 1, "name": "a"}, {"seed": 2}) == [("seed", "1", "2"), ("name", "a", "")]
     ((_, was, now),) = differences(racer("a\n" * 2000), racer("b\n" * 2000))
     assert was.startswith("a\na\n") and was.endswith(" …") and now.startswith("b\nb\n") and len(now) < 310

@@ -26,12 +26,9 @@ def test_every_ancestor_stands_left_of_what_comes_from_it() -> None:
     assert len(places) == len(graph.boxes) and max(x for x, _ in places) < graph.width
 
 
-def test_a_run_that_is_gone_ends_its_line_with_its_name() -> None:
+def test_runs_that_are_gone_end_their_line_and_those_that_come_from_each_other_are_drawn_once() -> None:
     graph = drawn(version(1, "b", {"run": "gone", "iteration": 3}))
     assert [box.title for box in graph.boxes] == ["fast@1", "b", "gone"]
-
-
-def test_runs_of_a_damaged_store_that_come_from_each_other_are_drawn_once() -> None:
     graph = drawn(version(1, "a"), a="b", b="a")
     assert {box.title for box in graph.boxes} == {"fast@1", "a", "b"}
 

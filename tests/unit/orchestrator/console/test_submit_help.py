@@ -34,14 +34,11 @@ def test_help_is_of_the_section_in_which_the_line_stands(line: int) -> None:
     assert found["section"] == section and key in [each["name"] for each in found["keys"]]
 
 
-def test_help_says_what_a_key_is_and_which_are_given() -> None:
+def test_help_says_what_a_key_is_and_which_are_given_also_in_what_is_not_yaml_yet() -> None:
     found = help_at(JOB, 5)
     about = "simulated worlds of each rank; whole number from 1"
     assert found["key"] == {"name": "train.worlds", "about": about, "given": True}
     assert [each["name"] for each in found["keys"] if each["given"]] == ["task", "worlds", "config", "ppo"]
-
-
-def test_what_is_not_yaml_yet_has_the_help_of_what_stands_above() -> None:
     assert help_at("name: x\ntrain:\n  task: Ant\n  wor: [", 4)["section"] == "train"
     assert help_at("name: [", 1)["section"] == "" == help_at("", 1)["section"]
 

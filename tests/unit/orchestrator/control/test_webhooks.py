@@ -16,14 +16,11 @@ from tests.support.orchestrator.receiver import SECRET, write_webhooks
 URL = "https://chat.example:8443/hooks/T0/secret"
 
 
-def test_a_message_is_signed_as_the_example_of_standard_webhooks() -> None:
+def test_a_message_is_signed_as_the_example_of_standard_webhooks_and_tried_for_about_eleven_hours() -> None:
     webhook = Webhook(url=URL, secret=SECRET)
     headers = webhook.headers("msg_p5jXN8AQM9LWM0D4loKWxJek", 1614265330, b'{"test": 2432232314}')
     assert headers["webhook-signature"] == "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
     assert headers["webhook-id"] == "msg_p5jXN8AQM9LWM0D4loKWxJek" and headers["webhook-timestamp"] == "1614265330"
-
-
-def test_retries_continue_for_about_eleven_hours() -> None:
     assert len(PAUSES) == 7 and 10.5 < sum(PAUSES) / 3600 < 11.5
     assert all(later == 5 * earlier for earlier, later in itertools.pairwise(PAUSES))
 
@@ -83,7 +80,7 @@ def ended(status: str = "FAILED", queue: str = "robots", parent: str | None = No
     return Job(id="j", name="n", queue=queue, status=status, parent=parent, node_properties=properties)
 
 
-def test_a_webhook_gets_its_states_queues_and_kinds_and_arrays_as_a_whole() -> None:
+def test_a_webhook_gets_its_states_queues_and_kinds_arrays_as_a_whole_and_damaged_jobs_as_commands() -> None:
     webhook = Webhook(url=URL, secret=SECRET, statuses=["FAILED"], queues=["robots"], kinds=["train"])
     train = json.dumps({"train": {"task": "Ant"}})
     assert webhook.wants(ended(spec=train))
@@ -92,7 +89,4 @@ def test_a_webhook_gets_its_states_queues_and_kinds_and_arrays_as_a_whole() -> N
     everything = Webhook(url=URL, secret=SECRET)
     assert everything.wants(ended("SUCCEEDED", "lab")) and not everything.wants(ended("RUNNING"))
     assert not everything.wants(ended(parent="array"))
-
-
-def test_a_damaged_job_counts_as_a_command() -> None:
     assert kind_of(ended(spec="{")) == kind_of(Job(id="j", own_node_properties={})) == "command"

@@ -8,34 +8,7 @@ from dataclasses import dataclass, replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orchestrator.domain.attempt import (
-    SHORTEST_REQUEUE,
-    AwaitChildren,
-    Close,
-    Decide,
-    Due,
-    Event,
-    Explain,
-    Gone,
-    Instructions,
-    Keep,
-    Launch,
-    LaunchDelayed,
-    Launched,
-    LaunchRefused,
-    MarkRunning,
-    Observe,
-    Observed,
-    Preempted,
-    Save,
-    State,
-    Stop,
-    StopDelayed,
-    Terms,
-    WindUp,
-    after,
-    step,
-)
+from orchestrator.domain import attempt
 from orchestrator.domain.job import Ending, NodeEnd, Status
 from orchestrator.domain.native_options import NativeOptions
 
@@ -49,30 +22,30 @@ node_ends = st.none() | st.builds(
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
 silences = st.just([None] * NODES) | st.lists(st.none() | st.floats(0, 60), min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
-delays = st.builds(LaunchDelayed, words, st.booleans())
-launches = st.one_of(*[st.just(Launched("handle"))] * 4, delays, st.just(LaunchRefused("refused")))
-looks = st.builds(Observed, moments, both, silences, words, words, words)
-gone = st.builds(Gone, moments, both | st.just([]), words)
-stops = st.one_of(gone, gone, gone, st.none(), st.just(StopDelayed("not allowed")))
+delays = st.builds(attempt.LaunchDelayed, words, st.booleans())
+launches = st.one_of(*[st.just(attempt.Launched("handle"))] * 4, delays, st.just(attempt.LaunchRefused("refused")))
+looks = st.builds(attempt.Observed, moments, both, silences, words, words, words)
+gone = st.builds(attempt.Gone, moments, both | st.just([]), words)
+stops = st.one_of(gone, gone, gone, st.none(), st.just(attempt.StopDelayed("not allowed")))
 
 
 @dataclass(frozen=True)
 class Turn:
     """One turn of the controller: what happens before its look, and what the engine answers where it is asked."""
 
-    before: Event | str | None
+    before: attempt.Event | str | None
     """A text: the user asks the job to end, which a request writes to the database."""
-    launch: Event
-    seen: Observed
-    stop: Event | None
+    launch: attempt.Event
+    seen: attempt.Observed
+    stop: attempt.Event | None
 
 
 out_of_place = st.one_of(launches, looks, gone)
-before = st.one_of(*[st.none()] * 4, st.just("enough"), st.just(Preempted("preempted by job b")), out_of_place)
+before = st.one_of(*[st.none()] * 4, st.just("enough"), st.just(attempt.Preempted("preempted by job b")), out_of_place)
 turns = st.builds(Turn, before, launches, looks, stops)
 policies = st.sampled_from(["ignore", "restart", "fail"])
 terms = st.builds(
-    Terms,
+    attempt.Terms,
     number=st.just(1),
     hosts=st.just(("h/0", "h/1")),
     whole=st.just(NODES),
@@ -89,68 +62,70 @@ terms = st.builds(
 class Page:
     """An event of a story and what followed from it."""
 
-    before: State
-    event: Event
-    instructions: Instructions
-    now: State
+    before: attempt.State
+    event: attempt.Event
+    instructions: attempt.Instructions
+    now: attempt.State
 
 
-def told(terms: Terms, turns: Sequence[Turn]) -> list[Page]:
+def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
     """A job's attempts, one after the other."""
-    state, pages = State(terms), list[Page]()
+    state, pages = attempt.State(terms), list[Page]()
     for turn in turns:
-        events: list[Event] = [Due()]
+        events: list[attempt.Event] = [attempt.Due()]
         if isinstance(turn.before, str):
             state = state if state.closed else replace(state, stop_reason=turn.before)
         elif turn.before is not None:
             events.insert(0, turn.before)
         while events:
             event = events.pop(0)
-            before, instructions = state, step(state, event)
+            before, instructions = state, attempt.step(state, event)
             for instruction in instructions:
-                state = after(state, instruction)
+                state = attempt.after(state, instruction)
                 match instruction:
-                    case Launch():
+                    case attempt.Launch():
                         events.append(turn.launch)
-                    case Observe():
+                    case attempt.Observe():
                         events.append(turn.seen)
-                    case Stop() if turn.stop is not None:
+                    case attempt.Stop() if turn.stop is not None:
                         events.append(turn.stop)
-                    case WindUp():
-                        events.append(Gone(turn.seen.moment, [], ""))
+                    case attempt.WindUp():
+                        events.append(attempt.Gone(turn.seen.moment, [], ""))
             pages.append(Page(before, event, instructions, state))
             if (close := closed(pages[-1])) is not None and close.status is Status.RUNNABLE:  # the next attempt
                 spent = state.terms.spent + close.spent
                 following = replace(state.terms, number=state.terms.number + 1, spent=spent)
-                state, events = State(following, stop_reason=state.stop_reason), []
+                state, events = attempt.State(following, stop_reason=state.stop_reason), []
     return pages
 
 
-def closed(page: Page) -> Close | None:
-    return next((each for each in page.instructions if isinstance(each, Close)), None)
+def closed(page: Page) -> attempt.Close | None:
+    return next((each for each in page.instructions if isinstance(each, attempt.Close)), None)
 
 
 stories = st.builds(told, terms, st.lists(turns, min_size=8, max_size=14))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_saved(story: list[Page]) -> None:
-    kept = [page.before.terms.number for page in story for each in page.instructions if isinstance(each, Keep)]
+    kept = [page.before.terms.number for page in story for each in page.instructions if isinstance(each, attempt.Keep)]
     assert len(kept) == len(set(kept)), "a second handle of one epoch"
     for page in story:
-        assert Launch() not in page.instructions or not page.before.launched
+        assert attempt.Launch() not in page.instructions or not page.before.launched
         for index, each in enumerate(page.instructions):
-            if isinstance(each, Stop):
+            if isinstance(each, attempt.Stop):
                 assert page.before.launched and page.now.verdict is not None
-                assert page.before.verdict is not None or Save() in page.instructions[:index], "a crash would forget it"
-            if isinstance(each, Keep):
-                assert Save() in page.instructions[index:], "a crash would forget it"
-            if isinstance(each, Launch | Observe | Stop | WindUp):
+                assert page.before.verdict is not None or attempt.Save() in page.instructions[:index], (
+                    "a crash would forget it"
+                )
+            if isinstance(each, attempt.Keep):
+                assert attempt.Save() in page.instructions[index:], "a crash would forget it"
+            if isinstance(each, attempt.Launch | attempt.Observe | attempt.Stop | attempt.WindUp):
                 assert each is page.instructions[-1], "what it leads to is decided on when all else is carried out"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_a_job_that_is_over_stays_over_and_attempts_are_spent_up_to_the_limit(story: list[Page]) -> None:
     allowed = story[0].before.terms.allowed
@@ -163,7 +138,7 @@ def test_a_job_that_is_over_stays_over_and_attempts_are_spent_up_to_the_limit(st
     assert all(each.reason for each in closes)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
     for page in story:
@@ -172,39 +147,39 @@ def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
         assert page.now.stop_reason == page.before.stop_reason
         if (close := closed(page)) is not None:
             assert close.status.is_terminal, "it is started again"
-        if isinstance(page.event, Observed) and page.before.launched:
+        if isinstance(page.event, attempt.Observed) and page.before.launched:
             assert page.now.verdict is not None, "the next look decides its end"
-        if isinstance(page.event, LaunchDelayed) and not page.event.unknown and not page.before.launched:
-            assert WindUp() in page.instructions, "nothing is launched any more"
+        if isinstance(page.event, attempt.LaunchDelayed) and not page.event.unknown and not page.before.launched:
+            assert attempt.WindUp() in page.instructions, "nothing is launched any more"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories, looks)
 def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_reason_or_brings_the_end_about(
-    story: list[Page], seen: Observed
+    story: list[Page], seen: attempt.Observed
 ) -> None:
     for page in story:
         state = page.now
         if state.closed:
             continue
-        assert step(state, Due()) == ((Observe(),) if state.launched else (Launch(),))
-        follows = step(state, seen) if state.launched else ()
-        if state.verdict is not None or any(isinstance(each, Decide) for each in follows):
-            assert not follows or isinstance(follows[-1], Stop | AwaitChildren)
+        assert attempt.step(state, attempt.Due()) == ((attempt.Observe(),) if state.launched else (attempt.Launch(),))
+        follows = attempt.step(state, seen) if state.launched else ()
+        if state.verdict is not None or any(isinstance(each, attempt.Decide) for each in follows):
+            assert not follows or isinstance(follows[-1], attempt.Stop | attempt.AwaitChildren)
         elif state.launched:
-            assert isinstance(follows[0], Explain | MarkRunning) and follows[0].reason
+            assert isinstance(follows[0], attempt.Explain | attempt.MarkRunning) and follows[0].reason
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_an_end_that_was_decided_for_a_launched_gang_stays(story: list[Page]) -> None:
     for page in story:
         if page.before.launched and page.before.verdict is not None:
             assert page.now.verdict == page.before.verdict
-            assert not any(isinstance(each, Decide) for each in page.instructions)
+            assert not any(isinstance(each, attempt.Decide) for each in page.instructions)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(stories)
 def test_leaving_on_request_and_preemption_spend_no_attempt_and_fail_no_job(story: list[Page]) -> None:
     for page in story:
@@ -212,18 +187,25 @@ def test_leaving_on_request_and_preemption_spend_no_attempt_and_fail_no_job(stor
         if close is None or verdict is None:
             continue
         ran = close.moment - (since or close.moment)
-        is_free = verdict.ending is Ending.PREEMPTED or (verdict.ending is Ending.REQUEUE and ran >= SHORTEST_REQUEUE)
+        is_free = verdict.ending is Ending.PREEMPTED or (
+            verdict.ending is Ending.REQUEUE and ran >= attempt.SHORTEST_REQUEUE
+        )
         assert close.spent is not is_free
         if is_free and page.before.stop_reason is None:
             assert close.status in (Status.RUNNABLE, Status.SUCCEEDED)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(terms, st.lists(turns, min_size=12, max_size=20))
-def test_a_gang_whose_main_node_is_done_succeeds(terms: Terms, turns: Sequence[Turn]) -> None:
+def test_a_gang_whose_main_node_is_done_succeeds(terms: attempt.Terms, turns: Sequence[Turn]) -> None:
     done = [NodeEnd(0, "done", 1.0)] * NODES
     answered = [
-        Turn(None, Launched("handle"), replace(turn.seen, ends=done, waits=""), Gone(turn.seen.moment, done, ""))
+        Turn(
+            None,
+            attempt.Launched("handle"),
+            replace(turn.seen, ends=done, waits=""),
+            attempt.Gone(turn.seen.moment, done, ""),
+        )
         for turn in turns
     ]
     assert [each.status for page in told(terms, answered) if (each := closed(page))] == [Status.SUCCEEDED]

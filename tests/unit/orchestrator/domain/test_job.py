@@ -112,12 +112,9 @@ def test_a_node_that_was_asked_to_end_is_not_the_cause(
     assert verdict and (verdict.reason, verdict.certain) == (reason, certain)
 
 
-def test_on_aws_only_the_main_node_matters() -> None:
+def test_on_aws_only_the_main_node_matters_and_a_gang_never_goes_on_without_it() -> None:
     for main_code, *child_codes in itertools.product((None, 0, 1, 75), repeat=3):
         alone = judge("ignore", 0, ends(main_code))
         assert judge("ignore", 0, ends(main_code, *child_codes)) == alone
-
-
-def test_a_gang_never_goes_on_without_its_main_node() -> None:
     for policy, main_code, child in itertools.product(("restart", "fail", "ignore"), (0, 1, 75, 137), (None, 0, 1, 75)):
         assert judge(policy, 0, ends(main_code, child)) is not None

@@ -13,11 +13,14 @@ amounts = st.builds(Resources, st.integers(0, 640).map(lambda n: n / 8), st.inte
 """CPUs in eighths, which floats hold exactly."""
 
 
-def test_amounts_are_added_and_subtracted_kind_by_kind() -> None:
+def test_amounts_are_added_and_subtracted_kind_by_kind_and_gpus_are_counted() -> None:
     some, more = Resources(1.5, 2, 512), Resources(0.25, 1, 100)
     assert some + more == Resources(1.75, 3, 612)
     assert some - more == Resources(1.25, 1, 412)
     assert more - some == Resources(-1.25, -1, -412)
+    assert Host("a", 4.0, ("0", "1"), 1024).resources == Resources(4.0, 2, 1024)
+    assert Host("a", 4.0, ("0", "1"), 1024).left(1.0, ("1",), 24).resources == Resources(1.0, 1, 24)
+    assert Placement("a", ("1",), 0.5, 100).resources == Resources(0.5, 1, 100)
 
 
 @pytest.mark.parametrize(
@@ -39,9 +42,3 @@ def test_an_amount_fits_where_there_is_enough_of_every_kind(asked: Resources, fr
 def test_allocating_and_releasing_restores_the_free_resources(there: Resources, taken: Resources) -> None:
     assert there - taken + taken == there and taken <= there + taken
     assert (taken <= there) == (Resources() <= there - taken)
-
-
-def test_a_host_and_a_placement_count_their_gpus() -> None:
-    assert Host("a", 4.0, ("0", "1"), 1024).resources == Resources(4.0, 2, 1024)
-    assert Host("a", 4.0, ("0", "1"), 1024).left(1.0, ("1",), 24).resources == Resources(1.0, 1, 24)
-    assert Placement("a", ("1",), 0.5, 100).resources == Resources(0.5, 1, 100)

@@ -14,12 +14,9 @@ from orchestrator.engines.installed import ENGINES, check_tags, engine_type
 DOCUMENTATION = Path(__file__).parents[4] / "docs"
 
 
-def test_muster_s_own_engines_are_entry_points_in_their_usual_order() -> None:
+def test_muster_s_own_engines_are_entry_points_and_any_other_is_refused_with_those_that_are() -> None:
     assert ENGINES[:5] == ("local", "docker", "ray", "slurm", "aws-batch")
     assert all(isinstance(engine_type(name), EngineType) for name in ENGINES)
-
-
-def test_an_engine_that_is_not_installed_is_refused_with_those_that_are() -> None:
     with pytest.raises(EngineError, match="there is no engine 'kubernetes'; there are local, docker, ray, slurm, aws-"):
         engine_type("kubernetes")
 

@@ -35,14 +35,11 @@ def test_without_waiting_jobs_nothing_is_decided() -> None:
     assert (decided.starts, decided.preempts, decided.cancels, decided.waits()) == ((), (), (), "")
 
 
-def test_a_gang_that_fits_starts_with_what_it_asked_for() -> None:
+def test_a_gang_that_fits_starts_with_what_it_asked_for_and_no_gpu_is_given_twice() -> None:
     waiting = [job("ant", gang(node(0.5, 1, 1024), node(1, 2, 512)))]
     assert Pass([host(gpus=3)], waiting).starts == (
         Start("ant-0123456789", "all", (Placement("a", ("a2",), 0.5, 1024), Placement("a", ("a0", "a1"), 1, 512))),
     )
-
-
-def test_no_gpu_is_given_twice() -> None:
     held = [running("other", on("a", 1, [0, 2]))]
     [start] = Pass([host(gpus=4)], [job("ant", gang(node(1, 1), node(1, 1)))], held).starts
     assert [placement.gpus for placement in start.placements] == [("a1",), ("a3",)]
@@ -55,10 +52,6 @@ def test_a_gang_starts_whole_or_not_at_all() -> None:
         "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 4 nodes with 4 CPUs, 0 GPUs, 400 MiB in all; "
         "3 CPUs, 0 GPUs, 7.99 GiB free until job cart (cart-012) ends"
     )
-
-
-def test_a_gang_may_span_hosts() -> None:
-    assert Pass([host("a"), host("b", 2)], [job("ant", gang(*[node(2)] * 3))]).started == "ant:a+a+b"
 
 
 def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
@@ -130,13 +123,10 @@ def test_gpus_count_where_a_gang_has_any_else_cpus() -> None:
     assert decided.started == "a0:a+a b0:a b1:a a1:a b2:a"
 
 
-def test_in_a_share_priority_comes_before_age() -> None:
+def test_in_a_share_priority_comes_before_age_and_jobs_without_one_have_their_own() -> None:
     young, old = job("young", share="s", priority=5), job("old", share="s", priority=5, age=5)
     waiting = [young, old, job("eldest", share="s", age=9), job("first", share="s", priority=9999)]
     assert Pass([host()], waiting, queues=[queue(policy=FAIR)]).started == "first:a old:a young:a eldest:a"
-
-
-def test_jobs_without_a_share_have_one_of_their_own() -> None:
     usage = {("default", ""): 50.0, ("default", "s"): 10.0}
     decided = Pass([host()], [job("named", share="s"), job("none")], queues=[queue(policy=FAIR)], usage=usage)
     assert decided.started == "named:a none:a"

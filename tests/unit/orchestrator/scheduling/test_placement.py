@@ -65,23 +65,24 @@ def test_a_gang_has_its_place(case: str) -> None:
     assert (never_fits(shape, hosts) is None) == (expected is not None)
 
 
-def test_every_node_gets_gpus_of_its_own() -> None:
+def test_every_node_gets_gpus_of_its_own_and_there_are_no_more_nodes_than_asked_for() -> None:
     assert place(gang(node(1, 2), node(1, 1)), [host("a", 4, 3)]) == (
         Placement("a", ("a0", "a1"), 1, 100),
         Placement("a", ("a2",), 1, 100),
     )
-
-
-def test_no_more_nodes_than_asked_for() -> None:
     placements = place(ELASTIC, [host(cpus=8)], 3)
     assert placements is not None and len(placements) == 3 and place(ELASTIC, [host(cpus=8)], 1) is None
 
 
-def test_the_reason_why_a_gang_never_fits_covers_only_its_required_nodes() -> None:
+def test_a_gang_never_fits_for_its_required_nodes_and_on_elastic_hosts_for_one_larger_than_any() -> None:
     shape = gang(node(1), node(99), node(1), minimum=1)
     assert never_fits(shape, [host()]) is None
     assert never_fits(shape, [host(cpus=0.5)]) == (
         "each node needs 1 CPU, 0 GPUs, 100 MiB; the largest host has 0.5 CPUs, 0 GPUs, 8 GiB"
+    )
+    assert never_fits(gang(node(8)), [], elastic=True) is None, "nobody knows what will come"
+    assert never_fits(gang(node(8)), [single("a")], elastic=True) == (
+        "each node needs 8 CPUs, 0 GPUs, 100 MiB; the largest host has 4 CPUs, 0 GPUs, 8 GiB"
     )
 
 
@@ -104,13 +105,6 @@ def test_a_lack_of_hosts_for_one_node_each_is_counted_in_hosts(nodes: list[Resou
     assert never_fits(shape, hosts, elastic=True) is None, "more may come"
 
 
-def test_on_elastic_hosts_only_a_node_larger_than_any_host_is_refused() -> None:
-    assert never_fits(gang(node(8)), [], elastic=True) is None, "nobody knows what will come"
-    assert never_fits(gang(node(8)), [single("a")], elastic=True) == (
-        "each node needs 8 CPUs, 0 GPUs, 100 MiB; the largest host has 4 CPUs, 0 GPUs, 8 GiB"
-    )
-
-
 def test_hosts_that_are_away_are_taken_only_where_the_gang_needs_them() -> None:
     hosts = [single("a", away=True), single("b"), single("c")]
     assert where(gang(*[node()] * 2), *hosts) == "b c"
@@ -126,13 +120,13 @@ hosts_strategy = st.lists(
 ).map(lambda each: [host(f"h{i}", cpus, gpus, memory) for i, (cpus, gpus, memory) in enumerate(each)])
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(hosts_strategy, nodes, st.integers(1, 6))
 def test_a_gang_of_equal_nodes_fits_exactly_where_it_can(hosts: list[Host], each: Resources, count: int) -> None:
     assert (place(gang(*[each] * count), hosts) is not None) == (seats(each, hosts) >= count)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(hosts_strategy, st.lists(nodes, min_size=1, max_size=5), st.data())
 def test_every_node_gets_what_it_needs_and_no_host_gives_more_than_it_has(
     hosts: list[Host], members: list[Resources], data: st.DataObject
@@ -153,13 +147,10 @@ def test_every_node_gets_what_it_needs_and_no_host_gives_more_than_it_has(
         assert len(gpus) == len(set(gpus)) and set(gpus) <= set(each.gpus)
 
 
-def test_one_machine_that_two_engines_serve_is_placed_on_once() -> None:
+def test_one_machine_of_two_engines_is_placed_on_once_and_a_gang_that_awaits_new_hosts_nowhere_yet() -> None:
     twice = [replace(host("localhost"), machine="pc"), replace(host("docker/pc"), machine="pc")]
     found = fit(gang(node(3), node(3)), queue(), {"all": environment()}, twice)
     assert found.allocation is None and found.problem is not None and "all hosts together have 4 CPUs" in found.problem
-
-
-def test_a_gang_that_awaits_new_hosts_is_not_a_problem_and_has_no_placement_yet() -> None:
     found = fit(gang(*[node(3)] * 3), queue(), {"all": environment()}, [host()], elastic=["all"])
     assert (found.allocation, found.problem) == (None, None)
 
@@ -180,7 +171,7 @@ pools_strategy = st.lists(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(hosts_strategy, st.lists(machines, min_size=4, max_size=4), pools_strategy, nodes, st.integers(1, 4), st.data())
 def test_a_gang_alone_starts_exactly_where_it_is_said_to_fit(
     hosts: list[Host], on: list[str], pools: list, each: Resources, count: int, data: st.DataObject

@@ -35,12 +35,14 @@ def cart(cpus: float = 4, queue: str = "low", name: str = "cart", host: str = "a
     return running(name, on(host, cpus), queue=queue, **{"preemptible": True, **facts})  # type: ignore[arg-type]
 
 
-def test_a_job_of_a_higher_queue_preempts_and_keeps_what_comes_free() -> None:
+def test_a_job_of_a_higher_queue_preempts_also_for_the_cpus_that_may_be_used_and_keeps_what_comes_free() -> None:
     decided = Pass([host()], [job("ant", 3, queue="high"), job("small", 2, queue="low", timeout=60)], [cart()], HIGH)
     assert decided.preempts == (Preempt("cart-0123456789", "ant-0123456789"),)
     assert decided.starts == ()
     assert decided.reason("ant").endswith("free until job cart (cart-012), preempted for it, has stopped")
     assert decided.reason("small").startswith(f"{CAPACITY} - 1st in queue low, behind")
+    decided = Pass([host(cpus=64)], [job("ant", 3, queue="high")], [cart(2)], HIGH, [environment(max_cpus=4)])
+    assert decided.preempted == "cart"
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,7 @@ def test_victims_are_ordered_by_queue_then_priority_then_age() -> None:
     assert chosen == ["young", "young old", "young old dear", "young old dear mid"]
 
 
-def test_no_more_are_preempted_than_needed() -> None:
+def test_no_more_are_preempted_than_needed_and_none_while_some_stop() -> None:
     held = [
         cart(1, name="small", for_seconds=1),
         cart(1, name="other", host="b", for_seconds=2),
@@ -79,9 +81,6 @@ def test_no_more_are_preempted_than_needed() -> None:
     ]
     # the youngest two come first but are not enough, and with the third they are no longer needed
     assert Pass([host("a"), host("b")], [job("ant", 3, queue="high")], held, HIGH).preempted == "large"
-
-
-def test_no_further_victims_are_chosen_while_some_stop() -> None:
     held = [cart(2, name="first", ending=True), cart(2, name="second")]
     assert Pass([host()], [job("ant", 2, queue="high")], held, HIGH).preempted == ""
     assert Pass([host()], [job("ant", 3, queue="high")], held, HIGH).preempted == "second"
@@ -104,11 +103,6 @@ def test_across_shares_only_one_that_would_be_served_first_preempts() -> None:
     ):
         usage = {("default", "s"): mine, ("default", "t"): its}
         assert Pass([host()], waiting, held, queues, usage=usage).preempted == expected
-
-
-def test_the_cpus_that_a_compute_environment_may_use_are_preempted_for_too() -> None:
-    decided = Pass([host(cpus=64)], [job("ant", 3, queue="high")], [cart(2)], HIGH, [environment(max_cpus=4)])
-    assert decided.preempted == "cart"
 
 
 # -- jobs that are stuck ----------------------------------------------------------------------------------------------
@@ -154,10 +148,12 @@ def test_only_the_time_at_the_head_counts_and_a_pass_tells_the_next_one_since_wh
         assert decided.cancels == () and decided.decisions.leading == leads("x", CAPACITY, since)
 
 
-def test_a_cancelled_job_preempts_no_gang() -> None:
+def test_a_cancelled_job_preempts_no_gang_and_an_unusable_queue_cancels_none() -> None:
     queues, leading = [queue("high", 9, limits=LIMITED), queue("low")], leads("ant", CAPACITY, 601, "high")
     decided = Pass([host()], [job("ant", queue="high")], [cart()], queues, leading=leading)
     assert (len(decided.cancels), decided.preempts) == (1, ())
+    queues = [queue(limits=tuple(TimeLimit(code, 600) for code in (CAPACITY, MAXIMUM, REQUIREMENT)))]
+    assert Pass([host()], [job("x", runnable=999)], (), queues, [environment(enabled=False)]).cancels == ()
 
 
 @pytest.mark.parametrize("cpus", [1, 4])
@@ -165,8 +161,3 @@ def test_the_first_of_a_queue_behind_the_head_of_another_is_stuck_too_also_where
     queues, held = [queue("high", 9), queue("low", limits=LIMITED)], [running("cart", on("a", 2))]
     waiting = [job("ant", 4, queue="high"), job("next", cpus, queue="low")]
     assert Pass([host()], waiting, held, queues, leading=leads("next", CAPACITY, 601, "low")).cancelled == "next"
-
-
-def test_a_queue_without_a_usable_compute_environment_cancels_no_job() -> None:
-    queues = [queue(limits=tuple(TimeLimit(code, 600) for code in (CAPACITY, MAXIMUM, REQUIREMENT)))]
-    assert Pass([host()], [job("x", runnable=999)], (), queues, [environment(enabled=False)]).cancels == ()

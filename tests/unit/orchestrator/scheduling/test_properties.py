@@ -138,7 +138,7 @@ some_timeouts = st.one_of(st.none(), st.sampled_from([60, 100, 200, 300, 1000]))
 ages_strategy = st.lists(st.integers(0, 200), min_size=6, max_size=6)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(hosts_strategy, jobs("r", some_timeouts, 6), jobs("w", some_timeouts, 8), ages_strategy)
 def test_jobs_that_pass_the_head_do_not_delay_it(
     hosts: list[Host], earlier: list[Waiting], waiting: list[Waiting], ages: list[int]
@@ -165,7 +165,7 @@ def test_jobs_that_pass_the_head_do_not_delay_it(
     assert earliest(reservation.shape, hosts, [*running, *starts], NOW) <= promised
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     hosts_strategy,
     jobs("w", st.sampled_from([60, 100, 200, 300]), 12),
@@ -337,4 +337,4 @@ class Cluster(RuleBasedStateMachine):
 
 
 TestCluster = Cluster.TestCase
-TestCluster.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestCluster.settings = settings(max_examples=60, stateful_step_count=30)

@@ -28,7 +28,7 @@ from tests.support.orchestrator.scheduling import (
 # -- jobs that can never start ----------------------------------------------------------------------------------------
 
 
-def test_a_job_that_can_never_start_says_so_and_delays_no_other() -> None:
+def test_a_job_that_can_never_start_says_so_even_behind_one_that_waits_and_delays_no_other() -> None:
     decided = Pass([host(gpus=1), host("b", 2)], line(job("huge", gang(node(64, 2))), job("small")))
     assert decided.started == "small:a"
     assert decided.reason("huge") == (
@@ -38,9 +38,6 @@ def test_a_job_that_can_never_start_says_so_and_delays_no_other() -> None:
     assert Pass([], [job("ant")]).reason("ant") == (
         f"{REQUIREMENT} - each node needs 1 CPU, 0 GPUs, 100 MiB; the largest host has nothing: there is no host"
     )
-
-
-def test_a_gang_too_large_for_all_hosts_together_says_so_even_behind_one_that_waits() -> None:
     waiting = line(job("first", 4), job("wide", gang(*[node()] * 9)))
     assert Pass([host(), host("b", 3)], waiting, [running("cart", on("a", 1))]).reason("wide") == (
         f"{REQUIREMENT} - {needs(9, nodes=9)}; all hosts together have 7 CPUs, 0 GPUs, 16 GiB"
@@ -108,15 +105,12 @@ def test_the_board_lists_who_still_waits_and_numbers_them() -> None:
         decided.reason("runs")
 
 
-def test_room_that_is_enough_in_all_but_in_pieces_says_so() -> None:
+def test_a_reason_says_that_room_is_in_pieces_and_names_the_last_gangs_that_it_waits_for() -> None:
     held = [running("x", on("a", 2)), running("y", on("b", 2)), running("z", on("b", 1)), running("v", on("a", 1))]
     assert Pass([host("a"), host("b")], [job("ant", 2)], held).reason("ant") == (
         f"{CAPACITY} - {needs(2)}; "
         "2 CPUs, 0 GPUs, 16 GiB free, but not in one piece for each node until job v (v-012345) ends"
     )
-
-
-def test_a_reason_names_the_last_gangs_that_it_waits_for_and_counts_the_others() -> None:
     held = [running(f"r{i}", on("a", 1), timeout=100 + i) for i in range(1, 6)]
     assert Pass([host(cpus=5)], [job("ant", 5)], held).reason("ant") == (
         f"{CAPACITY} - {needs(5)}; 0 CPUs, 0 GPUs, 8 GiB free until jobs r3 (r3-01234), r4 (r4-01234), "

@@ -59,9 +59,11 @@ def test_a_job_passes_only_if_its_timeout_ends_by_the_start_of_the_head() -> Non
     )
 
 
-def test_no_timeout_is_short_enough_while_nobody_knows_when_the_head_starts() -> None:
+def test_no_timeout_is_short_enough_while_nobody_knows_when_the_head_starts_and_an_absurd_one_is_none() -> None:
     held = [running("known", on("a", 1), timeout=700), running("unknown", on("a", 1))]
     assert Pass([host()], line(LARGE, job("short", timeout=60)), held).started == ""
+    decided = Pass([host()], line(LARGE, job("small", timeout=10**14)), [cart(timeout=10**15)])
+    assert decided.started == "" and decided.reason("large").endswith("free until job cart (cart-012) ends")
 
 
 def test_a_job_of_any_length_may_start_beside_a_reservation() -> None:
@@ -126,11 +128,6 @@ def test_a_gang_that_starts_now_or_before_is_expected_to_run_for_its_whole_timeo
     assert decided.reason("large").endswith("until job now (now-0123) ends, at the latest at 2027-01-15 08:08:20 UTC")
 
 
-def test_an_absurd_timeout_counts_as_none() -> None:
-    decided = Pass([host()], line(LARGE, job("small", timeout=10**14)), [cart(timeout=10**15)])
-    assert decided.started == "" and decided.reason("large").endswith("free until job cart (cart-012) ends")
-
-
 def test_equal_jobs_are_tried_once_a_pass_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     tried: list[Shape] = []
     monkeypatch.setattr(free, "place", lambda shape, *rest: tried.append(shape) or place(shape, *rest))
@@ -145,7 +142,7 @@ def test_equal_jobs_are_tried_once_a_pass_however_many_there_are(monkeypatch: py
 TWO_HOSTS, APART = [host("a"), host("b")], [environment("p", ("a",)), environment("q", ("b",))]
 
 
-def test_a_job_that_waits_holds_up_only_the_hosts_it_could_use() -> None:
+def test_a_job_that_waits_holds_up_only_the_hosts_that_it_could_use() -> None:
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]
     held = [cart(environment="p"), running("ant", on("b", 1), environment="q")]
     waiting = [
@@ -158,6 +155,8 @@ def test_a_job_that_waits_holds_up_only_the_hosts_it_could_use() -> None:
     assert decided.started == "two-small:b"
     assert decided.reason("two-large").startswith(f"{CAPACITY} - needs 1 node with 4 CPUs")
     assert decided.reason("two-next").startswith("2nd in queue two, behind job two-large (two-larg)")
+    waiting = [job("large", 4, queue="high"), job("short", queue="low", timeout=600, age=99)]
+    assert Pass([host()], waiting, [cart(2, timeout=700)], [queue("high", 2), queue("low", 1)]).started == "short:a"
 
 
 def test_a_job_with_several_compute_environments_is_the_head_of_those_that_are_not_kept_yet() -> None:
@@ -191,11 +190,6 @@ def test_equal_jobs_with_other_timeouts_are_each_judged_by_their_own() -> None:
         job("second", queue="any", age=4, timeout=100),
     ]
     assert Pass(TWO_HOSTS, waiting, held, queues, [*APART, environment("r")]).started == "middle:b short:a"
-
-
-def test_a_job_of_a_lower_queue_may_use_hosts_that_the_head_of_a_higher_one_can_not() -> None:
-    waiting = [job("large", 4, queue="high"), job("short", queue="low", timeout=600, age=99)]
-    assert Pass([host()], waiting, [cart(2, timeout=700)], [queue("high", 2), queue("low", 1)]).started == "short:a"
 
 
 # -- what is kept for shares that are not active ----------------------------------------------------------------------

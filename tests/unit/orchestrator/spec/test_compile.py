@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orchestrator.domain.gang import gang_needs, target_nodes
-from orchestrator.domain.native_options import NativeOptions
+from orchestrator.domain.native_options import MalformedOptions, NativeOptions
 from orchestrator.domain.resources import Resources
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
@@ -130,19 +130,13 @@ def test_target_nodes_of_another_form_are_refused(text: str) -> None:
         target_nodes(text, 4)
 
 
-def test_of_nested_ranges_the_inner_one_counts_in_whatever_order_they_come() -> None:
+def test_of_nested_ranges_the_inner_one_counts_of_equal_ones_the_later_and_each_node_needs_one() -> None:
     outer, inner, one = ("0:", container(command=["outer"])), ("1:2", container(command=["inner"])), ("2", container())
     for ranges in ([outer, inner, one], [one, inner, outer], [inner, outer, one]):
         commands = [node.command for node in gang_needs(properties(*ranges)).nodes]
         assert commands == [("outer",), ("inner",), ("x",), ("outer",)]
-
-
-def test_of_two_equal_ranges_the_later_one_counts_and_one_may_exceed_the_existing_nodes() -> None:
     ranges = [("0:", container(command=["first"])), ("0:9", container(command=["second"]))]
     assert {node.command for node in gang_needs(properties(*ranges)).nodes} == {("second",)}
-
-
-def test_nodes_without_a_range_are_named() -> None:
     with pytest.raises(ValueError, match="cover no node 2; every node from 0 to 3 needs a range"):
         gang_needs(properties(("0:1", container()), ("3", container())))
 
@@ -173,6 +167,22 @@ def test_settings_are_those_of_the_main_node() -> None:
 def test_a_gang_may_start_smaller_but_never_without_its_main_node(minimum: str, main: int, expected: int) -> None:
     smaller = container(environment=[{"name": "MUSTER_MIN_NODES", "value": minimum}])
     assert gang_needs(properties(("0:", smaller), main=main)).minimum == expected
+
+
+def ranks(value: str | None) -> dict[str, Any]:
+    return container(environment=[{"name": "MUSTER_RANKS_PER_NODE", "value": value}] if value else [])
+
+
+def test_each_node_has_its_own_number_of_ranks_and_the_name_of_its_container_in_ecs_properties() -> None:
+    given = properties(("0", ranks("2")), ("1", ranks(None)), ("2", ranks("8")), count=3)
+    given["nodeRangeProperties"][1]["ecs"] = "main"
+    assert [(node.ranks, node.ecs) for node in gang_needs(given).nodes] == [(2, None), (1, "main"), (8, None)]
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "two", "1.5", " 2", "9999999"])
+def test_a_number_of_ranks_that_is_none_is_refused(value: str) -> None:
+    with pytest.raises(MalformedOptions, match=f"MUSTER_RANKS_PER_NODE is '{value}'"):
+        gang_needs(properties(("0", ranks("1")), ("1", ranks(value)), count=2))
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(0.01, 64), st.integers(0, 8), st.integers(4, 10**6))

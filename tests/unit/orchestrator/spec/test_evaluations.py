@@ -32,7 +32,7 @@ def look(checkpoints: list[Checkpoint], counted: Counted, *, every: int = 2, bus
     return known, chosen.iteration if chosen else 0
 
 
-def test_every_second_checkpoint_is_due_however_many_retention_has_left() -> None:
+def test_every_second_checkpoint_of_the_job_is_due_however_many_retention_has_left() -> None:
     known, found = look(saved(10), Counted())
     assert (known, found) == (Counted("00000010-e1", 1), 0)
     known, found = look(saved(10), known)
@@ -42,6 +42,8 @@ def test_every_second_checkpoint_is_due_however_many_retention_has_left() -> Non
     assert look(saved(20), known) == (known, 0), "once"
     known, found = look(saved(20, 30, 40), known)
     assert (known, found) == (Counted("00000040-e1", 0), 40)
+    assert first_count([*saved(10, 20), *saved(30, epoch=3)], 3) == Counted("00000020-e1")
+    assert first_count(saved(30, epoch=3), 3) == first_count([], 1) == Counted()
 
 
 def test_one_evaluation_runs_at_a_time_and_the_newest_checkpoint_is_next() -> None:
@@ -54,23 +56,15 @@ def test_one_evaluation_runs_at_a_time_and_the_newest_checkpoint_is_next() -> No
     assert (known, found) == (Counted("00000070-e1", 0, 1), 70), "40 was due, too"
 
 
-def test_the_last_checkpoint_is_left_to_the_training_itself() -> None:
+def test_the_last_checkpoint_is_left_to_the_training_itself_and_a_later_epoch_is_newer() -> None:
     known, found = look(saved(90, 100), Counted("00000080-e1", 0), every=1)
     assert (known, found) == (Counted("00000100-e1", 1), 0), "the training is done: 90 is no news any more"
     assert look(saved(90), Counted("00000080-e1", 0), every=1)[1] == 90
-
-
-def test_a_later_epoch_is_newer_whatever_its_iteration() -> None:
     known, found = look([*saved(50, 60), *saved(30, 40, epoch=2)], Counted("00000060-e1", 0))
     assert (known, found) == (Counted("00000040-e2", 0), 40)
 
 
-def test_checkpoints_of_earlier_jobs_do_not_count() -> None:
-    assert first_count([*saved(10, 20), *saved(30, epoch=3)], 3) == Counted("00000020-e1")
-    assert first_count(saved(30, epoch=3), 3) == first_count([], 1) == Counted()
-
-
-def test_the_job_has_one_node_like_those_of_the_training_and_keeps_no_checkpoint() -> None:
+def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_nothing_else() -> None:
     wanted = Evaluation(every=2, episodes=32, worlds=16)
     spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
     assert spec.evaluate is not None and spec.evaluate.model_dump(exclude_none=True) == {
@@ -79,9 +73,6 @@ def test_the_job_has_one_node_like_those_of_the_training_and_keeps_no_checkpoint
     assert (spec.name, spec.queue, spec.share, spec.image) == ("evaluate-ant-1", "slow", "a", "mine")
     assert (spec.nodes.max, spec.resources.gpus, spec.resources.cpus, spec.environment) == (1, 1, 4.0, {"NOTE": "a"})
     assert (spec.priority, spec.preemptible, spec.retry.attempts) == (0, True, 3)
-
-
-def test_the_section_says_where_else_and_with_what() -> None:
     section = {"every": 1, "queue": "idle", "resources": {"cpus": 0.5, "memory": 512}, "retry": {"attempts": 1}}
     wanted = wanted_of({**TRAINED, "evaluation": section})
     assert wanted is not None

@@ -146,28 +146,21 @@ print(found.__name__, algorithms.settings(found, "hop", configure(find_task("Car
 """
 
 
-def said_by(program: str, tmp_path: Path) -> list[str]:
+def test_an_algorithm_of_an_installed_package_is_known_to_the_submission_and_to_the_rank(tmp_path: Path) -> None:
     for name, text in HOPPER.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     env = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
-def test_an_algorithm_of_an_installed_package_is_known_to_the_submission(tmp_path: Path) -> None:
-    assert said_by(CONTROLLER, tmp_path) == [
+    command = [sys.executable, "-c", CONTROLLER + RANK]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
+    assert done.stdout.splitlines() == [
         "{'hops': 4}",
         "job.yaml: train.hop.hopps: unknown key; did you mean hops?",
         "job.yaml: train.hop.hops: expected a whole number, found a text ('many')",
         "job.yaml: train.ppo: the algorithm is hop, so its settings belong under train.hop",
         "job.yaml: train.config.hop: not a key of CartpoleConfig; settings of hop stand under train.hop",
-    ]
-
-
-def test_an_algorithm_of_an_installed_package_is_known_to_the_rank(tmp_path: Path) -> None:
-    assert said_by(RANK, tmp_path) == ["Hop 4"]
+        "Hop 4",
+    ], done.stderr
 
 
 def test_every_installed_algorithm_names_its_class_and_its_settings() -> None:

@@ -249,13 +249,14 @@ def test_a_number_of_nodes_is_a_range_of_one_and_a_node_has_one_rank_a_gpu_and_a
     assert [command(resources={"gpus": gpus}).ranks_per_node for gpus in (0, 1, 8)] == [1, 1, 8]
 
 
-def test_a_users_task_is_named_by_module_and_class() -> None:
+def test_the_known_tasks_are_the_installed_ones_and_a_user_s_is_named_by_module_and_class() -> None:
     document = {"name": "a", "train": {"task": "my_robot.tasks:Walker", "worlds": 1, "iterations": 1}}
     assert validate(document, "s").train.task == "my_robot.tasks:Walker"  # type: ignore[union-attr]
-
-
-def test_the_known_tasks_are_the_installed_ones() -> None:
     assert known_tasks() == TASKS.split(", ")
+
+
+def test_example_specs_are_shipped() -> None:
+    assert {path.name for path in SHIPPED} >= {"ant.yaml", "cartpole.yaml", "all-reduce.yaml"}
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
