@@ -407,4 +407,4 @@ def _is_sensor(kind: Any) -> bool:
 
 def _has_columns(kind: Any) -> bool:
     """Whether a sensor's struct has a column for each measured element, besides the row of each world."""
-    return any(isinstance(each.type, wp.array) and each.type.ndim > 1 for each in kind.vars.values())
+    return any(getattr(each.type, "ndim", 0) > 1 for each in kind.vars.values())
