@@ -159,9 +159,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
     assert fake.closed == 1
 
 
-def test_an_engine_that_fails_is_logged_once_and_its_gangs_run(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     fake = Fake()
     with engines(fake) as several:
         handle = launched(several, gang(tmp_path))
