@@ -78,9 +78,7 @@ def test_a_job_is_submitted_by_the_wizard_without_a_mouse(console: Console, peop
     console.client.batch("TerminateJob", jobId=page.url.rpartition("/")[2], reason="seen")
 
 
-def test_an_open_page_leads_to_the_login_when_its_key_is_deleted(
-    console: Console, people: People, waiting: str
-) -> None:
+def test_an_open_page_leads_to_the_login_once_its_key_is_gone(console: Console, people: People, waiting: str) -> None:
     person = people(console.url, secret_of(console.keys.create("passing")))
     page = person.goto("/?search=shared")
     job = console.submit(waiting, "shared-later")

@@ -62,7 +62,7 @@ def batch(server: Serving) -> Batch:
         ("route53", lambda route53: route53.list_hosted_zones(), "InvalidAction"),
     ],
 )
-def test_another_service_is_refused_as_it_would_say(
+def test_another_service_is_refused_its_way(
     server: Serving, service: str, call: Callable[[Any], Any], code: str
 ) -> None:
     with pytest.raises(ClientError) as caught:

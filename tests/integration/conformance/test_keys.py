@@ -80,7 +80,7 @@ def test_a_damaged_keys_file_is_one_line_at_the_start(tmp_path: Path, text: byte
     assert f"{tmp_path}/keys.json: " in done.stderr and part in done.stderr, done.stderr
 
 
-def test_a_keys_file_damaged_later_is_logged_once_and_its_keys_stay(
+def test_a_keys_file_damaged_later_is_logged_and_its_keys_stay(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = KeyStore(tmp_path)

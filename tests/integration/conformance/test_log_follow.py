@@ -216,9 +216,7 @@ def test_a_live_tail_takes_up_jobs_that_begin_and_end_later_and_filters(shared_s
     assert named.texts == []  # all was written before that session began
 
 
-def test_a_burst_comes_500_at_a_time_and_above_5000_is_sampled(
-    shared_server: Serving, watch: Any, running: str
-) -> None:
+def test_a_burst_comes_500_at_a_time_above_5000_is_sampled(shared_server: Serving, watch: Any, running: str) -> None:
     tail = watch(logStreamNames=[stream_of(shared_server, running)])
     append(shared_server, running, *(f"burst {i}" for i in range(3000)))
     wait_for(lambda: len(tail.results) >= 3000)

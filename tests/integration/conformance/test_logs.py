@@ -128,9 +128,7 @@ def test_a_time_range_has_its_start_and_not_its_end(shared_server: Serving, logs
     assert messages(logs.filter_log_events(**query, logStreamNames=[name])) == ["second 1", "second 2", "second 3"]
 
 
-def test_times_never_fall_when_a_clock_steps_back_nothing_is_lost(
-    shared_server: Serving, logs: Any, quiet: str
-) -> None:
+def test_times_never_fall_when_a_clock_steps_back(shared_server: Serving, logs: Any, quiet: str) -> None:
     high = int(time.time()) - 100
     log_of(shared_server, quiet).write_bytes(b"")
     append(shared_server, quiet, "before", seconds=high)
@@ -239,7 +237,7 @@ def test_bad_patterns_are_invalid_parameters_that_say_why(logs: Any, pattern: st
 # -- rules and refusals -----------------------------------------------------------------------------------------------
 
 
-def test_names_and_prefix_and_two_names_of_the_group_exclude_each_other(
+def test_names_prefix_and_two_names_of_the_group_exclude_others(
     shared_server: Serving, logs: Any, counted: str
 ) -> None:
     name, refused = stream_of(shared_server, counted), logs.exceptions.InvalidParameterException

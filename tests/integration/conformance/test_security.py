@@ -169,9 +169,7 @@ def test_a_body_that_is_not_signed_is_refused(served: Serving, key: Key, digest:
 
 
 @pytest.mark.parametrize("minutes", [-16, 16, -14, 14])
-def test_a_signature_holds_for_15_minutes(
-    served: Serving, key: Key, monkeypatch: pytest.MonkeyPatch, minutes: int
-) -> None:
+def test_a_signature_holds_15_minutes(served: Serving, key: Key, monkeypatch: pytest.MonkeyPatch, minutes: int) -> None:
     then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=minutes)
     monkeypatch.setattr(botocore.auth, "get_current_datetime", lambda: then)
     answer = send(signed(key, "POST", f"{served.url}/v1/describejobs", b'{"jobs": []}'))
@@ -278,9 +276,7 @@ def test_no_host_that_a_web_page_can_name_reaches_an_open_server(shared_server: 
     ],
 )
 @pytest.mark.parametrize("date", [b"20269999T999999Z", b"\xb2\xb2", b"{now}"])
-def test_garbage_in_headers_is_refused_in_one_line(
-    served: Serving, key: Key, authorization: bytes, date: bytes
-) -> None:
+def test_garbage_in_headers_is_refused_in_a_line(served: Serving, key: Key, authorization: bytes, date: bytes) -> None:
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ").encode()
     signature = authorization.replace(b"%s", key.access_key_id.encode())
     headers = [(b"Authorization", signature), (b"X-Amz-Date", date.replace(b"{now}", now))]

@@ -30,9 +30,7 @@ def test_a_disabled_queue_finishes_what_it_has(batch: Batch, one_cpu: str, tmp_p
     assert [batch.wait(job)["status"] for job in jobs] == ["SUCCEEDED", "SUCCEEDED"]
 
 
-def test_a_deleted_queue_ends_its_jobs_and_stays_until_the_last_ended(
-    batch: Batch, one_cpu: str, tmp_path: Path
-) -> None:
+def test_a_deleted_queue_ends_its_jobs_and_stays_until_then(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
     script = f"trap 'touch $GATE/asked' TERM; touch $GATE/ready; {UNTIL.format('go')}"
     definition = batch.single("q-ended", script, env={"GATE": str(tmp_path)}, cpus="1", retryStrategy={"attempts": 2})
     batch.queue("q-ended", one_cpu)

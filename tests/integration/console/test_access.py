@@ -134,9 +134,7 @@ def test_a_change_needs_the_token_of_a_form_of_the_same_session(console: Console
         {"Host": "evil.example"},
     ],
 )
-def test_another_web_page_neither_reads_nor_changes_an_open_server(
-    shared_server: Serving, headers: dict[str, str]
-) -> None:
+def test_another_web_page_can_use_no_open_server(shared_server: Serving, headers: dict[str, str]) -> None:
     visitor = Visitor(shared_server.url)
     token = visitor.page("/").form_token
     for path in ("/", "/jobs/stream", "/api/jobs", "/login", "/static/x/console.js"):

@@ -167,9 +167,7 @@ def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(console: Co
         assert lines == expected
 
 
-def test_a_page_that_missed_too_much_gets_the_last_lines_and_a_count(
-    console: Console, talking: str, store: Store
-) -> None:
+def test_a_page_that_missed_too_much_gets_the_last_lines(console: Console, talking: str, store: Store) -> None:
     run = store.run(console.client.get(f"/api/jobs/{talking}")["run"])
     with open(run.log(talking, 1, 0), "a") as file:
         file.writelines(format_line(4e9, 0, "o", f"late {i} " + "x" * 100) for i in range(20_000))
@@ -180,9 +178,7 @@ def test_a_page_that_missed_too_much_gets_the_last_lines_and_a_count(
     assert said(window)[-1].startswith("late 19999 ")
 
 
-def test_the_stream_has_new_iterations_and_tells_of_a_run_that_went_back(
-    console: Console, training: str, store: Store
-) -> None:
+def test_the_stream_has_new_iterations_and_tells_what_went_back(console: Console, training: str, store: Store) -> None:
     visitor = console.visitor()
     told = visitor.http.get("/runs/taught/curves", params={"name": "reward*"}).json()
     assert told["series"]["reward"] == [i / 2 for i in range(1, 10)] and told["last"] == 9
@@ -289,9 +285,7 @@ def test_a_key_of_another_queue_sees_nothing_of_the_job_and_changes_nothing(cons
         assert visitor.submit(f"/jobs/{training}/{action}", name="x", confirmed="yes").status_code == 403, action
 
 
-def test_files_of_a_run_are_downloads_and_nothing_leads_out_of_it(
-    console: Console, training: str, store: Store
-) -> None:
+def test_files_of_a_run_are_downloads_and_none_leads_out_of_it(console: Console, training: str, store: Store) -> None:
     run, visitor = store.run("taught"), console.visitor()
     run.recordings.mkdir()
     (run.recordings / "gait.gif").write_bytes(b"GIF89a")

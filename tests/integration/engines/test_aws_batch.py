@@ -227,9 +227,7 @@ def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workst
     assert workstation.outcome(1).reason == "rank 1 exited with code 1"
 
 
-@pytest.mark.skipif(
-    os.geteuid() != 0, reason="NOT TESTED: the EFS volume of a definition is a mount, and mounting needs root"
-)
+@pytest.mark.skipif(os.geteuid() != 0, reason="NOT TESTED: an EFS volume is mounted, which needs root")
 def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path: Path) -> None:
     bench = AwsBench(aws, tmp_path, file_system="fs-1", store=str(tmp_path / "mount"))
     handle = bench.launch(bench.gang("touch $MUSTER_STORE/models", 1, run="mounted"))
@@ -247,9 +245,7 @@ def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path
         (1, (Claim("", "another-job", 2),), "attempt 2 of job another-job has epoch 1 already; leaving"),
     ],
 )
-def test_a_run_that_is_another_attempt_s_refuses_this_one(
-    bench: AwsBench, epoch: int, claim: tuple[Claim, ...], said: str
-) -> None:
+def test_a_run_of_another_attempt_refuses_it(bench: AwsBench, epoch: int, claim: tuple[Claim, ...], said: str) -> None:
     volume = bench.volume.run("run")
     volume.create({"run": "run"})
     raise_epoch(volume, epoch, *claim)

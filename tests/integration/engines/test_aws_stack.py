@@ -189,9 +189,7 @@ def test_roles_allow_no_more_than_they_must(account: Account) -> None:
     assert iam.list_attached_role_policies(RoleName=account.physical("JobRole"))["AttachedPolicies"] == []
 
 
-def test_the_engine_works_with_what_up_has_written(
-    account: Account, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_engine_works_with_what_up_wrote(account: Account, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name, value in account.env.items():
         monkeypatch.setenv(name, value)
     engine = AwsBatchEngine(account.home)

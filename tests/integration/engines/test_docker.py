@@ -64,7 +64,7 @@ def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_tol
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["the gateway is told", "an engine that leaves it out"])
-def test_containers_reach_this_machine_at_the_address_that_the_engine_found(
+def test_containers_reach_this_machine_where_the_engine_says(
     bench: DockerBench, monkeypatch: pytest.MonkeyPatch, told: bool
 ) -> None:
     networks = type(bench.client.networks)
@@ -171,9 +171,7 @@ def test_two_threads_that_look_at_once_copy_a_log_once(bench: DockerBench, monke
     bench.ended(handle)
 
 
-def test_a_long_log_is_copied_and_keeps_its_head_and_its_tail(
-    bench: DockerBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_log_is_copied_with_its_head_and_its_tail(bench: DockerBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("orchestrator.engines.docker.engine._LOOK", 0.0)  # it goes on at the next look
     handle = bench.launch(bench.gang("seq 100000 160000; echo the error; exit 1", 1, log_limit=1 << 20))
     bench.ended(handle)

@@ -79,9 +79,7 @@ class Relay:
 
 
 @pytest.mark.skipif(not Path("/var/run/docker.sock").exists(), reason="NO /var/run/docker.sock: nothing to cut off")
-def test_a_docker_engine_gone_is_waited_for(
-    docker_client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     relay = Relay(tmp_path / "docker.sock")
     relay.open()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{relay.path}")

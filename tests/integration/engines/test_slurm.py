@@ -80,7 +80,7 @@ def test_a_job_for_more_hosts_than_there_are_says_what_it_waits_for(bench: Slurm
         ("IDLE+MAINTENANCE", True),
     ],
 )
-def test_a_node_that_slurm_would_boot_is_a_host_and_one_that_is_out_of_service_is_away(
+def test_a_node_that_slurm_would_boot_is_a_host_others_are_away(
     state: str, away: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = f"NodeName=n1 CPUTot=4 RealMemory=8192 State={state} Gres=gpu:2\nNodeName=n2 State=FUTURE\n"

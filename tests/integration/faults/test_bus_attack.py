@@ -168,7 +168,7 @@ def test_a_node_feigns_no_presence_nor_absence_of_another(bus: Bus, victim: Vict
 
 
 @pytest.mark.parametrize("complete", [False, True])
-def test_an_answer_in_another_node_s_name_is_ignored(
+def test_an_answer_in_another_s_name_is_ignored(
     bus: Bus, victim: Victim, mallory: zenoh.Session, complete: bool
 ) -> None:
     overheard: list[dict[str, Any]] = []

@@ -182,7 +182,7 @@ def test_showing_a_run_names_the_jobs_that_made_it(controller: Controller) -> No
     assert (refused.returncode, refused.stderr) == (2, line)
 
 
-def test_a_controller_stopped_at_any_moment_neither_loses_nor_repeats_an_evaluation(
+def test_a_stopped_controller_neither_loses_nor_repeats_evaluations(
     controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Killed(BaseException):
@@ -236,9 +236,7 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
     assert controller.evaluations() == []
 
 
-def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(
-    controller: Controller, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_evaluation_that_its_queue_refuses_is_told(controller: Controller, caplog: pytest.LogCaptureFixture) -> None:
     order = [{"order": 1, "computeEnvironment": "local"}]
     controller.client.batch("CreateJobQueue", jobQueueName="idle", priority=1, computeEnvironmentOrder=order)
     controller.train({"every": 1, "queue": "idle"})

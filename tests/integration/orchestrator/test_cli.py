@@ -131,7 +131,7 @@ def test_an_address_that_is_no_url_is_wrong_use(tmp_path: Path, url: str) -> Non
     refused(["list"], tmp_path, 2, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
 
 
-def test_the_api_s_page_lists_its_operations_and_needs_no_script_and_nothing_from_elsewhere(
+def test_the_api_s_page_lists_operations_and_needs_nothing_from_elsewhere(
     shared_server: Serving,
 ) -> None:
     answer = httpx.get(f"{shared_server.url}/api/docs", trust_env=False)
@@ -221,9 +221,7 @@ def table(*rows: tuple[str, ...]) -> Table:
     return made
 
 
-def test_a_narrow_terminal_cuts_reasons_alone(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_narrow_terminal_cuts_reasons(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setenv("NO_COLOR", "1")

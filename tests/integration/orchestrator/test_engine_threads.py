@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import http.server
-import json
-import logging
 import os
 import resource
-import socket
-import socketserver
 import subprocess
 import threading
 import time
@@ -40,10 +35,9 @@ from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.transience import is_final
 from shared_store.layout import Store
 from tests.conftest import submit_gang, wait_for
-from tests.support.definitions import container, multinode
 from tests.support.engines.bench import make_gang
-from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
-from tests.support.processes import end_all, gang_members, processes_of
+from tests.support.orchestrator.jobs import serving
+from tests.support.processes import gang_members, processes_of
 
 HOST = "engine/host"
 
@@ -159,9 +153,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
     assert fake.closed == 1
 
 
-def test_an_engine_that_fails_is_logged_once_and_its_gangs_run(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     fake = Fake()
     with engines(fake) as several:
         handle = launched(several, gang(tmp_path))
@@ -264,82 +256,3 @@ def test_a_transient_launch_error_keeps_the_attempts_and_a_permanent_one_ends_th
         number.clear()
         assert len(shows(job, "SUCCEEDED")["attempts"]) == 1
     assert sum(said in record.getMessage() for record in caplog.records) == 2, "once for each job"
-
-
-DEFINITION = multinode("planned", container(cpus="1"))
-
-
-class HungDocker(socketserver.ThreadingUnixStreamServer):
-    """A Docker daemon that says what it is, and from then on takes every request and answers none."""
-
-    daemon_threads = True
-    info = {"NCPU": 4, "MemTotal": 2**33, "Name": socket.gethostname()}
-    answers = {"/version": {"ApiVersion": "1.41", "Version": "20.10"}, "/info": info}
-
-    def __init__(self, path: Path) -> None:
-        self.over = threading.Event()
-        self.asked: list[str] = []
-        server = self
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                for suffix, answer in server.answers.items():
-                    if self.path.endswith(suffix):
-                        body = json.dumps(answer).encode()
-                        self.send_response(200)
-                        self.send_header("Content-Type", "application/json")
-                        self.send_header("Content-Length", str(len(body)))
-                        self.end_headers()
-                        self.wfile.write(body)
-                        return
-                if self.path.endswith("/networks/bridge"):
-                    self.send_error(404)
-                    return
-                server.asked.append(self.path)
-                server.over.wait()
-                self.close_connection = True
-
-            do_POST = do_GET
-
-            def address_string(self) -> str:
-                return "unix"
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        super().__init__(str(path), Handler)
-        threading.Thread(target=self.serve_forever, daemon=True).start()
-
-
-def test_a_docker_daemon_that_hangs_delays_no_gang_of_another_engine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    pytest.importorskip("docker")
-    monkeypatch.setattr(runner, "OVERDUE", 1.0)
-    daemon = HungDocker(tmp_path / "docker.sock")
-    monkeypatch.setenv("DOCKER_HOST", f"unix://{tmp_path}/docker.sock")
-    try:
-        with serving(tmp_path, engines=("local", "docker")) as client, contextlib.ExitStack() as stack:
-            stack.callback(daemon.over.set)
-            running = submit_gang(client, FOREVER)
-            await_status(client, running, "RUNNING")
-            hung = submit_gang(client, "pass", queue="docker")
-            wait_for(lambda: daemon.asked, 30, "a request that is not answered")
-            said = "the docker engine has not answered since "
-            wait_for(lambda: detail(client, hung)["statusReason"].startswith(said), 30, "the reason")
-            # all of this while one call to Docker is in the air
-            await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
-            await_status(client, submit_gang(client, FOREVER, timeout=60), "RUNNING")
-            hosts = [host["name"].partition("/")[0] for host in client.get("/api/capacity")["hosts"]]
-            assert hosts == ["localhost", "docker"]
-            plan = client.post("/api/plan", {"definition": DEFINITION, "queue": "docker"})
-            assert (plan["engine"], len(plan["nodes"])) == ("docker", 1)
-            client.batch("TerminateJob", jobId=running, reason="enough")
-            await_status(client, running, "FAILED")
-            assert detail(client, hung)["status"] == "STARTING" and len(daemon.asked) == 1
-    finally:
-        daemon.shutdown()
-        daemon.server_close()
-        end_all(tmp_path)
-    assert sum(said in record.getMessage() for record in caplog.records) == 1
-    assert [record for record in caplog.records if record.levelno >= logging.ERROR and record.exc_info] == []

@@ -204,9 +204,7 @@ def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
     assert processes_of(tmp_path) == []
 
 
-def test_a_job_is_read_once_for_its_definition_and_once_with_its_overrides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_is_read_once_as_defined_and_once_with_overrides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[int] = []
     """The number of nodes of each document that is read for its gang, in order."""
 

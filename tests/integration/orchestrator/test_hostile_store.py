@@ -108,9 +108,7 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
     assert http.get("/api/runs/checkpointed").json()["evaluation"] is None
 
 
-def test_no_change_of_a_run_and_no_stored_spec_makes_an_answer_long(
-    inside: Server, http: httpx.Client, runs: Path
-) -> None:
+def test_no_change_of_a_run_and_no_spec_makes_an_answer_long(inside: Server, http: httpx.Client, runs: Path) -> None:
     levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
     bomb = ", ".join(["a0: &a0 [x, x, x, x, x, x, x, x]", *levels])
     said = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
@@ -134,7 +132,7 @@ def test_runs_come_in_pages_that_together_hold_each_run_once(http: httpx.Client,
     assert "max" in refused(http.get("/api/runs?max=100000"))
 
 
-def test_after_an_internal_error_a_client_that_keeps_its_connection_is_served(
+def test_after_an_internal_error_a_client_is_served(
     inside: Server, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
@@ -187,7 +185,7 @@ def test_a_damaged_page_found_while_serving_is_reported_to_each_request(tmp_path
     database.close()
 
 
-def test_a_job_and_its_log_can_be_read_whatever_it_put_in_place_of_its_files(
+def test_a_job_is_read_whatever_it_put_in_place_of_files(
     inside: Server, http: httpx.Client, runs: Path, tmp_path: Path
 ) -> None:
     secret = tmp_path / "secret"
@@ -229,7 +227,7 @@ def test_links_and_pipes_that_a_job_put_in_place_of_files_are_neither_followed_n
     assert victim.read_text() == "kept"
 
 
-def test_a_run_that_is_a_link_is_damaged_and_nothing_is_read_or_written_through_it(
+def test_nothing_is_read_or_written_through_a_run_that_is_a_link(
     inside: Server, http: httpx.Client, runs: Path, tmp_path: Path
 ) -> None:
     write_json(tmp_path / "elsewhere" / "run.json", {"run": "e-linked", "spec": SPEC})
@@ -267,7 +265,7 @@ def test_logs_and_outcomes_are_neither_read_nor_written_through_a_link(tmp_path:
     assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
 
 
-def test_a_log_stream_ends_in_order_whatever_lies_where_logs_are_looked_for(
+def test_a_log_stream_ends_in_order_whatever_lies_there(
     inside: Server, http: httpx.Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     job = submit_gang(Client(inside.url), "print('said')")

@@ -260,9 +260,7 @@ def test_output_of_a_supervisor_before_it_reaches_the_store_is_reported(bench: L
 # -- stopping ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "stopper", [lambda bench: bench.engine, LocalBench.new_engine], ids=["same engine", "new engine"]
-)
+@pytest.mark.parametrize("stopper", [lambda bench: bench.engine, LocalBench.new_engine], ids=["same", "new"])
 def test_stopping_leaves_no_process_at_all(bench: LocalBench, stopper: Callable[[LocalBench], LocalEngine]) -> None:
     stubborn = f'setsid sh -c "trap \\"\\" TERM; sleep 600" & (setsid sleep 600 &); {STUBBORN}'
     handle = bench.ready(bench.gang(stubborn))
@@ -293,9 +291,7 @@ def escaped(bench: LocalBench) -> list[int]:
     return [int(text.split()[1]) for _, text in bench.printed() if text.startswith("escaped ")]
 
 
-def test_a_gang_with_a_process_that_can_not_be_killed_is_not_stopped_until_it_is_gone(
-    bench: LocalBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gang_with_an_unkillable_process_is_not_stopped(bench: LocalBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
     handle = bench.ready(bench.gang(f"env -i setsid sh -c 'echo escaped $$; exec sleep 600' & {WAIT}", nodes=1))
     wait_for(lambda: escaped(bench), 10, "the process")

@@ -15,7 +15,7 @@ from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from orchestrator.domain.hosts import Host, Limit, Queued
 from orchestrator.domain.resources import Resources
-from orchestrator.engines import registry
+from orchestrator.engines import registry, runner
 from orchestrator.engines.api import Engine, Handle, NotYet, Setting
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.testing.fake import FakeEngine
@@ -24,7 +24,8 @@ from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 from tests.conftest import submit_gang, wait_for
 from tests.support.definitions import container, multinode
-from tests.support.orchestrator.jobs import await_status, detail, serving
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
+from tests.support.processes import end_all
 
 
 class Hanging(FakeEngine):
@@ -61,6 +62,7 @@ def client(hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     with serving(tmp_path, engines=("local", "fake")) as client:
         yield client
         hanging.answers.set()
+    end_all(tmp_path)
 
 
 def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(client: Client, hanging: Hanging) -> None:
@@ -80,6 +82,32 @@ def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(clie
     assert hanging.threads == {"engine fake"}
     with pytest.raises(ApiError, match="the largest host has 8 CPUs"):
         client.post("/api/plan", large)
+
+
+def test_an_engine_that_hangs_later_delays_no_gang_of_another_engine(
+    client: Client, hanging: Hanging, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(runner, "OVERDUE", 1.0)
+    hanging.answers.set()
+    running = submit_gang(client, FOREVER)
+    await_status(client, running, "RUNNING")
+    wait_for(lambda: len(client.get("/api/capacity")["hosts"]) > 1, 20, "the hosts of both")
+    hanging.answers.clear()
+    hung = submit_gang(client, "pass", queue="fake")
+    said = "the fake engine has not answered since "
+    wait_for(lambda: said in detail(client, hung)["statusReason"], 30, "the reason")
+    # all of this while one call to the engine is in the air
+    await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
+    await_status(client, submit_gang(client, FOREVER, timeout=60), "RUNNING")
+    hosts = {host["name"].partition("/")[0] for host in client.get("/api/capacity")["hosts"]}
+    assert hosts == {"localhost", "fake"}
+    planned = client.post("/api/plan", {"definition": multinode("planned", container(cpus="1")), "queue": "fake"})
+    assert (planned["engine"], len(planned["nodes"])) == ("fake", 1)
+    client.batch("TerminateJob", jobId=running, reason="enough")
+    await_status(client, running, "FAILED")
+    assert detail(client, hung)["status"] in ("RUNNABLE", "STARTING")
+    told = [record for record in caplog.records if said in record.getMessage()]
+    assert len(told) == 1 and told[0].exc_info is None
 
 
 def test_a_stop_that_is_not_answered_is_the_job_s_reason_and_tried_again(client: Client, hanging: Hanging) -> None:

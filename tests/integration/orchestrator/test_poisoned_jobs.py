@@ -77,7 +77,7 @@ GOES_WRONG = {
 
 
 @pytest.mark.parametrize("call", GOES_WRONG)
-def test_a_bug_of_an_engine_holds_up_one_job_and_is_logged_once(
+def test_a_bug_of_an_engine_holds_up_one_job_logged_once(
     bench: Bench, caplog: pytest.LogCaptureFixture, call: str
 ) -> None:
     began = time.monotonic()

@@ -86,9 +86,7 @@ def ended(inside: Server) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("value", ["{broken", "null", "[]"])
-def test_a_damaged_row_harms_itself_alone(
-    inside: Server, http: httpx.Client, ended: tuple[str, str], value: str
-) -> None:
+def test_a_damaged_row_harms_no_other(inside: Server, http: httpx.Client, ended: tuple[str, str], value: str) -> None:
     broken, whole = ended
     home = Path(str(inside.reconciler.database.volume))
     [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", broken)
@@ -148,7 +146,7 @@ def test_a_start_that_fails_stops_no_other_and_is_tried_again(home: Path, caplog
 
 
 @pytest.mark.parametrize("how", ["moved away", "replaced"])
-def test_without_its_database_the_controller_says_so_and_accepts_nothing_until_it_is_back(
+def test_without_its_database_a_controller_accepts_nothing(
     home: Path, caplog: pytest.LogCaptureFixture, how: str
 ) -> None:
     database, away = home / "muster.db", home / "away.db"

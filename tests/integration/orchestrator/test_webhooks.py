@@ -124,7 +124,7 @@ def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serv
     assert SECRET not in everything and "a-path-that-is-secret" not in everything
 
 
-def test_an_undeliverable_message_is_given_up_after_the_last_try_and_shown(
+def test_an_undeliverable_message_is_given_up(
     tmp_path: Path, receiver: Receiver, caplog: pytest.LogCaptureFixture
 ) -> None:
     receiver.answers = [500, 503, 404]
@@ -167,9 +167,7 @@ def test_a_receiver_that_answers_a_byte_at_a_time_is_left_after_the_deadline_of_
         assert dripping.drip.wait(30), "the connection is closed, not kept"
 
 
-def test_an_unknown_queue_is_told_with_the_nearest_at_the_start(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_unknown_queue_is_named_with_the_nearest_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     chat = {"url": "http://127.0.0.1:1/", "queues": ["default", "defualt"]}
     file = write_webhooks(tmp_path / "hooks.json", chat=chat)
     server = Server(tmp_path / "home", cpus=1, webhooks=file)

@@ -230,9 +230,7 @@ BY_ENGINE = "a node is started by one of Muster's engines"
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
     ],
 )
-def test_a_broken_contract_is_told_in_a_line(
-    node: Nodes, tmp_path: Path, change: dict[str, str | None], said: str
-) -> None:
+def test_a_broken_contract_is_one_line(node: Nodes, tmp_path: Path, change: dict[str, str | None], said: str) -> None:
     n = node()
     for name, value in change.items():
         if value is None:
