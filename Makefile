@@ -55,7 +55,7 @@ robots: $(READY) robots-kernels
 	$(PYTEST) tests/robots
 
 services: $(READY) kernels tracking
-	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_bundle_parts.py
+	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py
 
 # pictures of the pages are left in build/console
 console: $(READY) kernels

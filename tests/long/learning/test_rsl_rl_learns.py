@@ -18,9 +18,10 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 from torch import nn
 
+from tests.support.worker.loop import groups
 from tests.support.worker.point_task import PointConfig
 from tests.support.worker.ranks import run_ranks
-from tests.support.worker.rsl_loop import GroupedPoint, Recall, build, evaluate, seen, train
+from tests.support.worker.rsl_loop import GroupedPoint, Recall, build, evaluate, train
 from worker.distributed import Placement, connect
 from worker.learning.algorithm import Share
 from worker.learning.randomness import seed_generators
@@ -115,7 +116,7 @@ def test_symmetry_makes_a_policy_that_acts_alike_on_both_sides() -> None:
         task = cartpole()
         algorithm = learner(task, {"num_steps_per_env": 16, "algorithm": {"symmetry_cfg": symmetry}})
         train(algorithm, task, 30)
-        there = seen(task)
+        there = groups(task)
         here = algorithm.policy().act(there)
         mirrored = algorithm.policy().act(TensorDict({key: -value for key, value in there.items()}, [64]))
         unlike[name] = float((here + mirrored).abs().mean() / here.abs().mean())

@@ -115,10 +115,7 @@ class Sliders(DeclaredTask):
                     "target": Observation(terms.command_number, names=("target",)),
                     "last": Observation(terms.last_action),
                 },
-                "critic": {
-                    "place": Observation(terms.joint_position),
-                    "count": Observation(counted),
-                },
+                "critic": {"place": Observation(terms.joint_position), "count": Observation(counted)},
             },
             "rewards": {
                 "place": Reward(terms.joint_position, joints="first"),

@@ -35,6 +35,11 @@ def setting_of(task: Any, seed: int = 0, gang: Gang | None = None, share: Share 
     return Setting(spaces_of(task), share or every, gang or alone(), seed)
 
 
+def transition_of(task: Any) -> Transition:
+    """What the task's last step gave."""
+    return Transition(groups(task), groups(task, terminal=True), task.rewards, task.dones, task.time_outs)
+
+
 def iterate(algorithm: Algorithm, task: Any, first: int, last: int) -> Mapping[str, torch.Tensor]:
     """Iterations ``[first, last)``; the metrics of the last one."""
     metrics: Mapping[str, torch.Tensor] = {}
@@ -42,8 +47,7 @@ def iterate(algorithm: Algorithm, task: Any, first: int, last: int) -> Mapping[s
         algorithm.begin(iteration)
         for _ in range(algorithm.steps):
             task.step(algorithm.act(groups(task)))
-            ended = groups(task, terminal=True)
-            algorithm.record(Transition(groups(task), ended, task.rewards, task.dones, task.time_outs))
+            algorithm.record(transition_of(task))
         metrics = algorithm.learn(groups(task))
     return metrics
 

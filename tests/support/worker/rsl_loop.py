@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 
+from tests.support.worker.loop import groups, setting_of, transition_of
 from tests.support.worker.point_task import Point, PointConfig
-from worker.distributed import Gang, Placement
+from worker.distributed import Gang
 from worker.learning import algorithms
-from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.algorithm import Share
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.rsl.algorithm import RslRl
 from worker.learning.rsl.settings import RslRlConfig
 from worker.tasks.config import TaskConfig
+
+GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "hidden_dims": [8], "obs_normalization": True}
+"""A small network with memory."""
 
 
 class GroupedPoint(Point):
@@ -27,16 +32,6 @@ class GroupedPoint(Point):
         self.terminal_groups = {"policy": self.terminal_observations, "critic": self.terminal_observations}
 
 
-def alone() -> Gang:
-    """A gang of one rank on the CPU."""
-    return Gang(Placement(), "cpu", None, ["here"])
-
-
-def spaces_of(task: Any) -> Spaces:
-    """What goes into a policy for ``task``, and what comes out of it."""
-    return Spaces({name: tuple(group.shape[1:]) for name, group in task.groups.items()}, task.action_size)
-
-
 def settings(section: dict[str, Any]) -> RslRlConfig:
     """The settings of a job's ``rsl_rl`` section, as a rank reads them."""
     read: RslRlConfig = algorithms.settings(RslRl, "rsl_rl", TaskConfig(), {"rsl_rl": section})  # type: ignore[type-abstract]
@@ -45,15 +40,8 @@ def settings(section: dict[str, Any]) -> RslRlConfig:
 
 def build(task: Any, section: dict[str, Any], gang: Gang | None = None, share: Share | None = None) -> RslRl:
     """The algorithm that a job's ``rsl_rl`` section describes, for ``task``."""
-    gang, count = gang or alone(), task.world_count
-    share = share or Share(0, count, count)
-    setting = Setting(spaces_of(task), share, gang, seed=1, control_seconds=1.0 / task.config.control_hz)
-    return RslRl(settings(section), setting)
-
-
-def seen(task: Any) -> TensorDict:
-    """The task's observations: its own buffers."""
-    return TensorDict(dict(task.groups), batch_size=[task.world_count])
+    setting = setting_of(task, 1, gang, share)
+    return RslRl(settings(section), dataclasses.replace(setting, control_seconds=1.0 / task.config.control_hz))
 
 
 def train(algorithm: RslRl, task: Any, iterations: int, done: int = 0) -> list[dict[str, float]]:
@@ -63,11 +51,10 @@ def train(algorithm: RslRl, task: Any, iterations: int, done: int = 0) -> list[d
         algorithm.begin(iteration)
         rewards = 0.0
         for _ in range(algorithm.steps):
-            task.step(algorithm.act(seen(task)))
-            ended = TensorDict(dict(task.terminal_groups), batch_size=[task.world_count])
-            algorithm.record(Transition(seen(task), ended, task.rewards, task.dones, task.time_outs))
+            task.step(algorithm.act(groups(task)))
+            algorithm.record(transition_of(task))
             rewards += float(task.rewards.mean()) / algorithm.steps
-        metrics = algorithm.learn(seen(task))
+        metrics = algorithm.learn(groups(task))
         records.append({"reward": rewards, **{name: float(value) for name, value in metrics.items()}})
     return records
 
@@ -79,7 +66,7 @@ def evaluate(policy: Any, task: Any) -> tuple[float, float]:
     running = torch.ones(task.world_count)
     returns, lengths = torch.zeros(task.world_count), torch.zeros(task.world_count)
     for _ in range(task.max_episode_length):
-        task.step(policy.act(seen(task)))
+        task.step(policy.act(groups(task)))
         policy.reset(task.dones)
         returns += running * task.rewards
         lengths += running

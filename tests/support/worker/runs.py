@@ -10,8 +10,9 @@ import torch
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
+from tests.support.worker.loop import alone
 from tests.support.worker.point_task import Point
-from worker.distributed import Gang, Placement
+from worker.distributed import Gang
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.training import Training
@@ -23,7 +24,7 @@ def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | No
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
     training = Training.of(job, Point)  # type: ignore[arg-type]
-    return Loop(training, gang or Gang(Placement(), "cpu", None, ["here"]), stop or StopRequest())
+    return Loop(training, gang or alone(), stop or StopRequest())
 
 
 def train(env: dict[str, str], gang: Gang | None = None) -> Loop:

@@ -1,8 +1,9 @@
-"""What makes a class an algorithm, and what is done before one is built."""
+"""What makes a class an algorithm, what a rank says of a job that nobody checked, and what is done before an algorithm is built."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,10 +14,12 @@ import torch
 import warp
 
 from tests.conftest import REPOSITORY
+from tests.support.refusals import refusal
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import Point, PointConfig
 from worker.distributed import Gang
 from worker.errors import UserError
+from worker.learning import algorithms
 from worker.learning.algorithm import Share
 from worker.learning.algorithms import (
     check_actions,
@@ -27,6 +30,7 @@ from worker.learning.algorithms import (
     installed,
     settings,
 )
+from worker.learning.job import Job
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo import draws, objective
 from worker.learning.sac import kernels
@@ -124,3 +128,55 @@ def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algori
 def test_the_common_modules_import_no_algorithm() -> None:
     told = "import sys, worker.learning.setup as s; sys.exit(any(n.startswith('worker.learning.ppo.d') for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", told], cwd=REPOSITORY).returncode == 0
+
+
+ENVIRONMENT = {"MUSTER_STORE": "/store", "MUSTER_RUN": "run"}
+
+
+def read(train: dict[str, Any], **spec: Any) -> Job:
+    return Job.from_env({**ENVIRONMENT, "MUSTER_SPEC": json.dumps({"train": train, **spec})}, "train")
+
+
+@pytest.mark.parametrize(
+    ("train", "said"),
+    [
+        ({"ppo": 5}, "train.ppo: expected a mapping, found a whole number (5)"),
+        ({"algorithm": "sac", "sac": [1]}, "train.sac: expected a mapping, found a list"),
+        ({"algorithm": "my:Mine", "settings": "x"}, "train.settings: expected a mapping, found a text ('x')"),
+        ({"config": True}, "train.config: expected a mapping, found true or false (True)"),
+        ({"algorithm": 5}, "train.algorithm: expected a text, found a whole number (5)"),
+        ({"algorithm": None}, "train.algorithm: expected a text, found nothing"),
+    ],
+)
+def test_an_invalid_section_is_refused_in_one_line(train: dict[str, Any], said: str) -> None:
+    assert refusal(read, train, error=UserError) == said
+
+
+def test_an_invalid_section_of_the_spec_is_refused_too() -> None:
+    with pytest.raises(UserError, match=r"^checkpoint: expected a mapping, found a whole number \(5\)$"):
+        read({"task": "Ant"}, checkpoint=5)
+    assert read({"task": "Ant", "ppo": None, "config": {}}, checkpoint=None).section["task"] == "Ant"
+
+
+@pytest.mark.parametrize("name", [":X", "my_module:", "", "pp", "a b:C", ".:C"])
+def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) -> None:
+    assert refusal(find_algorithm, name, error=UserError) == (
+        f"train.algorithm: no algorithm is called {name!r}; known: ppo, rsl_rl, sac, and module:Class of your own"
+    )
+
+
+def test_an_uninstalled_source_tree_has_its_own_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = algorithms.installed()
+    monkeypatch.setattr(algorithms, "entry_points", lambda group: ())
+    assert algorithms.installed() == there and there["ppo"] == "worker.learning.ppo.fused:PPO"
+
+
+def test_settings_and_the_check_of_a_reward_function_import_neither_torch_nor_warp() -> None:
+    code = (
+        "import sys, worker.learning.ppo.settings, worker.learning.sac.settings, worker.learning.rsl.settings, "
+        "worker.racer.rewards.__main__; print(*sys.modules)"
+    )
+    command = [sys.executable, "-c", code]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True, cwd=REPOSITORY).stdout.split()
+    assert "worker.racer.rewards.translation.body" in loaded
+    assert not {"torch", "warp", "numpy", "newton"} & set(loaded)

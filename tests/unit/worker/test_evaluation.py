@@ -18,7 +18,7 @@ from shared_store.evaluations import lines
 from shared_store.files import write_json
 from shared_store.layout import Run, Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
-from worker.distributed import Gang, Placement
+from tests.support.worker.loop import alone
 from worker.evaluation.blocks import SIZE, Blocks
 from worker.evaluation.episodes import Episodes, Stopped, play
 from worker.evaluation.evaluation import best_words, result_of
@@ -29,7 +29,7 @@ from worker.tasks.configs.cartpole import CartpoleConfig
 from worker.tasks.declaration import Declaration, Metric
 from worker.tasks.ended import Ended
 
-GANG = Gang(Placement(), "cpu", None, ["here"])
+GANG = alone()
 
 
 class Push:
@@ -108,42 +108,23 @@ class Judged(Cartpole):
     says: str | None = None
 
     def declare(self, config: CartpoleConfig) -> Declaration:
-        declared = super().declare(config)
         metrics = {"speed": Metric(terms.joint_velocity_squared, joints="slider")}
-        return Declaration(
-            **{
-                **{
-                    name: getattr(declared, name)
-                    for name in ("actions", "observations", "rewards", "terminations", "events")
-                }
-            },
-            metrics=metrics,
-            success=self.says,
-        )
+        return replace(super().declare(config), metrics=metrics, success=self.says)
 
 
-class ByMetric(Judged):
-    says = "speed"
-
-
-class ByTermination(Judged):
-    says = "dropped_pole"
-
-
-class Misspelt(Judged):
-    says = "sped"
+def judged(says: str) -> type[Judged]:
+    return type("Judged", (Judged,), {"says": says})
 
 
 def test_a_success_is_a_metric_above_0_in_the_last_step_or_a_termination(task: Cartpole) -> None:
-    moving = play([ByMetric(task.config, 6, seed=3)], Push(), GANG)
-    assert (
-        moving.successes is not None and moving.successes.all() and moving.success == "speed above 0 in the last step"
-    )
-    fallen = play([ByTermination(task.config, 6, seed=3)], Push(), GANG)
+    moving = play([judged("speed")(task.config, 6, seed=3)], Push(), GANG)
+    assert moving.success == "speed above 0 in the last step"
+    assert moving.successes is not None and moving.successes.all()
+    fallen = play([judged("dropped_pole")(task.config, 6, seed=3)], Push(), GANG)
     assert fallen.successes is not None and fallen.success == "dropped_pole ended the episode"
     assert fallen.successes.tolist() == [end == "dropped_pole" for end in fallen.ends]
     # of a metric the table has its mean over the steps
-    other = ByMetric(task.config, 6, seed=3)
+    other = judged("speed")(task.config, 6, seed=3)
     other.reset()
     total, length = 0.0, int(moving.lengths[0])
     for _ in range(length):
@@ -152,15 +133,12 @@ def test_a_success_is_a_metric_above_0_in_the_last_step_or_a_termination(task: C
     assert float(moving.term("metric_speed")[0]) == pytest.approx(total / length, rel=1e-5)
 
 
-def test_a_success_that_names_nothing_is_refused_with_the_nearest_name() -> None:
+def test_a_success_that_names_nothing_is_refused_and_a_task_without_terminations_has_none() -> None:
     with pytest.raises(ValueError, match=r"success: no metric and no termination is called sped; did you mean speed\?"):
-        Misspelt.sketch(config())
-
-
-def test_a_task_without_terminations_has_no_success() -> None:
+        judged("sped").sketch(config())
+    flags, causes = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
     names = ["time_out", "physics_failed", "terminated"]
-    sums, flags = torch.zeros(1, 2), torch.zeros(1, dtype=torch.bool)
-    without = Ended(sums, torch.zeros(1, dtype=torch.int32), flags, names, [], None, False)
+    without = Ended(torch.zeros(1, 2), causes, flags, names, [], None, False)
     assert not without.says_success and without.meaning == "the task does not say"
 
 
@@ -205,21 +183,16 @@ def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
     assert "compared" not in first and first["table"] == "00000003-e1-first-jo.parquet"
     fell = played.ends.count("dropped_pole")
     assert first["causes"]["dropped_pole"]["count"] == fell and first["success"]["count"] == 6 - fell
-    assert (
-        first["rewards"]["fall"]["mean"] == pytest.approx(-2.0 * fell / 6)
-        and first["rewards"]["fall"]["weight"] == -2.0
-    )
+    falls = first["rewards"]["fall"]
+    assert falls["mean"] == pytest.approx(-2.0 * fell / 6) and falls["weight"] == -2.0
     second = result_of(task, played, "00000006-e1", 7, 0.0).write(run, "second-job", config={"angle_limit": 0.3})
     assert second["compared"]["checkpoint"] == "00000003-e1" and second["compared"]["other_worlds"]
-    assert (
-        second["compared"]["return"]["difference"] == 0.0 and second["compared"]["return"]["verdict"] == "within noise"
-    )
-    assert "method" not in second["compared"]["return"], "the worlds are others"
+    compared = second["compared"]["return"]
+    assert compared["difference"] == 0.0 and compared["verdict"] == "within noise"
+    assert "method" not in compared, "the worlds are others"
     third = result_of(task, played, "00000009-e1", 7, 0.0).write(run, "third-job", config={"angle_limit": 0.3})
-    assert third["compared"]["return"] == {
-        **{"difference": 0.0, "low": 0.0, "high": 0.0, "verdict": "within noise"},
-        **{"method": "paired", "pairs": 6},
-    }
+    same = {"difference": 0.0, "low": 0.0, "high": 0.0, "verdict": "within noise", "method": "paired", "pairs": 6}
+    assert third["compared"]["return"] == same
     last = list(lines(json.loads(json.dumps(third))))[-1]
     assert last.endswith(": return +0.00 (+0.00 to +0.00, paired over 6 episodes): within noise"), last
     (run.evaluations / third["table"]).unlink()
@@ -254,10 +227,8 @@ def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_it
     os.waitpid(pid, 0)
     assert not half.exists() and list(run.evaluations.glob("*.json")) == []
     result_of(task, played, "00000003-e1", 7, 0.0).write(run, "job", config={})
-    assert sorted(path.name for path in run.evaluations.iterdir()) == [
-        "00000003-e1-job.json",
-        "00000003-e1-job.parquet",
-    ]
+    left = sorted(path.name for path in run.evaluations.iterdir())
+    assert left == ["00000003-e1-job.json", "00000003-e1-job.parquet"]
 
 
 def test_the_end_of_a_training_names_the_best_checkpoint_once_there_is_one_to_compare_it_with(tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ from worker.evaluation.statistics import Sample, difference, share
 
 def test_the_interval_of_a_mean_is_student_s() -> None:
     found = Sample.of(torch.tensor([2.0, 4.0, 4.0, 6.0], dtype=torch.float64)).describe()
-    half = (
-        3.182446305 * math.sqrt(8 / 3) / 2
-    )  # t of 3 degrees of freedom; squares of deviations 8, n - 1 = 3, root of n = 2
+    # t of 3 degrees of freedom; squares of deviations 8, n - 1 = 3, root of n = 2
+    half = 3.182446305 * math.sqrt(8 / 3) / 2
     assert found["mean"] == 4.0 and found["std"] == pytest.approx(math.sqrt(8 / 3))
     assert (found["low"], found["high"]) == (pytest.approx(4.0 - half), pytest.approx(4.0 + half))
     assert Sample.of(torch.tensor([3.0])).describe() == {"mean": 3.0, "std": None, "low": None, "high": None}
@@ -43,6 +42,10 @@ def test_a_difference_is_welch_s() -> None:
     assert (found["low"], found["high"]) == (pytest.approx(5 - half, abs=1e-3), pytest.approx(5 + half, abs=1e-3))
     assert difference(old, new)["verdict"] == "worse"
     assert difference(Sample(10, 16.0, 4.0), old)["verdict"] == "within noise"
+    # samples without spread are distinguished unless they are equal
+    assert difference(Sample(9, 2.0, 0.0), Sample(9, 1.0, 0.0))["verdict"] == "better"
+    assert difference(Sample(9, 1.0, 0.0), Sample(9, 1.0, 0.0))["verdict"] == "within noise"
+    assert difference(Sample(1, 2.0, 0.0), Sample(9, 1.0, 1.0))["verdict"] == "unknown"
 
 
 def test_the_interval_of_paired_differences_is_student_s() -> None:
@@ -64,12 +67,5 @@ def test_episodes_are_paired_where_seed_task_and_changes_of_the_worlds_are_the_s
     assert are_paired(one, {**one, "config": None, "episodes": 9})
     for other in ({"seed": 8}, {"task": "Ant"}, {"config": {"angle_limit": 0.3}}):
         assert not are_paired(one, {**one, **other})
-    assert not are_paired({**one, "seed": None}, {**one, "seed": None}), (
-        "the ends of two trainings: each in its own worlds"
-    )
-
-
-def test_samples_without_spread_are_distinguished_unless_they_are_equal() -> None:
-    assert difference(Sample(9, 2.0, 0.0), Sample(9, 1.0, 0.0))["verdict"] == "better"
-    assert difference(Sample(9, 1.0, 0.0), Sample(9, 1.0, 0.0))["verdict"] == "within noise"
-    assert difference(Sample(1, 2.0, 0.0), Sample(9, 1.0, 1.0))["verdict"] == "unknown"
+    of_a_training = {**one, "seed": None}
+    assert not are_paired(of_a_training, of_a_training), "the ends of two trainings: each in its own worlds"

@@ -1,7 +1,8 @@
-"""What may become of a policy outside training: it is read back, and exported, or refused in one line."""
+"""What may become of a policy outside training: it is read back, and exported with all that a robot needs, or refused in one line."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 from pathlib import Path
@@ -12,35 +13,34 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+import yaml
 from tensordict import TensorDict
 from torch import nn
 
+import worker.tasks
 from shared_store.bundles import verify
 from shared_store.layout import Run
 from shared_store.policy_contract import Action, Command, Contract, Group, State, Term
-from tests.support.worker.rsl_loop import GroupedPoint, build, train
+from tests.support.worker.rsl_loop import GRU, GroupedPoint, build, train
 from tests.support.worker.sac import make, point
 from worker.deploy import bundle
-from worker.deploy.bundle import Files, bundle_files
-from worker.deploy.model import OnnxPolicy, metadata_of
+from worker.deploy.bundle import Files, _publish, bundle_files
+from worker.deploy.leapp_description import leapp_description
+from worker.deploy.model import OnnxPolicy, metadata_of, to_onnx
 from worker.deploy.parity import Recording
 from worker.deploy.rollouts import judge
 from worker.errors import TrainingError, UserError
 from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
+from worker.tasks.ant import Ant
+from worker.tasks.cartpole import Cartpole
+from worker.tasks.go1 import Go1Flat
 from worker.tasks.policy_contract import policy_contract
 
 torch.set_num_threads(1)
 FACTS = {"task": "Point", "algorithm": "mine:Mine", "policy": {"groups": {"policy": [2]}, "action_size": 2}}
-GRU = {
-    "class_name": "RNNModel",
-    "rnn_type": "gru",
-    "rnn_hidden_dim": 8,
-    "hidden_dims": [8],
-    "obs_normalization": True,
-    "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0},
-}
+RECURRENT = {**GRU, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
 
 
 class Sum(nn.Module):
@@ -121,7 +121,7 @@ def exported(run: Run, policy: Any, task: Any, rounds: int = 1) -> Path:
 def recurrent() -> Any:
     """A GRU that has learnt a little, so that its normaliser has seen something."""
     torch.manual_seed(0)  # whatever ran before in this process
-    algorithm = build(GroupedPoint(), {"actor": GRU, "critic": GRU, "num_steps_per_env": 8})
+    algorithm = build(GroupedPoint(), {"actor": RECURRENT, "critic": RECURRENT, "num_steps_per_env": 8})
     train(algorithm, GroupedPoint(), 3)
     return algorithm.policy()
 
@@ -203,7 +203,7 @@ def test_a_second_export_replaces_the_first_as_a_whole(tmp_path: Path) -> None:
     first = verify(exported(run, policy, point()))
     assert first["run"] == "run" and first["reward"] == 1.5 and first["versions"]["muster"]
     assert set(first["files"]) == {
-        *("README.md", "contract.json", "leapp.yaml", "parity.npz", "policy.onnx", "policy.pt", "report.json"),
+        *("README.md", "contract.json", "leapp.yaml", "parity.npz", "policy.onnx", "policy.pt", "report.json")
     }
     second = verify(exported(run, policy, point(), rounds=0))
     assert second["created"] > first["created"]
@@ -248,3 +248,105 @@ def test_settings_that_the_algorithm_does_not_take_any_more_are_told_in_one_line
     with pytest.raises(UserError, match=there) as caught:
         load_policy(checkpoint)
     assert "\n" not in str(caught.value)
+
+
+SUMMED_TERMS = (
+    Term("slope", "measured", 0, ("x",), ("1",), (1.0,), (0.0,), history=1),
+    Term("speed", "measured", 1, ("x",), ("m/s",), (2.0,), (0.0,), history=1),
+)
+SUMMED = Contract(
+    "Point",
+    "0.1.0",
+    50.0,
+    (Group("policy", "obs", (2,), "float32", SUMMED_TERMS),),
+    (Action("x", "effort", "N", 10.0, 0.0), Action("y", "effort", "N", 10.0, 0.0)),
+    ("x", "y"),
+    states=(State("total", "total_out", (2,)),),
+)
+
+
+def test_the_description_for_leapp_has_each_tensor_its_names_and_what_is_fed_back() -> None:
+    model = to_onnx(Summing(tells=True).module(), {})
+    described = yaml.safe_load(leapp_description(model, SUMMED))
+    pair = {"dtype": "float32", "shape": [1, 2], "type": "tensor"}
+    assert described["models"]["policy"]["inputs"] == [
+        {"name": "obs", **pair, "element_names": [None, ["slope/x", "speed/x"]]},
+        {"name": "total", **pair},
+    ]
+    assert described["models"]["policy"]["outputs"] == [
+        {"name": "actions", **pair, "element_names": [None, ["x", "y"]]},
+        {"name": "total_out", **pair},
+    ]
+    assert described["models"]["policy"]["parameters"]["sha256sum"] == hashlib.sha256(model).hexdigest()
+    assert described["pipeline"] == {
+        "configs": {"frequency": 50.0, "contract": "contract.json"},
+        "inputs": {"policy": ["obs"]},
+        "outputs": {"policy": ["actions"]},
+        "data_flow": {},
+        "feedback_flow": {"policy/total_out": ["policy/total"]},
+    }
+
+
+def test_numbers_of_earlier_steps_are_named_with_the_steps_since_then() -> None:
+    past = Term("speed", "measured", 0, ("x",), ("m/s",), (1.0,), (0.0,), history=2)
+    group = Group("policy", "obs", (2,), "float32", (past,))
+    contract = Contract("Point", "0.1.0", 50.0, (group,), (), ("left", "right"), discrete=True)
+    described = yaml.safe_load(leapp_description(to_onnx(Summing(tells=False).module(), {}), contract))
+    assert described["models"]["policy"]["inputs"][0]["element_names"] == [None, ["speed/x[-1]", "speed/x"]]
+    assert "element_names" not in described["models"]["policy"]["outputs"][0]  # one number, which of the choices
+
+
+def test_leapp_itself_runs_the_bundle_as_it_is_described_over_steps_and_a_reset(tmp_path: Path) -> None:
+    pytest.importorskip("leapp", reason="pip install 'muster[leapp]', or make services")
+    from leapp import InferenceManager
+
+    files = files_of(Summing(tells=True))
+    (tmp_path / "policy.onnx").write_bytes(files.onnx)
+    (tmp_path / "leapp.yaml").write_text(leapp_description(files.onnx, SUMMED))
+    manager = InferenceManager(str(tmp_path / "leapp.yaml"))
+    assert manager.inputs == ["policy/obs"] and manager.outputs == ["policy/actions"]
+    assert manager.feedback_inputs == ["policy/total"]
+    told = np.load(io.BytesIO(files.parity))
+    for world in range(3):
+        manager.reset()
+        for step in range(len(told["begins"])):
+            if told["begins"][step, world]:
+                manager.reset()
+            found = manager({"policy/obs": torch.from_numpy(told["obs"][step, world : world + 1])})
+            np.testing.assert_allclose(found["policy/actions"], told["actions"][step, world : world + 1], atol=1e-5)
+
+
+def bundle_of(tmp_path: Path, kind: Any) -> tuple[Path, dict[str, Any]]:
+    """A bundle of made-up policy files and of task ``kind``, whose worlds are not built: a robot is what its declaration says."""
+    task: Any = kind.__new__(kind)
+    task.config = kind.config_type()
+    files = Files(to_onnx(Summing(tells=False).module(), {}), b"", b"", {})
+    manifest = {"files": {}, "train": {}, "settings": {}}
+    checkpoint: Any = SimpleNamespace(name="00000004-e1", iteration=4, manifest=manifest)
+    run = Run(tmp_path / "run")
+    run.path.mkdir()
+    target = _publish(run, checkpoint, task, SUMMED, files, {})
+    return target, verify(target)
+
+
+def test_a_robot_of_musters_own_is_in_the_bundle_with_its_licence(tmp_path: Path) -> None:
+    target, manifest = bundle_of(tmp_path, Cartpole)
+    file = "cartpole.xml"
+    assert (target / "robot" / file).read_bytes() == Path(worker.tasks.__file__).with_name(file).read_bytes()
+    assert manifest["robot"] == {"source": file, "format": "mjcf", "licence": "Apache-2.0", "file": f"robot/{file}"}
+    assert f"robot/{file}" in manifest["files"]  # with its digest
+    said = (target / "README.md").read_text()
+    assert f"`robot/{file}` is the robot's model ({file}); its licence: Apache-2.0." in said
+    assert "The policy, the contract and the recordings belong to whoever trained the policy" in said
+
+
+@pytest.mark.parametrize(("kind", "package"), [(Ant, "newton"), (Go1Flat, "mjlab")])
+def test_a_robot_of_another_package_is_named_with_its_licence_and_not_copied(
+    tmp_path: Path, kind: Any, package: str
+) -> None:
+    target, manifest = bundle_of(tmp_path, kind)
+    assert not (target / "robot").exists() and manifest["robot"]["file"] is None
+    assert manifest["robot"]["package"].startswith(f"{package} ") and "Apache" in manifest["robot"]["licence"]
+    said = (target / "README.md").read_text()
+    assert "The robot's model is not in the bundle." in said and manifest["robot"]["licence"] in said
+    assert json.loads((target / "manifest.json").read_text())["robot"] == manifest["robot"]

@@ -11,9 +11,9 @@ import torch
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
+from tests.support.worker.loop import alone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
-from worker.distributed import Gang, Placement
 from worker.evaluation.evaluation import evaluate
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
@@ -31,15 +31,19 @@ def scores(iterations: list[tuple[int, float]], **settings: int) -> list[float |
     return found
 
 
-def test_early_falls_alone_make_no_score() -> None:
-    # episodes take up to 40 steps: what ends in the first 30 are falls
-    found = scores([(200, 1.0), (200, 1.0), (200, 1.0), (400, 21.0)], worlds=100, longest=40)
-    assert found == [None, None, None, pytest.approx(9.0)]
-
-
-def test_a_score_covers_an_episode_of_each_world_and_a_hundred_in_all() -> None:
-    assert scores([(150, 1.0), (150, 3.0)], worlds=300, longest=10) == [None, pytest.approx(2.0)]
-    assert scores([(4, 1.0)] * 24 + [(4, 26.0)], worlds=4, longest=10)[-2:] == [None, pytest.approx(2.0)]
+@pytest.mark.parametrize(
+    ("iterations", "worlds", "longest", "expected"),
+    [
+        # episodes take up to 40 steps: what ends in the first 30 are falls, which alone make no score
+        ([(200, 1.0)] * 3 + [(400, 21.0)], 100, 40, [None, None, None, 9.0]),
+        ([(150, 1.0), (150, 3.0)], 300, 10, [None, 2.0]),
+        ([(4, 1.0)] * 24 + [(4, 26.0)], 4, 10, [None] * 24 + [2.0]),
+    ],
+)
+def test_a_score_covers_an_episode_of_each_world_and_a_hundred_in_all(
+    iterations: list[tuple[int, float]], worlds: int, longest: int, expected: list[float | None]
+) -> None:
+    assert scores(iterations, worlds=worlds, longest=longest) == pytest.approx(expected)
 
 
 def test_a_score_follows_the_newest_episodes_and_one_lucky_iteration_is_not_the_best() -> None:
@@ -67,13 +71,9 @@ def test_a_score_with_old_records_without_squares_has_no_error_until_they_expire
         progress.count(10, 100, 100.0, 100.0, worlds=100, longest=20)
         found.append((progress.score, progress.score_error))
     assert found == [(1.0, None), (1.0, 0.0), (1.0, 0.0)]
-
-
-def test_only_what_the_score_needs_is_kept() -> None:
-    progress = Progress()
     for _ in range(1000):
         progress.count(10, 50, 50.0, 50.0, worlds=100, longest=40)
-    assert len(progress.recent) == 4
+    assert len(progress.recent) == 4, "only what the score needs is kept"
 
 
 def test_the_manifest_has_the_score_and_a_resumed_run_the_same(tmp_path: Path) -> None:
@@ -86,14 +86,11 @@ def test_the_manifest_has_the_score_and_a_resumed_run_the_same(tmp_path: Path) -
     assert straight["score_episodes"] == stopped["score_episodes"] >= 100
 
 
-# -- evaluation ------------------------------------------------------------------------------------------------------
-
-
 def cartpole(store: Path, epoch: int = 1, **train: Any) -> Loop:
     env = training(store, epoch=epoch, task="Cartpole", worlds=16, iterations=2, **train)
     job = Job.from_env(env, "train")
     raise_epoch(job.run, epoch)
-    return Loop(Training.of(job, Cartpole), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
+    return Loop(Training.of(job, Cartpole), alone(), StopRequest())
 
 
 def test_a_policy_is_evaluated_on_physics_that_training_did_not_see(tmp_path: Path) -> None:

@@ -43,32 +43,16 @@ def test_the_table_has_medians_and_ratios_to_muster() -> None:
     rows.append(record("mjlab", 500.0, limits="ours"))
     lines = [line for line in table.table(rows).splitlines() if line.startswith("| go1")]
     shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    assert [row[3] for row in shown] == [
-        "Muster",
-        "Muster (sac)",
-        "rsl_rl's runner on Muster",
-        "mjlab 1.6.0",
-        "mjlab 1.6.0",
-    ]
+    assert [row[3] for row in shown] == ["Muster", "Muster (sac)", "rsl_rl's runner on Muster", *["mjlab 1.6.0"] * 2]
     assert shown[0][4:] == ["3", "1,000 (900 to 1,300)", "–", "200 ms", "100 ms", "12.0 s", "3.0 s"]
-    assert [row[6] for row in shown[1:]] == [
-        "1.4 ×",
-        "2.5 ×",
-        "4.0 ×",
-        "–",
-    ]  # none of ours under the limits of the last
+    assert [row[6] for row in shown[1:]] == ["1.4 ×", "2.5 ×", "4.0 ×", "–"]  # none of ours under the last's limits
     assert [row[1] for row in shown[3:]] == ["theirs (10/20, 1e-08)", "ours (4/8, 1e-08)"]
 
 
 def test_the_table_says_when_muster_was_as_good_as_a_peer() -> None:
     def row(seconds: float, linear: float, angular: float, length: float) -> dict[str, float]:
-        return {
-            "seconds": seconds,
-            "env_steps": 1e6,
-            "linear_error": linear,
-            "angular_error": angular,
-            "length_share": length,
-        }
+        errors = {"linear_error": linear, "angular_error": angular, "length_share": length}
+        return {"seconds": seconds, "env_steps": 1e6, **errors}
 
     facts = {"case": "go1", "limits": "theirs", "judged_limits": "theirs", "seed": 0, "device": "a GPU"}
     theirs = {**facts, "peer": "mjlab", "rows": [row(300.0, 0.5, 0.5, 0.9), row(600.0, 0.2, 0.3, 0.98)]}
@@ -143,22 +127,21 @@ def test_a_converted_policy_acts_as_rsl_rl_says(tmp_path: Path, normalized: bool
 
 def test_files_other_than_policies_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.pt"
-    with pytest.raises(ValueError, match="there is no checkpoint"):
-        conversion.read_rsl_rl(path)
+
+    def refused(words: str, **options: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            conversion.check_fit(conversion.read_rsl_rl(path, **options), 48, 12, "Go1Flat")
+
+    refused("there is no checkpoint")
     path.write_bytes(b"no checkpoint")
-    with pytest.raises(ValueError, match="is no checkpoint of rsl_rl: "):
-        conversion.read_rsl_rl(path)
+    refused("is no checkpoint of rsl_rl: ")
     torch.save({"model_state_dict": {}}, path)
-    with pytest.raises(ValueError, match="it has no actor_state_dict, but model_state_dict"):
-        conversion.read_rsl_rl(path)
+    refused("it has no actor_state_dict, but model_state_dict")
     torch.save({"actor_state_dict": {"rnn.weight": torch.zeros(1)}}, path)
-    with pytest.raises(ValueError, match=r"its actor is no plain network, it has rnn\.weight"):
-        conversion.read_rsl_rl(path)
+    refused(r"its actor is no plain network, it has rnn\.weight")
     saved_actor(path)
-    with pytest.raises(ValueError, match="there is no activation 'elo'; did you mean elu"):
-        conversion.read_rsl_rl(path, activation="elo")
-    with pytest.raises(ValueError, match="the policy sees 7 values, task Go1Flat has 48"):
-        conversion.check_fit(conversion.read_rsl_rl(path), 48, 12, "Go1Flat")
+    refused("there is no activation 'elo'; did you mean elu", activation="elo")
+    refused("the policy sees 7 values, task Go1Flat has 48")
     layers = [(torch.zeros(4, 2), torch.zeros(4)), (torch.zeros(1, 3), torch.zeros(1))]
     with pytest.raises(ValueError, match="a layer of 4 outputs is followed by one of 3 inputs"):
         conversion.PlainPolicy(layers, None, None)
@@ -188,18 +171,18 @@ def interface(order: tuple[str, ...] = JOINTS, scale: float = 0.5, offset: float
 
 def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
     conversion.check_contract(CONTRACT, interface(), "Own")
-    with pytest.raises(ValueError, match="action 0 moves joint hip in mjlab and knee in task Own"):
-        conversion.check_contract(CONTRACT, interface(("knee", "hip")), "Own")
-    with pytest.raises(ValueError, match=r"joint knee: its scale is 0\.5 in mjlab and 0\.4 in task Own"):
-        conversion.check_contract(CONTRACT, interface(scale=0.4), "Own")
-    with pytest.raises(ValueError, match=r"joint knee: its offset is -0\.2 in mjlab and 0 in task Own"):
-        conversion.check_contract(CONTRACT, interface(offset=0.0), "Own")
     widths = CONTRACT["observations"]
-    with pytest.raises(ValueError, match="mjlab's policy sees 13 values, task Own has 12"):
-        conversion.check_contract(CONTRACT | {"observations": widths | {"command": 4}}, interface(), "Own")
+    wider = CONTRACT | {"observations": widths | {"command": 4}}
     turned = {name: widths[name] for name in ("joint_pos", "base_lin_vel", "joint_vel", "actions", "command")}
-    with pytest.raises(ValueError, match="mjlab sees joint_pos at 0 to 1, where task Own has velocity_x"):
-        conversion.check_contract(CONTRACT | {"observations": turned}, interface(), "Own")
+    for contract, own, words in (
+        (CONTRACT, interface(("knee", "hip")), "action 0 moves joint hip in mjlab and knee in task Own"),
+        (CONTRACT, interface(scale=0.4), r"joint knee: its scale is 0\.5 in mjlab and 0\.4 in task Own"),
+        (CONTRACT, interface(offset=0.0), r"joint knee: its offset is -0\.2 in mjlab and 0 in task Own"),
+        (wider, interface(), "mjlab's policy sees 13 values, task Own has 12"),
+        (CONTRACT | {"observations": turned}, interface(), "mjlab sees joint_pos at 0 to 1, where task Own has veloc"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            conversion.check_contract(contract, own, "Own")
 
 
 def test_vectors_turn_back_as_rotation_matrices_say() -> None:
@@ -222,13 +205,13 @@ def test_a_task_has_the_limits_of_its_case() -> None:
 
 
 def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration(tmp_path: Path) -> None:
-    shared = cases.find_case("go1").shared("muster", "ours")
+    shared = cases.find_case("ant").shared("muster", "ours")
     asked = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
-    loop = build_loop(asked, tmp_path, config={"substeps": 2})
+    loop = build_loop(asked, tmp_path, config={"substeps": 1})
     found = loop.task.solver_options
     loop.close()
-    assert (found["iterations"], found["ls_iterations"]) == (4, 8)
-    assert loop.config.substeps == 2 and list(loop.training.settings.hidden_sizes) == [8]
+    assert (found["iterations"], found["ls_iterations"]) == (3, 6)
+    assert loop.config.substeps == 1 and list(loop.training.settings.hidden_sizes) == [8]
 
 
 @pytest.mark.parametrize(
@@ -248,30 +231,18 @@ def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration
         ("table --records nowhere", "there are no records in nowhere"),
         ("environment mjlabs", "there is no environment 'mjlabs'; did you mean mjlab?"),
         ("environment mjlab --python nowhere", "nowhere is no Python that can be started"),
+        ("walking --task Ant", "--task Ant: it follows no velocity commands; there are Go1Flat, G1Flat"),
+        ("walking --task G1Flatt", "did you mean G1Flat?"),
+        ("walking --algorithm td3", "--algorithm td3: there are sac and ppo"),
+        ("walking --every 0", "--every 0.0: it is more than 0"),
+        ("walking --length 98", "--length 98.0: it is a share of the longest episode"),
     ],
 )
 def test_invalid_options_of_the_commands_are_refused(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     name, *arguments = words.split()
+    command = walking if name == "walking" else importlib.import_module(f"benchmarks.peers.{name}")
     with pytest.raises(SystemExit) as ended:
-        importlib.import_module(f"benchmarks.peers.{name}").main(arguments)
-    assert ended.value.code == 2 and said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--task Ant", "--task Ant: it follows no velocity commands; there are Go1Flat, G1Flat"),
-        ("--task G1Flatt", "did you mean G1Flat?"),
-        ("--algorithm td3", "--algorithm td3: there are sac and ppo"),
-        ("--every 0", "--every 0.0: it is more than 0"),
-        ("--length 98", "--length 98.0: it is a share of the longest episode"),
-    ],
-)
-def test_the_walking_benchmark_refuses_invalid_options(
-    words: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        walking.main(words.split())
+        command.main(arguments)
     assert ended.value.code == 2 and said in capsys.readouterr().err
 
 
@@ -316,7 +287,7 @@ def test_the_clock_notes_what_rsl_rls_runner_does(tmp_path: Path, monkeypatch: p
     clock.write(str(tmp_path / "found.json"), where=tmp_path)
     found = json.loads((tmp_path / "found.json").read_text())
     assert clock.runner is runner and found["where"] == str(tmp_path)
-    assert 5.0 <= found["startup_s"] < 120.0
+    assert found["startup_s"] >= 5.0
     assert [point["env_steps"] for point in found["curve"]] == [32, 64, 96, 128]
     times = [point["seconds"] for point in found["curve"]]
     assert times == sorted(times) and all(

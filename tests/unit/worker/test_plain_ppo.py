@@ -16,7 +16,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.support.worker.loop import alone, groups, iterate, mean_return, setting_of, spaces_of
+from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
@@ -54,13 +54,9 @@ def twins(setting: Setting, **settings: Any) -> tuple[PPO, Watched]:
 def assert_equal(fused: PPO, plain: Watched, learnt: tuple[dict[str, Any], dict[str, Any]]) -> None:
     """After an iteration: estimates, losses, learning rate, weights and moments."""
     rollout = fused.rollout
-    for name, its in (
-        ("values", "values"),
-        ("returns", "returns"),
-        ("advantages", "advantages"),
-        ("log_probs", "log_prob"),
-    ):
-        torch.testing.assert_close(plain.samples[name], getattr(rollout, its).flatten(), **ROUNDING, msg=name)
+    for name in ("values", "returns", "advantages", "log_prob"):
+        samples = plain.samples["log_probs" if name == "log_prob" else name]
+        torch.testing.assert_close(samples, getattr(rollout, name).flatten(), **ROUNDING, msg=name)
     one, other = ({name: float(value) for name, value in each.items()} for each in learnt)
     assert one.keys() == other.keys() >= {*LOSSES, "learning_rate", "action_std"}
     assert one["learning_rate"] == pytest.approx(other["learning_rate"], rel=1e-5)
@@ -133,22 +129,6 @@ def test_both_implementations_learn_the_same_on_random_data(settings: dict[str, 
         assert len(rates) > 1, "the rule was exercised"
 
 
-@pytest.mark.parametrize("settings", [{}, {"clip_values": False, "schedule": "fixed"}], ids=["as it is", "unlike"])
-def test_both_implementations_learn_the_same_on_the_point_task(settings: dict[str, Any]) -> None:
-    """Each has worlds of its own, which its own actions move: five iterations of three passes over four minibatches."""
-    torch.manual_seed(8)
-    tasks = [Point(PointConfig(episode_seconds=1.0), WORLDS, seed=2) for _ in range(2)]
-    fused, plain = twins(setting_of(tasks[0], seed=4), epochs=3, minibatches=4, **settings)
-    time_outs = falls = 0
-    for iteration in range(5):
-        learnt = iterate(fused, tasks[0], iteration, iteration + 1), iterate(plain, tasks[1], iteration, iteration + 1)
-        assert_equal(fused, plain, learnt)
-        time_outs += int(plain.samples["time_outs"].sum())
-        falls += int((plain.samples["dones"] & ~plain.samples["time_outs"]).sum())
-    torch.testing.assert_close(tasks[1].observations, tasks[0].observations, **OF_WEIGHTS)
-    assert time_outs >= WORLDS and falls > 0, "episodes of at most 10 steps, in 40 steps"
-
-
 class Part(Gang):
     """One of several ranks that are threads of this process."""
 
@@ -211,15 +191,6 @@ def test_two_ranks_learn_the_same_as_the_fused_one_alone() -> None:
     assert {name: float(value) for name, value in said.items()} == pytest.approx(
         {name: float(value) for name, value in learnt.items()}, rel=1e-3, abs=1e-5
     )
-
-
-def test_it_learns_the_point_task_by_itself() -> None:
-    torch.manual_seed(0)
-    task, held_out = Point(PointConfig(), 32, seed=0), Point(PointConfig(), 64, seed=99)
-    ppo = PlainPPO(PointPPO(), setting_of(task))
-    assert mean_return(ppo.policy(), held_out) < 9.0
-    iterate(ppo, task, 0, 60)
-    assert mean_return(ppo.policy(), held_out) > 14.0, "a point that is left alone gets −1.1"
 
 
 def test_it_goes_on_from_its_state_with_the_same_bits() -> None:

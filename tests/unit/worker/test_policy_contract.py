@@ -1,4 +1,4 @@
-"""The policy contract of a task: a stranger rebuilds the policy's observations and actions from the document alone."""
+"""The policy contract of a task: what the document says of its observations, commands and actions, and of a change of them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import pytest
 import torch
 import warp as wp
 
+from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from shared_store.policy_contract import Contract, differences, read
 from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
-from tests.support.worker.kernels.cartpole import Cartpole as CartpoleOfKernels
 from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.setup import check_contract
@@ -36,10 +36,11 @@ from worker.tasks import (
     reward_weights,
     terms,
 )
-from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.interface import Interface, motor
+from worker.tasks.interface import Observation as Seen
 from worker.tasks.policy_contract import policy_contract
 
-WORLDS, STEPS = 4, 12
+WORLDS = 4
 
 
 @pytest.fixture(scope="module")
@@ -51,51 +52,6 @@ def published(task: Any, exported: ExportedPolicy | None = None) -> Contract:
     return read(json.loads(json.dumps(policy_contract(task, type(task).__name__, exported).document())))
 
 
-def seen_by(
-    quantities: dict[str, list[torch.Tensor]], group: dict[str, Any], step: int, skip: set[str]
-) -> torch.Tensor:
-    """A stranger's observation of a step, from the document and what was measured until then (shape (worlds, columns) a step)."""
-    numbers = torch.full((WORLDS, group["shape"][0]), torch.nan)
-    for term in group["terms"]:
-        width = len(term["names"])
-        for place, back in enumerate(range(term["history"] - 1, -1, -1)):
-            if term["name"] in skip:
-                continue
-            value = quantities[term["name"]][max(0, step - back)] - torch.tensor(term["offset"])
-            if term["clip"]:
-                value = value.clamp(*term["clip"])
-            first = term["first"] + place * width
-            numbers[:, first : first + width] = value * torch.tensor(term["scale"])
-    return numbers
-
-
-def test_observations_are_rebuilt_from_the_document_alone(sliders: Sliders) -> None:
-    group = published(sliders).document()["groups"][0]
-    assert [term["name"] for term in group["terms"]] == ["place", "late", "noisy", "target", "last"]
-    sliders.reset()
-    measured: dict[str, list[torch.Tensor]] = {name: [] for name in ("place", "late", "target", "last")}
-    actions = torch.zeros(WORLDS, 2)
-    generator = torch.Generator().manual_seed(0)
-    compared = 0
-    begun = torch.zeros(WORLDS, dtype=torch.bool)
-    for step in range(STEPS):
-        measured["place"].append(wp.to_torch(sliders.worlds.arrays.joint_q).clone())
-        measured["late"].append(wp.to_torch(sliders.worlds.arrays.joint_qd)[:, :1].clone())
-        measured["target"].append(sliders.groups["policy"][:, 6:7].clone())  # the operator's own word
-        measured["last"].append(actions.clamp(-2.0, 2.0))
-        expected = seen_by(
-            measured, group, step, skip={"late", "noisy"}
-        )  # those that are late and noisy are another matter
-        known = ~expected.isnan()
-        found = torch.where(known, sliders.observations, expected)[~begun]
-        torch.testing.assert_close(found, expected[~begun], equal_nan=True)
-        compared += int(known[~begun].sum())
-        actions = torch.rand(WORLDS, 2, generator=generator) * 2.0 - 1.0
-        sliders.step(actions)
-        begun |= sliders.dones
-    assert compared > WORLDS * 4 * 5
-
-
 def test_a_term_s_function_and_numbers_are_in_the_contract(sliders: Sliders) -> None:
     contract = published(sliders)
     terms = {term.name: term for term in contract.groups[0].terms}
@@ -104,6 +60,10 @@ def test_a_term_s_function_and_numbers_are_in_the_contract(sliders: Sliders) -> 
     assert (place.scale, place.offset) == ((2.0, 1.0), (0.5, 0.0)) and place.clip == pytest.approx((-0.8, 0.8))
     assert (late.first, late.size, late.history, late.delay) == (2, 3, 3, (0, 2))
     assert (target.kind, target.command, target.ranges, target.units) == ("command", "target", ((-1.0, 1.0),), ("m",))
+    assert contract.groups[0].terms[-1].kind == "previous_action"
+    force = contract.actions[0]
+    assert (force.kind, force.scale, force.offset) == ("effort", 1.0, 0.5)
+    assert (force.clip, force.effort_limit) == ((-2.0, 2.0), 2.0)
     (command,) = contract.commands
     assert (command.name, command.names, command.ranges) == ("target", ("place",), ((-1.0, 1.0),))
     assert command.seconds == pytest.approx((0.3, 0.5))
@@ -112,9 +72,8 @@ def test_a_term_s_function_and_numbers_are_in_the_contract(sliders: Sliders) -> 
 
 
 def test_a_recurrent_policy_s_inputs_and_state_are_in_the_contract(sliders: Sliders) -> None:
-    exported: Any = SimpleNamespace(
-        sample={"critic": None}, inputs={"obs": torch.zeros(1, 3), "h": torch.zeros(1, 1, 8)}, states=["h"]
-    )
+    inputs = {"obs": torch.zeros(1, 3), "h": torch.zeros(1, 1, 8)}
+    exported: Any = SimpleNamespace(sample={"critic": None}, inputs=inputs, states=["h"])
     contract = published(sliders, exported)
     assert [(group.name, group.input, group.shape) for group in contract.groups] == [("critic", "obs", (3,))]
     assert [(state.name, state.output, state.shape) for state in contract.states] == [("h", "h_out", (1, 8))]
@@ -124,12 +83,16 @@ def test_a_recurrent_policy_s_inputs_and_state_are_in_the_contract(sliders: Slid
 def test_terms_in_torch_and_kernels_by_hand_have_the_same_document_with_less() -> None:
     both = published(TorchSliders(SlidersConfig(), 1)).groups[0].terms[0]
     assert (both.names, both.quantity, both.element) == (("both_0", "both_1"), "both", "")
-    cart = published(CartpoleOfKernels(CartpoleConfig(), 1))
-    assert [(term.names, term.units, term.quantity) for term in cart.groups[0].terms[:2]] == [
-        (("slider_position",), ("m",), ""),
-        (("hinge_position",), ("rad",), ""),
-    ]
-    assert cart.action_names == ("slider",) and cart.actions[0].scale == pytest.approx(cart.actions[0].effort_limit)
+
+    class Described(PendulumByHand):
+        def interface(self) -> Interface:
+            torque = motor(self.worlds.solver.mj_model, 0, "hinge", "N m", 0.0)
+            return Interface(tuple(map(Seen, self.observation_names, ("1", "1", "rad/s"))), (torque,))
+
+    swung = published(Described(PendulumConfig(), 1))
+    units = {term.names: (term.units, term.quantity) for term in swung.groups[0].terms[1:]}
+    assert units == {("sine",): (("1",), ""), ("velocity",): (("rad/s",), "")}
+    assert swung.action_names == ("hinge",) and swung.actions[0].scale == pytest.approx(swung.actions[0].effort_limit)
 
 
 class Other(Sliders):
@@ -188,6 +151,9 @@ LIMITED = """<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbo
   </body></body></worldbody></mujoco>"""
 
 
+SERVO = PositionActuator("*", 20.0, 0.5)
+
+
 @dataclass(frozen=True)
 class DrivenConfig(TaskConfig):
     control_hz: float = 50.0
@@ -219,27 +185,22 @@ def driven_by(function: Any, *actuators: Any, **options: Any) -> list[dict[str, 
 def test_gains_of_a_motor_whose_force_is_computed_are_its_own() -> None:
     motor = ExplicitPDActuator("*", {"first": 20.0, "second": 30.0}, 0.5, effort_limit=4.0)
     first, second = driven_by(terms.position_target, motor, kind="position", scale=0.25)
-    assert [(each["stiffness"], each["damping"], each["effort_limit"]) for each in (first, second)] == [
-        (20.0, 0.5, 4.0),
-        (30.0, 0.5, 4.0),
-    ]
+    gains = [(each["stiffness"], each["damping"], each["effort_limit"]) for each in (first, second)]
+    assert gains == [(20.0, 0.5, 4.0), (30.0, 0.5, 4.0)]
     assert (first["scale"], first["unit"], second["unit"], first["rule"]) == (0.25, "rad", "m", "")
 
 
 def test_a_share_of_a_range_becomes_scale_and_offset_within_limits() -> None:
     """value = 0.5 a + 0.2, within ±1, is a share of [-3, 1]: the target is -1 + 2 value."""
-    servo = PositionActuator("*", 20.0, 0.5)
-    first, second = driven_by(
-        terms.share_of_range_target, servo, kind="position", scale=0.5, offset=0.2, clip=(-2.0, 2.0)
-    )
+    options: dict[str, Any] = {"kind": "position", "scale": 0.5, "offset": 0.2, "clip": (-2.0, 2.0)}
+    first, second = driven_by(terms.share_of_range_target, SERVO, **options)
     assert (first["scale"], first["offset"]) == pytest.approx((1.0, -0.6))
     assert (second["scale"], second["offset"]) == pytest.approx((0.5, 1.2))
     assert first["clip"] == pytest.approx([-2.0, 1.6]) and first["rule"] == ""
 
 
 def test_a_rule_beyond_scale_and_offset_is_given_in_words() -> None:
-    servo = PositionActuator("*", 20.0, 0.5)
-    first, _ = driven_by(terms.smoothed_position_target, servo, kind="position", share=0.25)
+    first, _ = driven_by(terms.smoothed_position_target, SERVO, kind="position", share=0.25)
     assert first["rule"].startswith("A position target that follows ``value`` slowly: t = share * value")
     assert first["rule"].endswith("(share = 0.25)")
 
@@ -252,11 +213,11 @@ def press(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value
 @pytest.mark.parametrize(
     ("function", "actuator", "kind", "unit"),
     [
-        (terms.position_target, PositionActuator("*", 20.0, 0.5), "position", "rad"),
+        (terms.position_target, SERVO, "position", "rad"),
         (terms.position_target, ExplicitPDActuator("*", 20.0, 0.5), "position", "rad"),
         (terms.velocity_target, VelocityActuator("*", 0.5), "velocity", "rad/s"),
         (terms.effort, EffortActuator("*"), "effort", "N m"),
-        (press, PositionActuator("*", 20.0, 0.5), "position", "rad"),
+        (press, SERVO, "position", "rad"),
     ],
 )
 def test_an_action_is_what_its_function_writes_or_else_what_its_actuators_take(
@@ -266,47 +227,27 @@ def test_an_action_is_what_its_function_writes_or_else_what_its_actuators_take(
     assert (first["kind"], first["unit"]) == (kind, unit)
 
 
-SERVO = PositionActuator("*", 20.0, 0.5)
-
-
 @pytest.mark.parametrize(
-    ("function", "actuator", "options", "words"),
+    ("function", "actuator", "kind", "writes", "takes", "another"),
     [
-        (
-            terms.effort,
-            SERVO,
-            {},
-            "effort writes an effort, and the actuator of joint first takes a position; use terms.position_target, "
-            "or give the joint an EffortActuator",
-        ),
-        (
-            terms.position_target,
-            EffortActuator("*"),
-            {},
-            "position_target writes a position, and the actuator of joint first takes an effort; use terms.effort, "
-            "or give the joint a PositionActuator",
-        ),
-        (
-            press,
-            SERVO,
-            {"kind": "velocity"},
-            "press writes a velocity, and the actuator of joint first takes a position; use terms.position_target, "
-            "or give the joint a VelocityActuator",
-        ),
-        (
-            terms.position_target,
-            SERVO,
-            {"kind": "effort"},
-            "kind is 'effort', and position_target writes a position; leave kind= out",
-        ),
+        (terms.effort, SERVO, None, "an effort", "a position", "an EffortActuator"),
+        (terms.position_target, EffortActuator("*"), None, "a position", "an effort", "a PositionActuator"),
+        (press, SERVO, "velocity", "a velocity", "a position", "a VelocityActuator"),
     ],
 )
 def test_an_action_that_its_actuators_do_not_take_is_refused(
-    function: Any, actuator: Any, options: dict[str, Any], words: str
+    function: Any, actuator: Any, kind: str | None, writes: str, takes: str, another: str
 ) -> None:
     with pytest.raises(ValueError) as refused:
-        driven_by(function, actuator, **options)
-    assert str(refused.value).endswith(f"actions.drive: {words}")
+        driven_by(function, actuator, **({"kind": kind} if kind else {}))
+    use = {"a position": "terms.position_target", "an effort": "terms.effort"}[takes]
+    words = f"writes {writes}, and the actuator of joint first takes {takes}; use {use}, or give the joint {another}"
+    assert str(refused.value).endswith(f"actions.drive: {function.func.__name__} {words}")
+
+
+def test_the_kind_of_an_action_is_what_its_function_writes() -> None:
+    with pytest.raises(ValueError, match=r"kind is 'effort', and position_target writes a position; leave kind= out$"):
+        driven_by(terms.position_target, SERVO, kind="effort")
 
 
 def test_an_action_of_ones_own_for_actuators_that_take_different_things_is_refused() -> None:

@@ -14,8 +14,8 @@ from rsl_rl.storage.rollout_storage import RolloutStorage
 from tensordict import TensorDict
 from torch.distributions import Normal
 
+from tests.support.worker.loop import alone, iterate, transition_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
-from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.ppo import linear
 from worker.learning.ppo.fused import PPO
@@ -23,10 +23,6 @@ from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipp
 from worker.learning.ppo.objective import Objective
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.randomness import mix_seed
-
-
-def alone() -> Gang:
-    return Gang(Placement(), "cpu", None, ["here"])
 
 
 def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bool = False, **settings: object) -> PPO:
@@ -38,11 +34,6 @@ def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bo
 
 def groups(observations: torch.Tensor) -> TensorDict:
     return TensorDict({"policy": observations, "critic": observations}, [len(observations)])
-
-
-def transition(task: Point) -> Transition:
-    ended = groups(task.terminal_observations)
-    return Transition(groups(task.observations), ended, task.rewards, task.dones, task.time_outs)
 
 
 class FirstComponent(torch.nn.Module):
@@ -112,6 +103,9 @@ def test_learning_rate_rule(kl: float, before: float, after: float) -> None:
     ppo._adapt_learning_rate(torch.tensor(kl))
     assert float(ppo._rate) == pytest.approx(after)
     assert ppo.optimizer.param_groups[0]["lr"] is ppo._rate
+    fixed = make(schedule="fixed")
+    fixed._adapt_learning_rate(torch.tensor(1.0))
+    assert float(fixed._rate) == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize("device", [False, True])
@@ -129,12 +123,6 @@ def test_an_optimizer_keeps_the_flags_of_its_own_device(device: bool) -> None:
     assert group["capturable"] is device and group["fused"] and group["lr"] is ppo._rate
     moments, there = ppo.optimizer.state_dict()["state"], state["optimizer"]["state"]
     assert moments and all(torch.equal(moments[i]["exp_avg"], there[i]["exp_avg"]) for i in there)
-
-
-def test_a_fixed_schedule_keeps_the_learning_rate() -> None:
-    ppo = make(schedule="fixed")
-    ppo._adapt_learning_rate(torch.tensor(1.0))
-    assert float(ppo._rate) == pytest.approx(1e-3)
 
 
 def test_noise_and_minibatches_belong_to_worlds_not_to_ranks() -> None:
@@ -173,11 +161,6 @@ def test_noise_is_normal_and_independent() -> None:
 def test_shares_cover_all_worlds_once() -> None:
     shares = [Share.of(rank, 3, 8) for rank in range(3)]
     assert [(share.first, share.count) for share in shares] == [(0, 2), (2, 3), (5, 3)]
-
-
-def test_more_minibatches_than_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"minibatches: 9 minibatches need as many steps of each world, there are 8"):
-        PPOConfig(steps=8, minibatches=9)
 
 
 def test_seeds_differ() -> None:
@@ -220,7 +203,7 @@ def test_an_update_is_that_of_rsl_rl(entropy_coef: float) -> None:
             seen = groups(task.observations)
             stock.act(TensorDict({"policy": task.observations.clone()}, batch_size=[worlds]))
             task.step(ppo.act(seen))
-            ppo.record(transition(task))
+            ppo.record(transition_of(task))
             stock.transition.rewards, stock.transition.dones = task.rewards.clone(), task.dones.clone()
             stock.storage.add_transition(stock.transition)
             stock.transition.clear()
@@ -249,7 +232,7 @@ def test_losses_ignore_what_terminal_observations_hold_where_nothing_ended() -> 
     for _ in range(8):
         task.step(ppo.act(groups(task.observations)))
         terminal = torch.where(task.time_outs.unsqueeze(1), task.terminal_observations, float("nan"))
-        ppo.record(dataclasses.replace(transition(task), terminal_observations=groups(terminal)))
+        ppo.record(dataclasses.replace(transition_of(task), terminal_observations=groups(terminal)))
     assert all(torch.isfinite(value) for value in ppo.learn(groups(task.observations)).values())
 
 
@@ -282,7 +265,8 @@ def test_gradients_of_a_layer_are_those_of_torch(missing: int) -> None:
     )
 
 
-def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
+@pytest.mark.parametrize("clip_values", [True, False])
+def test_the_objective_and_its_gradient_are_those_of_torch_and_of_the_plain_loss(clip_values: bool) -> None:
     """Far from the old policy too, where ratios and values are clipped on either side."""
     torch.manual_seed(3)
     samples, actions, clip, value_coef, entropy_coef, weight = 500, 3, 0.2, 0.7, 0.02, 0.4
@@ -295,7 +279,7 @@ def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
     policy, value = Normal(mean, std), leaves[2][:, 0]
     ratio = (policy.log_prob(drawn).sum(1) - old_log_prob).exp()
     surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
-    near = old_values + (value - old_values).clamp(-clip, clip)
+    near = old_values + (value - old_values).clamp(-clip, clip) if clip_values else value
     value_loss = torch.max((value - returns).square(), (near - returns).square()).mean()
     entropy = policy.entropy().sum(1).mean()
     kl = torch.distributions.kl_divergence(Normal(old_mean, old_std), policy).sum(1).mean()
@@ -303,9 +287,14 @@ def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
     expected = [*torch.autograd.grad(loss, leaves), weight * torch.stack((surrogate, value_loss, entropy, kl)).detach()]
     assert (ratio < 1 - clip).any() and (ratio > 1 + clip).any()
 
+    settings = Clipping(clip, clip_values, value_coef, entropy_coef)
+    told = Samples(old_log_prob, advantages, returns, old_values)
+    plain, losses = clipped_loss(settings, told, *gaussian_terms(drawn, old_mean, old_std, mean, std), leaves[2][:, 0])
+    found = [*torch.autograd.grad(weight * plain, leaves), weight * losses]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+
     order = torch.randperm(samples)
     rollout = tuple(each[order.argsort()] for each in (drawn, old_mean, old_log_prob, advantages, returns, old_values))
-    settings = Clipping(clip, True, value_coef, entropy_coef)
     objective = Objective(samples, actions, "cpu", weight=weight, settings=settings)
     losses = objective.backward(order, rollout, old_std, *leaves)
     torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
@@ -313,26 +302,6 @@ def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
     mean.data[7, 0] = float("nan")
     assert objective.backward(order, rollout, old_std, *leaves)[[0, 3]].isnan().all()
     assert mean.grad[7].isnan().all()
-
-
-@pytest.mark.parametrize("clip_values", [True, False])
-def test_the_kernel_is_the_plain_loss_on_random_data(clip_values: bool) -> None:
-    torch.manual_seed(4)
-    samples, actions, weight = 300, 4, 0.3
-    settings = Clipping(0.2, clip_values, 0.6, 0.01)
-    drawn, old_mean = (torch.randn(samples, actions) for _ in range(2))
-    old_std, std = torch.rand(actions) + 0.5, (torch.rand(actions) + 0.5).requires_grad_()
-    mean, values = torch.randn(samples, actions, requires_grad=True), torch.randn(samples, 1, requires_grad=True)
-    told = Samples(
-        gaussian_terms(drawn, old_mean, old_std, old_mean, old_std)[0], *(torch.randn(samples) for _ in range(3))
-    )
-    terms = gaussian_terms(drawn, old_mean, old_std, mean, std)
-    loss, losses = clipped_loss(settings, told, *terms, values[:, 0])
-    expected = [*torch.autograd.grad(weight * loss, (mean, std, values)), weight * losses]
-    objective = Objective(samples, actions, "cpu", weight=weight, settings=settings)
-    rollout = (drawn, old_mean, told.log_prob, told.advantages, told.returns, told.values)
-    found = objective.backward(torch.arange(samples), rollout, old_std, mean, std, values)
-    torch.testing.assert_close([mean.grad, std.grad, values.grad, found], expected, rtol=1e-4, atol=1e-6)
 
 
 def test_choices_are_those_of_torch() -> None:
@@ -346,15 +315,10 @@ def test_choices_are_those_of_torch() -> None:
     torch.testing.assert_close(kl, torch.distributions.kl_divergence(before, policy))
 
 
-def played(ppo: PPO, iterations: int = 3) -> dict[str, torch.Tensor]:
+def played(ppo: PPO) -> dict[str, torch.Tensor]:
     """The networks after some iterations on the point task."""
     task = Point(PointConfig(), ppo.setting.share.count)
-    for iteration in range(iterations):
-        ppo.begin(iteration)
-        for _ in range(ppo.steps):
-            task.step(ppo.act(groups(task.observations)))
-            ppo.record(transition(task))
-        ppo.learn(groups(task.observations))
+    iterate(ppo, task, 0, 3)
     return {**ppo.actor.state_dict(), **{f"critic.{name}": each for name, each in ppo.critic.state_dict().items()}}
 
 
@@ -382,5 +346,7 @@ def test_unsupported_settings_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"'critic' is a group of images .*; rsl_rl can do that"):
         spaces = Spaces({"policy": (2,), "critic": (3, 8, 8)}, 1)
         PPO(PointPPO(critic_observations="critic"), Setting(spaces, Share(0, 4, 4), alone(), 1))
+    with pytest.raises(ValueError, match=r"minibatches: 9 minibatches need as many steps of each world, there are 8"):
+        PPOConfig(steps=8, minibatches=9)
     with pytest.raises(ValueError, match="adam has none; set optimizer: adamw"):
         PPOConfig(weight_decay=0.1)

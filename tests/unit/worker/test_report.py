@@ -9,69 +9,63 @@ import pytest
 
 from orchestrator.cli.progress import shown_metrics
 from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.layout import Run, Store
 from shared_store.metrics import read_metrics, scalars
 from worker.learning.report import Report
 from worker.plot import plot_reward
+
+
+def run_of(folder: Path) -> Run:
+    run = Store(folder).open().run("r")
+    run.create({})
+    raise_epoch(run, 1)
+    return run
 
 
 def said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str, resumed: int = 0
 ) -> list[str]:
     """The lines without an iteration's figures, of three iterations of 1,000 that take so long each."""
-    run = Store(tmp_path).open().run("r")
-    run.create({})
-    raise_epoch(run, 1)
+    run = run_of(tmp_path)
     job = SimpleNamespace(run=run, epoch=1, section={"task": "G1Rough"})
     report = Report(SimpleNamespace(job=job, iterations=1000), resumed, device)  # type: ignore[arg-type]
     for iteration in range(resumed + 1, resumed + 4):
-        report.iteration(
-            {
-                "iteration": iteration,
-                "reward": None,
-                "episode_length": None,
-                "steps_per_second": 98304.0 / seconds,
-                "iteration_seconds": seconds,
-            }
-        )
+        figures = {"reward": None, "episode_length": None, "steps_per_second": 98304.0 / seconds}
+        report.iteration({"iteration": iteration, "iteration_seconds": seconds, **figures})
     report.close()
     return [line for line in capsys.readouterr().out.splitlines() if not line.startswith("iteration")]
 
 
-def test_a_cpu_training_of_days_is_warned_about_once_with_a_remedy(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+DAYS = (
+    "no GPU: G1Rough trains at about 492 steps/s on these processors, so that the other 998 iterations take about 2.3 days; "
+    "--set train.worlds=16 --set train.iterations=20 tries it"
+)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "device", "resumed", "warning"),
+    [
+        # 998 iterations of 200 s are 199,600 s, 2.31 days; 98,304 steps in 200 s are 491.5 a second
+        (200.0, "cpu", 0, DAYS),
+        # of a resumed training the rest counts: 1,000 - 402 = 598 iterations of 60 s are 9.97 hours
+        (60.0, "cpu", 400, "so that the other 598 iterations take about 10 hours; "),
+        (20.0, "cpu", 0, ""),  # 5.5 hours
+        (200.0, "cuda:0", 0, ""),
+    ],
+)
+def test_a_training_of_many_hours_without_a_gpu_is_warned_about_once_with_a_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str, resumed: int, warning: str
 ) -> None:
-    # 998 iterations of 200 s are 199,600 s, 2.31 days; 98,304 steps in 200 s are 491.5 a second
-    assert said(tmp_path, capsys, 200.0, "cpu") == [
-        "no GPU: G1Rough trains at about 492 steps/s on these processors, so that the other 998 iterations take about 2.3 days; "
-        "--set train.worlds=16 --set train.iterations=20 tries it"
-    ]
-
-
-def test_the_remainder_of_a_resumed_training_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # 1,000 - 402 = 598 iterations of 60 s are 9.97 hours
-    (line,) = said(tmp_path, capsys, 60.0, "cpu", resumed=400)
-    assert "the other 598 iterations take about 10 hours" in line
-
-
-@pytest.mark.parametrize(("seconds", "device"), [(20.0, "cpu"), (200.0, "cuda:0")], ids=["5.5 hours", "on a GPU"])
-def test_a_short_training_or_one_with_a_gpu_is_not_warned_about(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str
-) -> None:
-    assert said(tmp_path, capsys, seconds, device) == []
+    lines = said(tmp_path, capsys, seconds, device, resumed)
+    assert len(lines) == bool(warning) and warning in "".join(lines) and (warning != DAYS or lines == [DAYS])
 
 
 def test_metrics_shown_by_a_task_are_in_the_line_the_record_and_the_plot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = Store(tmp_path).open().run("r")
-    run.create({})
-    raise_epoch(run, 1)
-    report = Report(
-        SimpleNamespace(job=SimpleNamespace(run=run, epoch=1, section={}), iterations=2),  # type: ignore[arg-type]
-        0,
-        "cuda:0",
-    )
+    run = run_of(tmp_path)
+    job = SimpleNamespace(run=run, epoch=1, section={})
+    report = Report(SimpleNamespace(job=job, iterations=2), 0, "cuda:0")  # type: ignore[arg-type]
     usual = {"episode_length": 33.0, "steps_per_second": 100.0, "iteration_seconds": 1.0}
     for iteration, progress in ((1, None), (2, 42.0)):
         shown = {"progress": "- %" if progress is None else "42.0 %"}

@@ -113,26 +113,18 @@ def test_records_that_a_hanging_volume_refuses_are_dropped_and_counted(
     assert "warning: the volume did not take the last metrics (4 were dropped)" in capsys.readouterr().out
 
 
-def test_a_fence_reports_a_newer_attempt(run: Run) -> None:
-    fence = Fence(run, 1)
-    time.sleep(0.05)
-    fence.check()
-    raise_epoch(run, 2)
-    with pytest.raises(StaleEpoch, match="now belongs to epoch 2"):
-        wait_for(fence.check)
-    fence.close()
-
-
-def test_a_fence_reads_again_what_cannot_be_read(run: Run) -> None:
+@pytest.mark.parametrize("readable", [True, False])
+def test_a_fence_reports_a_newer_attempt_and_reads_again_what_cannot_be_read(run: Run, readable: bool) -> None:
     path = run.path / "EPOCH"
     whole = path.read_text()
-    path.write_text("damaged")
+    if not readable:
+        path.write_text("damaged")
     fence = Fence(run, 1)
     time.sleep(0.05)
     fence.check()
     path.write_text(whole)
     raise_epoch(run, 2)
-    with pytest.raises(StaleEpoch):
+    with pytest.raises(StaleEpoch, match="now belongs to epoch 2"):
         wait_for(fence.check)
     fence.close()
 

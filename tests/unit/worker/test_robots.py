@@ -10,7 +10,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.support.worker.kernels.cartpole import Cartpole, CartpoleConfig
+from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from worker.errors import UserError
 from worker.learning.job import user_errors
 
@@ -25,12 +25,13 @@ URDF = """<robot name="arm"><link name="base"/><link name="tip"><inertial><mass 
 <joint name="elbow" type="revolute"><parent link="base"/><child link="tip"/><axis xyz="0 1 0"/>
   <limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>"""
 SERVOS = '<position name="servo" joint="hinge" kp="30" kv="3"/><velocity joint="knee" kv="1"/>'
+MIXED = '<motor joint="knee"/><position joint="hinge"/>'
 
 
-def robot(add: Callable[[newton.ModelBuilder], Any], **options: Any) -> type[Cartpole]:
-    """A task with this robot; a state of two joints is all that the cart-pole's kernels need."""
+def robot(add: Callable[[newton.ModelBuilder], Any], **options: Any) -> type[PendulumByHand]:
+    """A task with this robot; a state of a joint is all that the pendulum's kernels need."""
 
-    class Robot(Cartpole):
+    class Robot(PendulumByHand):
         solver_options = {"disable_contacts": True, "njmax": 4, "nconmax": 0, **options}
 
         def build(self, builder: newton.ModelBuilder) -> None:
@@ -47,26 +48,22 @@ def mjcf(actuators: str, **options: Any) -> Callable[[newton.ModelBuilder], Any]
     ("add", "parts"),
     [
         (mjcf(SERVOS), ["actuators of joints hinge, knee would ignore", "ctrl_direct=True"]),
-        (
-            mjcf('<motor joint="knee"/><position joint="hinge"/>'),
-            ["actuators of joint hinge would", "ctrl_direct=True"],
-        ),
+        (mjcf(MIXED), ["actuators of joint hinge would", "ctrl_direct=True"]),
         (lambda builder: builder.add_urdf(URDF), ["nothing would drive the robot: joint elbow follow", "in MJCF"]),
         (mjcf(""), ["the robot has no actuators", "<actuator>"]),
     ],
-    ids=["servos", "a motor and a servo", "URDF", "no actuators"],
 )
 def test_a_robot_that_no_action_would_move_is_refused(
     add: Callable[[newton.ModelBuilder], Any], parts: list[str]
 ) -> None:
     with pytest.raises(UserError) as error, user_errors():
-        robot(add)(CartpoleConfig(), 2)
+        robot(add)(PendulumConfig(), 2)
     assert str(error.value).startswith("task Robot: ") and "\n" not in str(error.value)
     assert all(part in str(error.value) for part in parts), str(error.value)
 
 
 def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> None:
-    task = robot(mjcf(SERVOS, ctrl_direct=True))(CartpoleConfig(), 2, seed=1)
+    task = robot(mjcf(SERVOS, ctrl_direct=True))(PendulumConfig(), 2, seed=1)
     controls, angles = wp.to_torch(task.worlds.arrays.controls), wp.to_torch(task.worlds.arrays.joint_q)
     controls.copy_(torch.tensor([[0.3, 0.0], [-0.3, 0.0]]))
     for _ in range(120):
@@ -85,5 +82,5 @@ def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> No
 )
 def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r"task Robot: solver_options: ") as error:
-        robot(mjcf('<motor joint="hinge"/>'), **options)(CartpoleConfig(), 2)
+        robot(mjcf('<motor joint="hinge"/>'), **options)(PendulumConfig(), 2)
     assert message in str(error.value) and "\n" not in str(error.value)

@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from onnx import load_from_string
-from onnx.reference import ReferenceEvaluator
 from rsl_rl import algorithms
 from rsl_rl.models import MLPModel
 from rsl_rl.runners import DistillationRunner, OnPolicyRunner
 from torch import nn
 
-from tests.support.worker.rsl_loop import Seen, alone, build, restore, save, seen, settings, spaces_of, train
-from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from tests.support.worker.loop import alone, groups, spaces_of, transition_of
+from tests.support.worker.onnx import onnx_of
+from tests.support.worker.rsl_loop import GRU, Seen, build, restore, save, settings, train
+from tests.support.worker.sac import same
+from worker.learning.algorithm import Setting, Share, Spaces
 from worker.learning.rsl.algorithm import RslRl
 from worker.tasks.rsl_rl_env import TaskVecEnv
 
 torch.set_num_threads(1)
 
 GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.5}
-GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "hidden_dims": [8], "obs_normalization": True}
 LSTM = {**GRU, "rnn_type": "lstm", "rnn_num_layers": 2}
 CNN = {
     "class_name": "CNNModel",
@@ -107,22 +107,6 @@ def made(name: str, seed: int = 4) -> tuple[RslRl, Seen]:
     return algorithm, task
 
 
-def assert_same(one: Any, other: Any, where: str = "") -> None:
-    """Bit for bit, through mappings and lists."""
-    if isinstance(one, dict):
-        assert one.keys() == other.keys(), where
-        for key in one:
-            assert_same(one[key], other[key], f"{where}.{key}")
-    elif isinstance(one, list | tuple):
-        for index, pair in enumerate(zip(one, other, strict=True)):
-            assert_same(*pair, f"{where}.{index}")
-    else:
-        assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other, where
-
-
-# -- what is refused --------------------------------------------------------------------------------------------------
-
-
 class OwnPPO(algorithms.PPO):
     """A class of the user's own, whose settings only the rank can check."""
 
@@ -140,7 +124,13 @@ def turn(obs: Any, actions: Any) -> tuple[Any, Any]:
     return obs, actions
 
 
+def mirrored(by: str = "tests.support.worker.rsl_loop:mirror") -> dict[str, Any]:
+    return {"algorithm": {"symmetry_cfg": {**SYMMETRY, "data_augmentation_func": by}}}
+
+
 TAUGHT = {"teacher_checkpoint": "taught"}
+BATCHES = {"algorithm": {"num_mini_batches": 9}}
+NORMALISED = {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN}
 
 
 @pytest.mark.parametrize(
@@ -153,10 +143,7 @@ TAUGHT = {"teacher_checkpoint": "taught"}
         (own(max_grad_norm=None), r"algorithm\.max_grad_norm: expected a number, found nothing$"),
         ({"algorithm": {"optimizer": "adamm"}}, r"algorithm: Invalid optimizer 'adamm'"),
         ({"algorithm": {"num_mini_batches": 65}}, r"algorithm\.num_mini_batches: 65 .* samples; a rank has 64"),
-        (
-            {"critic": GRU, "algorithm": {"num_mini_batches": 9}},
-            r"algorithm\.num_mini_batches: 9 .* worlds, .* recurrent; a rank has 8",
-        ),
+        ({"critic": GRU, **BATCHES}, r"algorithm\.num_mini_batches: 9 .* worlds, .* recurrent; a rank has 8"),
         ({"actor": {"class_name": "nowhere:Net"}}, r"actor\.class_name: No module named 'nowhere'"),
         ({"critic": {"hiden_dims": [8]}}, r"critic: .* unexpected keyword argument 'hiden_dims'"),
         ({"critic": {"hidden_dims": []}}, r"critic: IndexError: "),
@@ -166,24 +153,11 @@ TAUGHT = {"teacher_checkpoint": "taught"}
         ({"actor": CNN}, r"actor: No 2D observations are provided"),
         ({"obs_groups": {"actor": ["image"]}}, r"actor: The MLP model only supports 1D observations"),
         ({"obs_groups": {"actor": ["polcy"]}}, r"obs_groups: Observation 'polcy' in observation set 'actor' not found"),
+        ({**CASES["shared convolutions"], "actor": NORMALISED}, r"actor\.obs_normalization: it sees images alone"),
+        ({"critic": GRU, **mirrored()}, r"algorithm: Symmetry augmentation is not supported for recurrent"),
+        (mirrored("nowhere:f"), r"algorithm: No module named"),
         (
-            {
-                **CASES["shared convolutions"],
-                "actor": {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN},
-            },
-            r"actor\.obs_normalization: it sees images alone",
-        ),
-        (
-            {"critic": GRU, "algorithm": {"symmetry_cfg": SYMMETRY}},
-            r"algorithm: Symmetry augmentation is not supported for recurrent",
-        ),
-        ({"algorithm": {"symmetry_cfg": {"data_augmentation_func": "nowhere:f"}}}, r"algorithm: No module named"),
-        (
-            {
-                "algorithm": {
-                    "symmetry_cfg": {**SYMMETRY, "data_augmentation_func": "tests.unit.worker.test_rsl_rl:turn"}
-                }
-            },
+            mirrored("tests.unit.worker.test_rsl_rl:turn"),
             r"algorithm\.symmetry_cfg\.data_augmentation_func: turn is called with env, obs and actions: ",
         ),
         ({**own(), "student": GRU}, r"student: .*:OwnPPO has the networks actor and critic$"),
@@ -210,14 +184,20 @@ def test_choices_are_refused() -> None:
         RslRl(settings({}), setting)
 
 
-# -- learning ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", CASES)
-def test_the_weights_are_those_of_rsl_rls_own_runner(name: str) -> None:
+def test_the_weights_are_those_of_rsl_rls_own_runner_and_a_resumed_run_ends_with_the_same_bits(name: str) -> None:
     algorithm, task = made(name)
-    records = train(algorithm, task, 3)
+    train(algorithm, task, 2)
+    saved = save(algorithm, task)
+    records = train(algorithm, task, 2, done=2)
     weights = copy.deepcopy(dict(algorithm.algorithm.save()))
+    again, fresh = made(name, seed=77)
+    train(again, fresh, 1)
+    restore(again, fresh, saved)
+    assert same(train(again, fresh, 2, done=2), records)
+    assert same(dict(again.state_dict()), dict(algorithm.state_dict()))
+    assert same(dict(again.world_state()), dict(algorithm.world_state()))
+    assert same(fresh.state_dict(), task.state_dict())
 
     own = Seen(seed=3)
     config = settings({"num_steps_per_env": 8, **CASES[name]})
@@ -231,25 +211,10 @@ def test_the_weights_are_those_of_rsl_rls_own_runner(name: str) -> None:
         runner = (DistillationRunner if distils else OnPolicyRunner)(TaskVecEnv(own), stock, None, "cpu")  # type: ignore[arg-type]
         if distils:
             runner.alg.teacher_loaded = True
-        runner.learn(3)
-    assert_same(weights, dict(runner.alg.save()))
+        runner.learn(4)
+    assert same(weights, dict(runner.alg.save()))
     assert records[-1]["learning_rate"] == runner.alg.optimizer.param_groups[0]["lr"]
     assert torch.equal(task.place, own.place)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_a_run_resumed_from_its_checkpoint_ends_bit_identical(name: str) -> None:
-    algorithm, task = made(name)
-    train(algorithm, task, 2)
-    saved = save(algorithm, task)
-    expected = train(algorithm, task, 2, done=2)
-    again, fresh = made(name, seed=77)
-    train(again, fresh, 1)
-    restore(again, fresh, saved)
-    assert_same(train(again, fresh, 2, done=2), expected)
-    assert_same(dict(again.state_dict()), dict(algorithm.state_dict()))
-    assert_same(dict(again.world_state()), dict(algorithm.world_state()))
-    assert_same(fresh.state_dict(), task.state_dict())
 
 
 def test_saved_state_of_worlds_has_their_index_as_its_first_dimension() -> None:
@@ -272,8 +237,8 @@ def test_the_recurrent_state_of_a_world_is_forgotten_where_its_episode_ended() -
     algorithm.begin(0)
     ended = False
     for _ in range(algorithm.steps):
-        task.step(algorithm.act(seen(task)))
-        algorithm.record(Transition(seen(task), seen(task), task.rewards, task.dones, task.time_outs))
+        task.step(algorithm.act(groups(task)))
+        algorithm.record(transition_of(task))
         state = algorithm.world_state()["actor.0"]
         assert torch.equal((state == 0).all(dim=(1, 2)), task.dones)
         ended |= bool(task.dones.any())
@@ -286,9 +251,9 @@ def test_loading_only_weights_leaves_the_optimizer_unchanged() -> None:
     state = copy.deepcopy(dict(trained.state_dict()))
     fresh, _ = made("RND", seed=5)
     fresh.load_state_dict(state, weights_only=True)
-    assert_same(dict(fresh.policy().state_dict()), state["policy"])
+    assert same(dict(fresh.policy().state_dict()), state["policy"])
     now = fresh.state_dict()
-    assert_same(now["rnd_state_dict"], state["rnd_state_dict"])
+    assert same(now["rnd_state_dict"], state["rnd_state_dict"])
     assert not now["optimizer_state_dict"]["state"] and now["rnd_steps"] == 0 and fresh.learning_rate == 1e-3
     fresh.learning_rate = 2e-4
     assert fresh.algorithm.learning_rate == 2e-4 and fresh.learning_rate == 2e-4
@@ -323,15 +288,12 @@ def test_a_teacher_has_the_weights_of_a_run_of_ppo_and_must_fit_it() -> None:
         pupil.begin(0)
     pupil.load_teacher(teaching.state_dict())
     pupil.begin(0)
-    assert_same(pupil.algorithm.teacher.state_dict(), dict(teaching.policy().state_dict()))
+    assert same(pupil.algorithm.teacher.state_dict(), dict(teaching.policy().state_dict()))
     with pytest.raises(ValueError, match=r"^rsl_rl\.teacher: the weights do not fit; set .*") as refusal:
         build(task, section).load_teacher(teaching.state_dict())
     assert "\n" not in str(refusal.value)
     with pytest.raises(ValueError, match=r"^rsl_rl\.teacher_checkpoint: only Distillation has a teacher"):
         teaching.load_teacher(teaching.state_dict())
-
-
-# -- policies ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -343,7 +305,7 @@ def test_a_policy_acts_like_the_one_that_is_trained_and_like_its_export(name: st
     policy = RslRl.build_policy(config, spaces_of(task), "cpu")
     policy.load_state_dict(algorithm.policy().state_dict())
     exported = policy.module()
-    run = to_onnx(exported)
+    run = onnx_of(exported)
     sample = {key: value.numpy() for key, value in exported.sample.items()}
     count = len(exported.sample)
     inputs = dict(zip(exported.inputs, sample.values(), strict=False))
@@ -364,7 +326,7 @@ def test_a_policy_acts_like_the_one_that_is_trained_and_like_its_export(name: st
     policy.reset()
     algorithm.policy().reset()
     assert torch.equal(policy.act(exported.sample), algorithm.policy().act(exported.sample))
-    assert_same(dict(algorithm.world_state()), before)  # training goes on with its own memory
+    assert same(dict(algorithm.world_state()), before)  # training goes on with its own memory
     assert algorithm.algorithm.get_policy().training
 
 
@@ -380,27 +342,9 @@ def test_names_of_an_export() -> None:
     assert exported.inputs["obs"].dtype == torch.uint8 and exported.inputs["obs"].shape == (1, 2, 9, 9)
 
 
-def to_onnx(exported: Any) -> ReferenceEvaluator:
-    """The module as ONNX's own evaluator reads it, with any batch size."""
-    buffer, names = io.BytesIO(), [*exported.inputs, *exported.outputs]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            exported.network,
-            tuple(exported.inputs.values()),
-            buffer,
-            dynamo=False,
-            opset_version=18,
-            input_names=list(exported.inputs),
-            output_names=list(exported.outputs),
-            dynamic_axes={name: {0: "batch"} for name in names},
-        )
-    return ReferenceEvaluator(load_from_string(buffer.getvalue()))
-
-
 def test_a_batch_norm_is_frozen_while_a_policy_acts() -> None:
     algorithm, task = made("images and numbers")
     norm = next(each for each in algorithm.algorithm.actor.modules() if isinstance(each, nn.BatchNorm2d))
     before = norm.running_mean.clone()
-    algorithm.policy().act(seen(task))
+    algorithm.policy().act(groups(task))
     assert torch.equal(norm.running_mean, before)

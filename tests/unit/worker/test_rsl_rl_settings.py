@@ -6,8 +6,6 @@ import dataclasses
 import inspect
 import json
 import math
-import subprocess
-import sys
 from typing import Any
 
 import pytest
@@ -17,13 +15,6 @@ from tests.support.worker.rsl_loop import settings
 from worker.errors import UserError
 from worker.learning.rsl import checks
 from worker.learning.rsl.settings import REFUSED, RslRlConfig
-
-
-def test_settings_are_read_without_torch() -> None:
-    code = (
-        "import sys; from worker.learning.rsl.settings import RslRlConfig; RslRlConfig(); print('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
 
 def test_a_section_with_a_class_is_used_unchanged_and_one_without_overrides_the_defaults() -> None:

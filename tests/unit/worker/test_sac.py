@@ -5,30 +5,24 @@ from __future__ import annotations
 import copy
 import dataclasses
 import io
-import subprocess
-import sys
-import warnings
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of
+from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of, transition_of
+from tests.support.worker.onnx import onnx_of
 from tests.support.worker.point_task import Point, PointConfig
 from tests.support.worker.sac import SMALL, make, point, same
 from worker.distributed import Gang, Placement
-from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces, Transition
+from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.host_copies import HostCopies
 from worker.learning.sac.sac import SAC, SAVED
 from worker.learning.sac.settings import SACConfig
 
 torch.set_num_threads(1)
-
-
-# -- settings ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -65,11 +59,6 @@ def test_settings_as_yaml_gives_them() -> None:
     assert SACConfig(atoms=1, v_min=0.0, v_max=0.0).atoms == 1, "the range is not used with one atom"
 
 
-def test_settings_are_read_without_torch() -> None:
-    told = "import sys, worker.learning.sac.settings; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", told], cwd=Path(__file__).parents[3]).returncode == 0
-
-
 @pytest.mark.parametrize(
     ("spaces", "settings", "message"),
     [
@@ -86,9 +75,6 @@ def test_an_unsupported_setting_is_refused(spaces: Spaces, settings: dict[str, A
     setting = Setting(spaces, Share(0, 2, 2), alone(), 0)
     with pytest.raises(ValueError, match=f"^sac.*{message}"):
         SAC(dataclasses.replace(SMALL, **settings), setting)
-
-
-# -- the whole --------------------------------------------------------------------------------------------------------
 
 
 def test_it_is_an_algorithm() -> None:
@@ -224,29 +210,12 @@ def test_a_policy_alone_acts_as_the_algorithm_does() -> None:
 
 
 def test_the_exported_policy_computes_the_same() -> None:
-    import onnx
-    from onnx.reference import ReferenceEvaluator
-
     task = point()
     sac = make(task, action_limit=0.8)
     iterate(sac, task, 0, 5)
     exported = sac.policy().module()
     assert list(exported.inputs) == ["obs"] and list(exported.outputs) == ["actions"]
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            exported.network,
-            tuple(exported.inputs.values()),
-            buffer,
-            dynamo=False,
-            opset_version=18,
-            input_names=list(exported.inputs),
-            output_names=list(exported.outputs),
-            dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}},
-        )
-    model = ReferenceEvaluator(onnx.load_from_string(buffer.getvalue()))
-    (found,) = model.run(None, {"obs": exported.sample["policy"].numpy()})
+    (found,) = onnx_of(exported).run(None, {"obs": exported.sample["policy"].numpy()})
     torch.testing.assert_close(torch.from_numpy(found), sac.policy().act(exported.sample), atol=1e-5, rtol=0)
     moved = exported.sample["policy"].mean(0) - sac.learner.actor.normalizer.mean
     assert (moved.abs() < 0.5).all(), "the sample is of what the policy has met"
@@ -281,7 +250,7 @@ def test_recording_neither_reads_from_the_device_nor_draws_random_numbers(settin
     sac = make(task, **settings)
     iterate(sac, task, 0, 3)
     sac.begin(3)
-    task_step = Transition(groups(task), groups(task, True), task.rewards, task.dones, task.time_outs)
+    task_step = transition_of(task)
     with Watch() as watch:
         for _ in range(sac.steps):
             sac.act(task_step.observations)
@@ -291,17 +260,16 @@ def test_recording_neither_reads_from_the_device_nor_draws_random_numbers(settin
     assert watch.found == []
 
 
+MOMENTS = "gather moments, merge moments"
+
+
 @pytest.mark.parametrize(
     ("settings", "ranks", "names"),
     [
         ({}, 1, "moments, updates"),
         ({"normalize_observations": False}, 1, "updates"),
-        (
-            {"policy_delay": 2},
-            2,
-            "gather moments, merge moments, critic gradients, critic step, all gradients, all steps",
-        ),
-        ({"policy_delay": 1}, 2, "gather moments, merge moments, all gradients, all steps"),
+        ({"policy_delay": 2}, 2, f"{MOMENTS}, critic gradients, critic step, all gradients, all steps"),
+        ({"policy_delay": 1}, 2, f"{MOMENTS}, all gradients, all steps"),
         ({"normalize_observations": False, "policy_delay": 1}, 2, "all gradients, all steps"),
     ],
 )
@@ -346,7 +314,7 @@ def test_two_ranks_take_the_step_that_one_takes_with_the_same_samples() -> None:
         sac.begin(0)
         for _ in range(sac.steps):
             task.step(sac.act(groups(task)))
-            sac.record(Transition(groups(task), groups(task, True), task.rewards, task.dones, task.time_outs))
+            sac.record(transition_of(task))
         sac.replay.advance(sac.steps)
         sac._gather_moments()
     assert torch.equal(one.replay.after, torch.cat([sac.replay.after for sac in ranks], 1)), "the same worlds"

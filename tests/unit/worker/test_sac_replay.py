@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.support.worker.loop import alone, groups, iterate
+from tests.support.worker.loop import alone, groups, iterate, transition_of
 from tests.support.worker.sac import SMALL, make, point
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.sac import kernels
@@ -18,9 +18,6 @@ from worker.learning.sac.sac import SAC
 torch.set_num_threads(1)
 
 
-# -- exploring --------------------------------------------------------------------------------------------------------
-
-
 def draw(first: int, worlds: int, key: int, uniform: bool = False, actions: int = 3) -> torch.Tensor:
     """What is explored around a mean of 0.2 with a deviation of 0.5."""
     drawn = torch.zeros(worlds, actions)
@@ -28,13 +25,6 @@ def draw(first: int, worlds: int, key: int, uniform: bool = False, actions: int 
     keys = torch.tensor([0, key], dtype=torch.int32)
     kernels.explore(keys, 1, first, torch.tensor([int(uniform)], dtype=torch.int32), 2.0, mean, log_std, drawn)
     return drawn
-
-
-def test_noise_belongs_to_worlds_and_steps_not_to_ranks() -> None:
-    whole = draw(0, 8, 7)
-    assert torch.equal(whole, torch.cat((draw(0, 3, 7), draw(3, 5, 7))))
-    assert len(torch.unique(whole)) == whole.numel()
-    assert not torch.isclose(whole, draw(0, 8, 8)).any()
 
 
 def test_exploring_is_normal_noise_squashed_or_uniform() -> None:
@@ -53,7 +43,7 @@ def test_actions_of_an_iteration_do_not_depend_on_the_ranks() -> None:
             sac.begin(iteration)
             for _ in range(sac.steps):
                 drawn.append(sac.act(groups(task)).clone())
-                sac.record(Transition(groups(task), groups(task, True), task.rewards, task.dones, task.time_outs))
+                sac.record(transition_of(task))
         return torch.stack(drawn)
 
     whole = actions(0, 6)
@@ -72,9 +62,6 @@ def test_actions_are_random_until_the_first_update() -> None:
     spread = [float(each.std()) for each in drawn]
     assert spread[0] > 0.5 and spread[1] > 0.5 and spread[2] < 0.2
     assert sac.state_dict()["updates"] == 8, "4 steps are too few for the first iteration, 8 are enough"
-
-
-# -- replay -----------------------------------------------------------------------------------------------------------
 
 
 def fill(replay: Replay, steps: int, ends: torch.Tensor | None = None, time_outs: torch.Tensor | None = None) -> None:
@@ -121,7 +108,7 @@ def test_an_iterations_draws_exist_once_its_steps_are_written(n_step: int) -> No
         sac.begin(iteration)
         for step in range(4):
             task.step(sac.act(groups(task)))
-            sac.record(Transition(groups(task), groups(task, True), task.rewards, task.dones, task.time_outs))
+            sac.record(transition_of(task))
             sac.replay.before[sac._slots[step], :, 0] = 4.0 * iteration + step
         written = 4 * iteration + 4
         begun = sac.replay.before[..., 0].flatten()[sac._all_rows]

@@ -24,9 +24,6 @@ from worker.learning.sac.settings import SACConfig
 torch.set_num_threads(1)
 
 
-# -- critics ----------------------------------------------------------------------------------------------------------
-
-
 def projection_by_loop(
     probabilities: torch.Tensor, returns: float, discount: float, bonus: float, least: float, greatest: float
 ) -> list[float]:
@@ -112,9 +109,6 @@ def test_several_critics_are_each_a_network_of_its_own(layer_norm: bool) -> None
                     x = x * next(numbers) + next(numbers)
                 x = x * x.sigmoid()
         torch.testing.assert_close(outputs[number], x)
-
-
-# -- policy -----------------------------------------------------------------------------------------------------------
 
 
 def test_log_probabilities_are_those_of_torch() -> None:

@@ -1,8 +1,9 @@
-"""What a job's overrides make of a task's configuration, of Muster's own tasks and of users'."""
+"""What a job's overrides make of a task's configuration and its rewards, of Muster's own tasks and of users'."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ import pydantic.dataclasses
 import pytest
 
 from job_specs.my_task import Pendulum, PendulumConfig
+from tests.support.refusals import refusal
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.learning.ppo.settings import PPOConfig
@@ -65,9 +67,7 @@ def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
         ({"episode_seconds": -1}, "episode_seconds: expected a value greater than 0, found -1.0"),
         ({"rewards": {"speed": float("nan")}}, "rewards.speed: expected a finite number, found a number (nan)"),
     ):
-        with pytest.raises(UserError) as refused:
-            configure(Pendulum, {"config": overrides})
-        assert str(refused.value) == f"train.config.{said}"
+        assert refusal(configure, Pendulum, {"config": overrides}, error=UserError) == f"train.config.{said}"
 
 
 def test_a_plain_dataclass_that_python_makes_is_checked_in_what_every_task_has() -> None:
@@ -126,9 +126,7 @@ def test_a_users_configuration_may_be_a_plain_or_a_pydantic_dataclass(kind: type
         ({"camera": {"fov": 4}}, "camera.fov: expected a value less than 3.141592653589793, found 4"),
         ({"ppo": {"steps": 8}}, f"ppo: not a key of {kind.__name__}; settings of ppo stand under train.ppo"),
     ):
-        with pytest.raises(Refused) as refused:
-            configured(kind, overrides)
-        assert str(refused.value) == said
+        assert refusal(configured, kind, overrides, error=Refused) == said
 
 
 def test_a_task_with_invalid_defaults_says_so() -> None:
@@ -139,8 +137,30 @@ def test_a_task_with_invalid_defaults_says_so() -> None:
     class Task(Pendulum):
         config_type = Careless
 
-    with pytest.raises(UserError) as refused:
-        configure(Task, {})
-    assert str(refused.value) == (
+    assert refusal(configure, Task, {}, error=UserError) == (
         "task Task: its own configuration: substeps: expected a value greater than or equal to 1, found 0"
     )
+
+
+def test_a_yaml_changes_the_weights_that_it_names() -> None:
+    config = configure(Ant, {"config": {"rewards": {"forward": 2, "fall": -7.5}}})
+    assert config.rewards == {**AntConfig().rewards, "forward": 2.0, "fall": -7.5}
+    assert tuple(config.rewards) == Ant.reward_terms, "the order is the kernel's, whatever the YAML's"
+    assert configure(Ant, {}).rewards == AntConfig().rewards
+    with pytest.raises(TypeError):
+        config.rewards["forward"] = 3.0  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("rewards", "message"),
+    [
+        ({7: 1.0}, ".7: expected a text, found a whole number (7)"),
+        ({"forward": True}, ".forward: expected a number, found true or false (True)"),
+        ({"forward": math.nan}, ".forward: expected a finite number, found a number (nan)"),
+        ({"up": math.inf}, ".up: expected a finite number, found a number (inf)"),
+        ({"up": None}, ".up: expected a number, found nothing"),
+    ],
+)
+def test_an_impossible_weight_is_refused_in_one_line(rewards: object, message: str) -> None:
+    said = refusal(configure, Ant, {"config": {"rewards": rewards}}, error=UserError)
+    assert said.startswith(f"train.config.rewards{message}")

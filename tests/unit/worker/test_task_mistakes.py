@@ -91,9 +91,7 @@ def test_a_function_that_warp_cannot_compile_is_named_first(folder: Path) -> Non
     assert str(mistake.value).startswith("task warped:Bad: warped.py:6: `joint_qq` is not an attribute of 'worlds'")
 
 
-def test_transient_errors_and_musters_own_defects_are_not_mistakes_of_the_user(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_transient_errors_and_musters_own_defects_are_not_mistakes_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     for error in (MemoryError(), OSError(errno.EIO, "a disk"), RuntimeError("CUDA error: out of memory")):
         with pytest.raises(type(error)) as passed, task_mistakes("mine:Bad"):
             raise error

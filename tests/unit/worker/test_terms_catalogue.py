@@ -34,38 +34,19 @@ def test_a_page_is_up_to_date(page: str, written: object) -> None:
     assert (REPOSITORY / "docs" / "tasks" / f"{page}.md").read_text() == written()
 
 
-def test_every_term_is_reached_by_its_name_and_says_what_it_is() -> None:
+def test_every_term_is_in_the_catalogue_is_reached_by_its_name_and_says_what_it_is() -> None:
     found = list(entries())
     assert len(found) > 200
-    assert len({entry.name for entry in found}) == len(found)
+    names = {entry.name for entry in found}
+    assert len(names) == len(found) and names == {
+        name for name, each in vars(terms).items() if isinstance(each, wp.Function)
+    }
     for entry in found:
         function = getattr(terms, entry.name)
         assert isinstance(function, wp.Function) and function.func.__module__ == f"worker.tasks.terms.{entry.group}"
         assert entry.meaning.endswith("."), entry.name
         assert "world" in inspect.signature(function.func).parameters
         assert (entry.returns == "") == (inspect.signature(function.func).return_annotation is inspect.Signature.empty)
-
-
-def test_every_public_term_is_on_the_page_and_the_page_has_no_other() -> None:
-    public = {name for name, each in vars(terms).items() if isinstance(each, wp.Function)}
-    told = re.findall(r"^\| `(\w+)` \|", (REPOSITORY / "docs" / "tasks" / "terms.md").read_text(), re.MULTILINE)
-    assert len(told) == len({*told}) and {*told} == public == {entry.name for entry in entries()}
-
-
-def test_mjlabs_own_terms_have_one_here() -> None:
-    """By name, those of the functions that mjlab's tasks are made of."""
-    ported = {theirs.partition(" ")[0] for entry in entries() for theirs in split(entry.mjlab)}
-    wanted = """base_lin_vel base_ang_vel projected_gravity joint_vel_rel last_action generated_commands height_scan foot_height
-        foot_air_time foot_contact foot_contact_forces is_alive is_terminated joint_torques_l2 joint_vel_l2 joint_acc_l2 action_rate_l2
-        action_acc_l2 joint_pos_limits posture electrical_power_cost flat_orientation_l2 time_out bad_orientation nan_detection
-        root_height_below_minimum mean_action_acc track_linear_velocity track_angular_velocity upright self_collision_cost
-        body_angular_velocity_penalty angular_momentum_penalty feet_air_time feet_clearance feet_swing_height feet_slip soft_landing
-        variable_posture illegal_contact out_of_terrain_bounds terrain_edge_reached terrain_levels_vel joint_pos_rel
-        motion_anchor_pos_b motion_anchor_ori_b robot_body_pos_b robot_body_ori_b ee_to_object_distance object_to_goal_distance
-        ee_velocity target_position staged_position_reward bring_object_reward joint_velocity_hinge_penalty
-        reset_scene_to_default reset_root_state_uniform reset_joints_by_offset push_by_setting_velocity randomize_terrain
-        bad_anchor_pos bad_anchor_ori bad_motion_body_pos"""
-    assert set(wanted.split()) - ported == set()
 
 
 def test_the_page_of_names_has_all_terms_of_mjlabs_tasks() -> None:

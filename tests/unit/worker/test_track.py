@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import socket
 import subprocess
 import sys
@@ -112,7 +113,9 @@ def test_other_settings_from_the_last_iteration_on_continue_the_same_run(run: Ru
     assert service.sent == {"ant": [(i, 1.0) for i in range(1, 6)] + [(6, 2.0)]}
 
 
-def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(run: Run) -> None:
+def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     code = (
         "import sys; from pathlib import Path; from shared_store.layout import Run; from worker.track import Turn; "
         "turn = Turn(Run(Path(sys.argv[1])), 'mlflow'); print(turn.take(), flush=True); sys.stdin.read()"
@@ -129,28 +132,16 @@ def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(run:
         holder = f"process {other.pid} on {socket.gethostname()}"
         turn = Turn(run, "mlflow")
         assert turn.take() == holder and Turn(run, "wandb").take() is None
-        write_json(
-            run.path / "run.json", {"run": run.name, "spec": {"train": TRAIN, "track": {"mlflow": {"uri": "x"}}}}
-        )
-        done = subprocess.run(
-            [sys.executable, "-c", _WITH_MEMORY, str(run.path)], cwd=REPOSITORY, capture_output=True, text=True
-        )
+        described = {"run": run.name, "spec": {"train": TRAIN, "track": {"mlflow": {"uri": "x"}}}}
+        write_json(run.path / "run.json", described)
+        monkeypatch.setattr(track, "SERVICES", {"mlflow": lambda tracked, settings: Memory()})
         line = f"error: mlflow: {holder} sends this run already; run this again once its training is over\n"
-        assert (done.returncode, done.stderr) == (2, line)
+        assert track.afterwards(str(run.path), "mlflow") == 2 and capsys.readouterr().err == line
     finally:
         other.kill()  # as a rank's death would end it
         other.wait()
         other.communicate()
     assert turn.take() is None and turn.take() is None
-
-
-_WITH_MEMORY = """
-import sys
-from tests.unit.worker.test_track import Memory
-from worker import track
-track.SERVICES = {"mlflow": lambda tracked, settings: Memory()}
-sys.exit(track.afterwards(sys.argv[1], "mlflow"))
-"""
 
 
 def test_an_unreachable_service_is_reported_in_one_line_and_everything_is_sent_later(
@@ -196,25 +187,14 @@ def test_the_end_of_a_training_comes_with_its_evaluation_and_pictures_and_that_o
     summary |= {"success": {"share": 0.75}, "metrics": {"error_vel_xy": {"mean": 0.125}}}
     own = run.evaluations / "00000004-e1.json"
     own.write_text(json.dumps(summary))
-    (run.evaluations / "00000004-e1-abc.json").write_text(
-        json.dumps({**summary, "config": {"randomize": {}}, "time": 2})
-    )
+    another = {**summary, "config": {"randomize": {}}, "time": 2}
+    (run.evaluations / "00000004-e1-abc.json").write_text(json.dumps(another))
     sending.finish("stopped")
     sending.finish("finished")
-    assert service.ended == [
-        Ending("stopped", 4, {}, []),
-        Ending(
-            "finished",
-            4,
-            {
-                "evaluation/return": 2.5,
-                "evaluation/length": 9.0,
-                "evaluation/success": 0.75,
-                "evaluation/error_vel_xy": 0.125,
-            },
-            [run.metrics / "reward.png", own],
-        ),
-    ]
+    figures = {"return": 2.5, "length": 9.0, "success": 0.75, "error_vel_xy": 0.125}
+    last = {f"evaluation/{name}": value for name, value in figures.items()}
+    finished = Ending("finished", 4, last, [run.metrics / "reward.png", own])
+    assert service.ended == [Ending("stopped", 4, {}, []), finished]
 
 
 def test_a_records_numbers_have_the_names_that_tensorboard_shows() -> None:
@@ -242,10 +222,11 @@ def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
     ],
 )
 def test_a_run_that_cannot_be_sent_afterwards_is_reported_in_one_line(
-    run: Run, arguments: list[str], said: str
+    run: Run, arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [str(run.path) if each == "RUN" else each for each in arguments]
-    command = [sys.executable, "-m", "worker.track", *given]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
-    assert done.returncode == 2 and done.stdout == ""
-    assert done.stderr.count("\n") == 1 and said in done.stderr
+    monkeypatch.setattr(sys, "argv", ["track", *(str(run.path) if each == "RUN" else each for each in arguments)])
+    monkeypatch.delitem(sys.modules, "worker.track")
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("worker.track", run_name="__main__")
+    out, errors = capsys.readouterr()
+    assert (ended.value.code, out, errors.count("\n")) == (2, "", 1) and said in errors

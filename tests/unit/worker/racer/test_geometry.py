@@ -51,7 +51,7 @@ def test_the_measures_of_a_square_are_those_of_its_sides() -> None:
     assert track.rows().shape == (33, 6) and (track.rows()[0] == track.rows()[-1]).all()
 
 
-def test_a_point_is_projected_onto_the_centre_line() -> None:
+def test_a_point_is_projected_onto_the_centre_line_and_the_width_between_waypoints_changes_evenly() -> None:
     found = project(square(), [[1.2, 0.3], [4.25, 2.6], [3.0, 3.8], [-0.1, 1.0]])
     np.testing.assert_allclose(found.point, [[1.2, 0], [4, 2.6], [3, 4], [0, 1]])
     np.testing.assert_allclose(found.distance, [0.3, 0.25, 0.2, 0.1])
@@ -61,12 +61,13 @@ def test_a_point_is_projected_onto_the_centre_line() -> None:
     np.testing.assert_allclose(found.heading, [0, math.pi / 2, math.pi, -math.pi / 2])
     np.testing.assert_allclose(degrees(found.heading), [0, 90, 180, -90])
     assert list(found.before) == [2, 13, 18, 30] and list(found.after) == [3, 14, 19, 31]
-
-
-def test_between_two_waypoints_the_width_changes_evenly() -> None:
     # from the corner, where the road is √2 wide, to the next waypoint: 2.5 from the middle, its borders are half as far apart
     found = project(square(), [[0.125, 0.0], [2.0, 0.3]])
     np.testing.assert_allclose(found.width, [math.sqrt(2) + 0.25 * (1.25 - math.sqrt(2)), 1.0])
+    found = project(square(), [[4.3, -0.4]])
+    np.testing.assert_allclose(found.point, [[4, 0]], err_msg="the corner is the nearest point for a car outside it")
+    assert found.distance[0] == pytest.approx(0.5) and not found.left[0]
+    assert (found.before[0], found.after[0], found.along[0]) == (8, 9, 4.0)
 
 
 def test_driving_backwards_reverses_left_progress_and_waypoints() -> None:
@@ -88,13 +89,6 @@ def test_a_waypoint_that_the_car_has_reached_counts_as_the_one_behind() -> None:
     assert (back.before == rows).all() and (back.after == (rows - 1) % 32).all()
     assert forth.along[0] == 0.0 and back.along[0] == 0.0
     assert not forth.left.any() and not back.left.any(), "on the line is not to the left of it"
-
-
-def test_the_corner_is_the_nearest_point_for_a_car_outside_it() -> None:
-    found = project(square(), [[4.3, -0.4]])
-    np.testing.assert_allclose(found.point, [[4, 0]])
-    assert found.distance[0] == pytest.approx(0.5) and not found.left[0]
-    assert (found.before[0], found.after[0], found.along[0]) == (8, 9, 4.0)
 
 
 @pytest.mark.parametrize("direction", [COUNTER_CLOCKWISE, CLOCKWISE])

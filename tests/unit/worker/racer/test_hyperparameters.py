@@ -13,17 +13,13 @@ from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.file import load
 from orchestrator.spec.json_schema import schema
 from orchestrator.spec.model import Spec, validate
+from tests.support.refusals import refusal
 
 USUAL = {
     **{"batch_size": 64, "beta_entropy": 0.01, "discount_factor": 0.99, "e_greedy_value": 0.05, "epsilon_steps": 10000},
     **{"exploration_type": "categorical", "loss_type": "huber", "lr": 0.0003, "num_episodes_between_training": 20},
-    **{
-        "num_epochs": 5,
-        "stack_size": 1,
-        "term_cond_avg_score": 350.0,
-        "term_cond_max_episodes": 1000,
-        "sac_alpha": 0.2,
-    },
+    **{"num_epochs": 5, "stack_size": 1, "term_cond_avg_score": 350.0, "term_cond_max_episodes": 1000},
+    "sac_alpha": 0.2,
 }
 """A file as DeepRacer has it when nothing was changed."""
 
@@ -99,14 +95,8 @@ def test_a_stack_is_the_frames_of_the_camera() -> None:
         ({"num_epochs": 5.5}, ".num_epochs: expected a whole number from 3 to 10, found 5.5"),
         ({"discount_factor": True}, ".discount_factor: expected a number from 0 to 1, found True"),
         ({"loss_type": "mse"}, ".loss_type: expected one of huber, mean squared error, found 'mse'"),
-        (
-            {"exploration_type": "e-greedy"},
-            ".exploration_type: ppo and sac draw actions from the policy itself; use categorical",
-        ),
-        (
-            {"stack_size": 2},
-            ".stack_size: it stacks images, and the task sees none; use task RacerPixels, or 1",
-        ),
+        ({"exploration_type": "e-greedy"}, ".exploration_type: ppo and sac draw actions from the policy itself; use "),
+        ({"stack_size": 2}, ".stack_size: it stacks images, and the task sees none; use task RacerPixels, or 1"),
         ([1], ": "),
         ("hyperparameters.json", ": a file is read for a job YAML alone; write its settings out"),
     ],
@@ -139,6 +129,7 @@ def test_a_file_of_hyperparameters_is_read_at_the_submission_and_not_needed_agai
     assert spec.train is not None and spec.train.given() == {"learning_rate": 0.0002, "schedule": "fixed"}
     assert spec.notes == ()
     assert "hyperparameters" not in json.dumps(compile_definition(spec, "/"))
+    assert "hyperparameters" in schema()["$defs"]["Train"]["properties"]
     for content, words in (
         ("[", f"racer.yaml:6: train.hyperparameters: {file}: not JSON"),
         ("[1]", f"racer.yaml:6: train.hyperparameters: {file}: not a JSON object"),
@@ -148,10 +139,4 @@ def test_a_file_of_hyperparameters_is_read_at_the_submission_and_not_needed_agai
         file.unlink()
         if content is not None:
             file.write_text(content)
-        with pytest.raises(SpecError) as found:
-            load(str(yaml))
-        assert words in str(found.value) and "\n" not in str(found.value)
-
-
-def test_the_schema_for_editors_has_the_key() -> None:
-    assert "hyperparameters" in schema()["$defs"]["Train"]["properties"]
+        assert words in refusal(load, str(yaml), error=SpecError)

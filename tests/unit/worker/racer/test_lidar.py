@@ -54,11 +54,8 @@ def expected(task: Racer, lidar: LidarConfig) -> np.ndarray:
 
 
 def racer(lidar: LidarConfig, worlds: int = 16) -> Racer:
-    sideways, turned = (-0.5, 0.5), (-3.0, 3.0)
-    config = RacerConfig(
-        obstacles=BOXES, lidar=lidar, start="random", start_sideways=sideways, start_turned=turned, track="oval"
-    )
-    return Racer(config, worlds, seed=5)
+    starts: dict[str, Any] = {"start": "random", "start_sideways": (-0.5, 0.5), "start_turned": (-3.0, 3.0)}
+    return Racer(RacerConfig(obstacles=BOXES, lidar=lidar, track="oval", **starts), worlds, seed=5)
 
 
 def test_every_sector_sees_the_nearest_obstacle_that_numpy_computes() -> None:
@@ -91,6 +88,15 @@ def test_a_lidar_among_deepracer_s_sensors_becomes_the_task_s_lidar(sensor: str,
         assert task.observations[0, 2:].tolist() == [0.0] * 8  # there is no obstacle
 
 
+def sensing(*sensors: str) -> dict[str, Any]:
+    return {"action_space": {"action_space": FIVE, "sensor": [*sensors]}}
+
+
+BLIND = "the policy of this task sees an image alone; use task RacerPixelsAndState"
+TWO = "lidar: the action space has the sensor LIDAR, too; leave one of them out"
+BOTH = "action_space.sensor: a car has one lidar, and there are LIDAR and SECTOR_LIDAR"
+
+
 @pytest.mark.parametrize(
     ("task", "config", "words"),
     [
@@ -98,26 +104,10 @@ def test_a_lidar_among_deepracer_s_sensors_becomes_the_task_s_lidar(sensor: str,
         ("Racer", {"lidar": {"sectors": 0}}, "lidar.sectors: expected a value greater than or equal to 1, found 0"),
         ("Racer", {"lidar": {"least": 1.0}}, "lidar.least: expected less than range (1), found 1"),
         ("Racer", {"lidar": 3}, "lidar: "),
-        (
-            "RacerPixels",
-            {"lidar": {}},
-            "lidar: the policy of this task sees an image alone; use task RacerPixelsAndState",
-        ),
-        (
-            "RacerPixels",
-            {"action_space": {"action_space": FIVE, "sensor": ["LIDAR"]}},
-            "action_space.sensor: the policy of this task sees an image alone; use task RacerPixelsAndState",
-        ),
-        (
-            "Racer",
-            {"action_space": {"action_space": FIVE, "sensor": ["LIDAR"]}, "lidar": {}},
-            "lidar: the action space has the sensor LIDAR, too; leave one of them out",
-        ),
-        (
-            "Racer",
-            {"action_space": {"action_space": FIVE, "sensor": ["LIDAR", "SECTOR_LIDAR"]}},
-            "action_space.sensor: a car has one lidar, and there are LIDAR and SECTOR_LIDAR",
-        ),
+        ("RacerPixels", {"lidar": {}}, f"lidar: {BLIND}"),
+        ("RacerPixels", sensing("LIDAR"), f"action_space.sensor: {BLIND}"),
+        ("Racer", {**sensing("LIDAR"), "lidar": {}}, TWO),
+        ("Racer", sensing("LIDAR", "SECTOR_LIDAR"), BOTH),
     ],
 )
 def test_an_impossible_lidar_is_refused_in_one_line(task: str, config: dict[str, Any], words: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -10,33 +11,20 @@ import pytest
 import torch
 
 from shared_store.layout import Store
+from tests.support.refusals import refusal
+from tests.support.worker.racing import OVAL, counted, known, racer, straight
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.learning.report import figures_of, shown_of
 from worker.racer.generator import make_random
-from worker.racer.geometry import on_road, place_at, project
+from worker.racer.geometry import on_road, place_at
 from worker.racer.naming import keep
-from worker.racer.presets import make_preset
 from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
 from worker.tasks.policy_contract import policy_contract
 from worker.tasks.racer import Racer, RacerPixels, RacerPixelsAndState
 
-OVAL = make_preset("oval")
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]
 DISCRETE = {"action_space": FIVE, "action_space_type": "discrete", "sensor": ["FRONT_FACING_CAMERA"], "version": "5"}
-
-
-def racer(worlds: int = 1, **fields: Any) -> Racer:
-    return Racer(RacerConfig(start=fields.pop("start", "line"), **fields), worlds, seed=3)
-
-
-def known(task: Racer, name: str) -> np.ndarray:
-    found: np.ndarray = getattr(task.sensors["car"].arrays, name).numpy().copy()
-    return found
-
-
-def counted(task: Racer, name: str) -> float:
-    return float(task.statistics[task.statistic_names.index(name)])
 
 
 def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
@@ -44,10 +32,6 @@ def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
     column = task.observation_names.index("waypoint_2_x")
     x, y = task.observations[:, column], task.observations[:, column + 1]
     return torch.stack((torch.atan2(y, x) / 0.5236, torch.full_like(x, speed)), 1)
-
-
-def straight(task: Racer, speed: float = 0.0) -> torch.Tensor:
-    return torch.tensor([[0.0, speed]] * task.world_count)
 
 
 def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
@@ -66,40 +50,6 @@ def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
     assert task.ended.terms[:, task.ended.columns.index("metric_progress")].tolist() == [100.0, 100.0]
 
 
-def test_the_state_of_a_car_agrees_with_the_track_s_geometry() -> None:
-    task = racer(32, track=("oval", "random:4"), start="random", start_sideways=(-0.4, 0.4), alternate_direction=True)
-    random = torch.Generator().manual_seed(4)
-    for step in range(120):
-        task.step(torch.rand(32, 2, generator=random) * 2 - 1)
-        if step % 10:
-            continue
-        poses, which, backwards = (known(task, name) for name in ("poses", "tracks", "backwards"))
-        assert (which == np.arange(32) % 2).all()
-        direction = np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), -1)
-        across = np.stack((-direction[:, 1], direction[:, 0]), -1)
-        for number, track in enumerate(task.circuit.tracks):
-            mine = which == number
-            fronts = poses[mine, :2] + 0.14 * direction[mine]
-            found = project(track, fronts, backwards[mine])
-            np.testing.assert_allclose(known(task, "fronts")[mine], fronts, atol=1e-5)
-            assert (known(task, "before")[mine] == found.before).all()
-            assert (known(task, "after")[mine] == found.after).all()
-            assert (known(task, "left")[mine] == found.left).all()
-            for name, expected in (("distances", found.distance), ("along", found.along), ("widths", found.width)):
-                np.testing.assert_allclose(known(task, name)[mine], expected, atol=1e-4)
-            wheels = [
-                poses[mine, :2] + forward * direction[mine] + sideward * across[mine]
-                for forward in (0.082, -0.082)
-                for sideward in (0.08, -0.08)
-            ]
-            assert (known(task, "wheels")[mine] == sum(on_road(track, wheel).astype(int) for wheel in wheels)).all()
-            corner = task.circuit.corners[number]
-            joints = task.worlds.arrays.joint_q.numpy()[mine]
-            np.testing.assert_allclose(joints[:, :2], poses[mine, :2] + corner, atol=1e-5)
-            np.testing.assert_allclose(joints[:, 2], poses[mine, 2], atol=1e-6)
-    assert known(task, "backwards").any() and counted(task, "episodes") > 10
-
-
 def test_an_episode_ends_when_no_wheel_is_on_the_road_any_more() -> None:
     task = racer(track="oval")
     while not task.dones.any():
@@ -113,27 +63,22 @@ def test_an_episode_ends_when_no_wheel_is_on_the_road_any_more() -> None:
     assert not on_road(OVAL, pose[None, :2] + [0.25, 0.0]).any()
 
 
-def test_a_car_that_stands_for_fifteen_steps_is_immobilized() -> None:
-    task = racer(track="oval", speed_factor=(1e-4, 1e-4))
+@pytest.mark.parametrize(
+    ("end", "speed", "fields"),
+    [
+        ("immobilized", 0.0, {"speed_factor": (1e-4, 1e-4)}),
+        ("reversed", -1.0, {"start_turned": (math.pi, math.pi)}),
+        ("time_out", 0.0, {"episode_seconds": 1.0}),
+    ],
+)
+def test_a_car_that_stands_or_comes_back_or_has_no_time_left_ends_its_episode_in_the_fifteenth_step(
+    end: str, speed: float, fields: dict[str, Any]
+) -> None:
+    task = racer(track="oval", **fields)
     for step in range(1, 16):
-        task.step(straight(task))
-        assert task.dones[0].item() == (step == 15)
-    assert counted(task, "termination_immobilized") == 1
-
-
-def test_a_car_that_comes_back_for_fifteen_steps_is_reversed() -> None:
-    task = racer(track="oval", start_turned=(math.pi, math.pi))
-    for step in range(1, 16):
-        task.step(straight(task, -1.0))
-        assert task.rewards[0] < 0 and task.dones[0].item() == (step == 15)
-    assert counted(task, "termination_reversed") == 1
-
-
-def test_the_clock_ends_an_episode_last() -> None:
-    task = racer(track="oval", episode_seconds=1.0)
-    for step in range(1, 16):
-        task.step(straight(task))
-        assert task.time_outs[0].item() == (step == 15)
+        task.step(straight(task, speed))
+        assert task.dones[0].item() == (step == 15) and (end != "reversed" or task.rewards[0] < 0)
+    assert counted(task, f"termination_{end}") == 1 and task.time_outs[0].item() == (end == "time_out")
 
 
 def test_a_car_that_touches_an_obstacle_has_crashed() -> None:
@@ -225,65 +170,41 @@ def test_continuous_actions_reach_from_end_to_end() -> None:
     assert (speed.scale, speed.offset) == (1.0, 2.0)
 
 
-REFUSED = {
-    "too fast": (
-        {"action_space": {"action_space": [{"steering_angle": 0, "speed": 1}, {"steering_angle": 0, "speed": 5}]}},
-        "config.action_space.action_space.1.speed: expected a number from 0.1 to 4 [m/s], found 5",
+def space(actions: Any, **more: Any) -> dict[str, Any]:
+    return {"action_space": {"action_space": actions, **more}}
+
+
+STILL, SPEEDS, LOW = {"steering_angle": 0, "speed": 1}, {"low": 1, "high": 2}, "config.action_space.action_space"
+REFUSED: dict[str, dict[str, Any]] = {
+    f"{LOW}.1.speed: expected a number from 0.1 to 4 [m/s], found 5": space([STILL, {**STILL, "speed": 5}]),
+    f"{LOW}: expected a list of 2 to 30 actions, found 1": space([STILL]),
+    f"{LOW}.steering_angle.low: expected a number from -30 to 30 [degrees], found -45": space(
+        {"steering_angle": {"low": -45, "high": 30}, "speed": SPEEDS}
     ),
-    "one action": (
-        {"action_space": {"action_space": [{"steering_angle": 0, "speed": 1}]}},
-        "config.action_space.action_space: expected a list of 2 to 30 actions, found 1",
+    f"{LOW}.steering_angle: low is 9 and high is 9; low must be less": space(
+        {"steering_angle": {"low": 9, "high": 9}, "speed": SPEEDS}
     ),
-    "too far": (
-        {
-            "action_space": {
-                "action_space": {"steering_angle": {"low": -45, "high": 30}, "speed": {"low": 1, "high": 2}}
-            }
-        },
-        "config.action_space.action_space.steering_angle.low: expected a number from -30 to 30 [degrees], found -45",
+    f"{LOW}_type: there is no type 'discreet'; did you mean discrete?": space(FIVE, action_space_type="discreet"),
+    f"{LOW}_type: it is continuous, and action_space is a list of actions; they must fit": space(
+        FIVE, action_space_type="continuous"
     ),
-    "the wrong way round": (
-        {"action_space": {"action_space": {"steering_angle": {"low": 9, "high": 9}, "speed": {"low": 1, "high": 2}}}},
-        "config.action_space.action_space.steering_angle: low is 9 and high is 9; low must be less",
-    ),
-    "no such type": (
-        {"action_space": {**DISCRETE, "action_space_type": "discreet"}},
-        "config.action_space.action_space_type: there is no type 'discreet'; did you mean discrete?",
-    ),
-    "another type": (
-        {"action_space": {**DISCRETE, "action_space_type": "continuous"}},
-        "config.action_space.action_space_type: it is continuous, and action_space is a list of actions; they must fit",
-    ),
-    "no such sensor": (
-        {"action_space": {**DISCRETE, "sensor": ["STEREO_CAMERAS"]}},
-        "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA, LIDAR, SECTOR_LIDAR, DISCRETIZED_SECTOR_LIDAR",
-    ),
-    "a key too many": (
-        {"action_space": {"action_space": [{"steering": 0, "speed": 1}] * 2}},
-        "config.action_space.action_space.0: there is no key 'steering'; did you mean steering_angle?",
-    ),
-    "no lane": (
-        {"obstacles": [{"distance": 1.0, "lane": "left"}]},
-        "config.obstacles.0.lane: expected 'inner', 'center' or 'outer', found 'left'",
-    ),
-    "mass": (
-        {"randomize": {"mass": [0.5, 2]}},
-        "config.randomize.mass: the car moves as a kinematic bicycle, without an engine's contacts; use "
-        "train.config.speed_factor, steering_factor and steering_offset",
-    ),
-    "a push": (
-        {"randomize": {"push_interval": 1.0, "push_velocity": 1.0}},
-        "config.randomize.push_interval: nothing can push a car that moves as a kinematic bicycle",
-    ),
+    "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA, LIDAR, "
+    "SECTOR_LIDAR, DISCRETIZED_SECTOR_LIDAR": space(FIVE, sensor=["STEREO_CAMERAS"]),
+    f"{LOW}.0: there is no key 'steering'; did you mean steering_angle?": space([{"steering": 0, "speed": 1}] * 2),
+    "config.obstacles.0.lane: expected 'inner', 'center' or 'outer', found 'left'": {
+        "obstacles": [{"distance": 1.0, "lane": "left"}]
+    },
+    "config.randomize.mass: the car moves as a kinematic bicycle, without an engine's contacts; use "
+    "train.config.speed_factor, steering_factor and steering_offset": {"randomize": {"mass": [0.5, 2]}},
+    "config.randomize.push_interval: nothing can push a car that moves as a kinematic bicycle": {
+        "randomize": {"push_interval": 1.0, "push_velocity": 1.0}
+    },
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_an_impossible_car_is_refused_in_one_line_before_anything_is_built(case: str) -> None:
-    overrides, message = REFUSED[case]
-    with pytest.raises(UserError) as refused:
-        configure(Racer, {"config": overrides})
-    assert str(refused.value).removeprefix("train.") == message
+@pytest.mark.parametrize("message", REFUSED)
+def test_an_impossible_car_is_refused_in_one_line_before_anything_is_built(message: str) -> None:
+    assert refusal(configure, Racer, {"config": REFUSED[message]}, error=UserError).removeprefix("train.") == message
 
 
 def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) -> None:
@@ -295,9 +216,7 @@ def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) 
             "config.obstacles.0.distance: 20.5 m is beyond the end of track oval, which is 20.00 m long",
         ),
     ):
-        with pytest.raises(ValueError) as refused:
-            Racer.sketch(RacerConfig(**fields))
-        assert message in str(refused.value) and "\n" not in str(refused.value)
+        assert message in refusal(Racer.sketch, RacerConfig(**fields))
     (tmp_path / "model_metadata.json").write_text('{"action_space": [')
     with pytest.raises(ValueError, match="it is not JSON"):
         RacerConfig(action_space=str(tmp_path / "model_metadata.json")).actions()
@@ -314,8 +233,6 @@ def test_a_track_of_the_store_is_found_by_the_ranks_of_a_job(tmp_path: Any, monk
 
 
 def test_a_metadata_file_is_equal_to_its_content_in_the_configuration(tmp_path: Any) -> None:
-    import json
-
     file = tmp_path / "model_metadata.json"
     file.write_text(json.dumps(DISCRETE))
     assert RacerConfig(action_space=str(file)).actions() == RacerConfig(action_space=DISCRETE).actions()
@@ -363,22 +280,12 @@ def test_a_policy_means_the_same_on_another_track_and_by_other_rules() -> None:
 def test_a_bundle_has_the_actions_and_the_sensors_as_deepracer_names_them() -> None:
     task = racer(action_space={**DISCRETE, "sensor": ["SECTOR_LIDAR"]})
     found = task.bundle_documents("ppo")["model_metadata.json"]
-    assert found == {
-        "action_space": FIVE,
-        "action_space_type": "discrete",
-        "sensor": ["SECTOR_LIDAR"],
-        "training_algorithm": "clipped_ppo",
-        "version": "5",
-    }
+    assert found == {**DISCRETE, "sensor": ["SECTOR_LIDAR"], "training_algorithm": "clipped_ppo"}
     again = racer(action_space=found)  # it is an action space for the next training, too
     assert again.actions_of_car == task.actions_of_car
     usual = racer().bundle_documents("mine:Algorithm")["model_metadata.json"]
-    assert usual == {
-        "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}},
-        "action_space_type": "continuous",
-        "sensor": [],
-        "version": "5",
-    }
+    ranges = {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}}
+    assert usual == {"action_space": ranges, "action_space_type": "continuous", "sensor": [], "version": "5"}
 
 
 def test_a_training_of_a_racer_shows_the_mean_progress_of_its_episodes() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.unit.worker.racer.test_racer import OVAL, counted, known, racer, straight
+from tests.support.worker.racing import OVAL, counted, known, racer, straight
 from worker.racer.geometry import place_at, project
 from worker.racer.resets import COUNTS
 from worker.racer.trace import COLUMNS
@@ -73,7 +73,7 @@ def test_progress_is_earned_once_however_often_a_car_is_put_back() -> None:
     assert earned == pytest.approx(progress, abs=1e-2)
 
 
-def test_a_car_that_crashed_is_put_into_a_lane_without_a_box() -> None:
+def test_a_car_that_crashed_is_put_into_a_lane_without_a_box_or_on_the_centre_line_where_none_is_clear() -> None:
     task = continuous(obstacles=(ObstacleConfig(1.5, "center"),))
     steps = until_put(task, straight(task))
     along = traced(task, "x") - OVAL.center[0, 0]  # on a straight along x, from the start line
@@ -85,13 +85,9 @@ def test_a_car_that_crashed_is_put_into_a_lane_without_a_box() -> None:
     for _ in range(2 * steps):
         task.step(straight(task))
     assert counts(task)["crashed"] == 1 and known(task, "along")[0] > 1.8  # it drove past
-
-
-def test_a_car_is_put_on_the_centre_line_where_no_lane_is_clear() -> None:
-    boxes = tuple(ObstacleConfig(1.5, lane) for lane in ("inner", "center", "outer"))
-    task = continuous(obstacles=boxes)
-    until_put(task, straight(task))
-    assert known(task, "poses")[0, 1] == pytest.approx(OVAL.center[0, 1], abs=1e-4)
+    full = continuous(obstacles=tuple(ObstacleConfig(1.5, lane) for lane in ("inner", "center", "outer")))
+    until_put(full, straight(full))
+    assert known(full, "poses")[0, 1] == pytest.approx(OVAL.center[0, 1], abs=1e-4)
 
 
 def test_a_car_that_stands_or_comes_back_is_put_back_after_fifteen_steps() -> None:

@@ -5,25 +5,21 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
 
 from tests.conftest import REPOSITORY
+from tests.support.refusals import refusal
 from worker.racer.rewards import parameters
 from worker.racer.rewards import reward as reward_module
-from worker.racer.rewards.compiled import RaceArrays, kernels, race_arrays, told_errors, warp_function
+from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
 from worker.racer.rewards.problems import Failure, RewardRefused
 from worker.racer.rewards.reward import RewardFunction
 from worker.racer.rewards.samples import oval, samples
 from worker.racer.rewards.translation import Outside, Translated, translate
-from worker.simulation.sensors.sensor import SensorContext
-from worker.tasks import Declaration, DeclaredTask, Reward, Robot, TaskConfig, reward_weights, terms
 
 VALUES = (-2.5, -2.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.5, 7.0, 1e6)
 """Of x; y is the same list backwards."""
@@ -188,9 +184,8 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
     ],
 )
 def test_code_outside_the_subset_is_refused_with_line_and_reason(body: str, reason: str) -> None:
-    with pytest.raises(Outside) as outside:
-        translate(f"{HEAD}    {body}\n")
-    assert str(outside.value) == f"{reason}: such functions run in Python workers"
+    said = refusal(translate, f"{HEAD}    {body}\n", error=Outside)
+    assert said == f"{reason}: such functions run in Python workers"
 
 
 def test_a_function_that_would_be_enormous_is_outside() -> None:
@@ -252,63 +247,3 @@ def test_a_function_compiles_in_a_process_that_has_used_no_warp_yet() -> None:
 def test_code_that_the_guard_refuses_does_not_run() -> None:
     with pytest.raises(RewardRefused, match=r"^r\.py:1: IMPORT_ERROR: os can't be imported"):
         RewardFunction(f"import os\n{SOURCE}", TRACKS, 2, file="r.py")
-
-
-class RaceSensor:
-    """In place of the racer's simulator: it gives the task its arrays, here filled with samples."""
-
-    arrays_type = RaceArrays
-    needs_bodies = False
-    names: tuple[str, ...] = ()
-
-    def rows(self, views: Any) -> list[str]:
-        return []
-
-    def build(self, context: SensorContext) -> RaceSensor:
-        self.arrays = race_arrays(len(samples()), TRACKS, context.device)
-        return self
-
-    def advance(self) -> None:
-        numbers = self.arrays.numbers.numpy()
-        for world, params in enumerate(samples().values()):
-            numbers[world], _ = parameters.row_of(params)
-
-    def settle(self) -> None:
-        pass
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        return {}
-
-
-@dataclass(frozen=True)
-class CarConfig(TaskConfig):
-    rewards: Mapping[str, float] = reward_weights(learner=2.0)
-
-
-class Car(DeclaredTask):
-    config_type = CarConfig
-    solver_options = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
-
-    def robot(self, config: CarConfig) -> Robot:
-        return Robot(
-            '<mujoco><worldbody><body><joint name="j" type="hinge"/><geom size="0.1"/></body></worldbody>'
-            '<actuator><motor joint="j"/></actuator></mujoco>'
-        )
-
-    def declare(self, config: CarConfig) -> Declaration:
-        from worker.tasks import Action, Observation
-
-        function = warp_function(translate("def reward_function(params):\n    return params['speed'] + 1\n").snippet)
-        return Declaration(
-            actions={"motor": Action(terms.effort)},
-            observations={"velocity": Observation(terms.joint_velocity)},
-            rewards={"learner": Reward(function)},
-            sensors={"race": RaceSensor()},
-        )
-
-
-def test_a_compiled_function_is_a_reward_term_of_a_declared_task() -> None:
-    task = Car(CarConfig(), len(samples()), seed=1, device="cpu")
-    task.reset()
-    task.step(torch.zeros_like(task.actions))
-    assert task.rewards.tolist() == pytest.approx([2.0 * (params["speed"] + 1.0) for params in samples().values()])

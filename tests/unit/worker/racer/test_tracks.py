@@ -1,16 +1,23 @@
-"""Made tracks: measures by hand, fifty seeds, the same bytes everywhere; and what is refused as a track."""
+"""Made tracks: measures by hand, fifty seeds, the same bytes everywhere; names and pictures of tracks; what is refused as one."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from shared_store.layout import Store
+from tests.support.refusals import refusal
 from worker.racer.checks import BadTrack, area_of, inside
 from worker.racer.generator import make_random
 from worker.racer.geometry import on_road
+from worker.racer.naming import keep, resolve
+from worker.racer.picture import picture_of
 from worker.racer.presets import PRESETS, make_preset
 from worker.racer.route_file import to_bytes
 from worker.racer.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
@@ -109,9 +116,7 @@ def test_a_drawn_track_has_the_requested_measures() -> None:
     ],
 )
 def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(asked: dict[str, object], words: str) -> None:
-    with pytest.raises(BadTrack) as told:
-        make_random(1, **asked)  # type: ignore[arg-type]
-    assert words in str(told.value) and "\n" not in str(told.value)
+    assert words in refusal(make_random, 1, error=BadTrack, **asked)
 
 
 def test_a_preset_that_is_too_short_for_its_width_says_how_wide_it_may_be() -> None:
@@ -163,9 +168,7 @@ def changed(name: str, row: int, x: float, y: float) -> dict[str, np.ndarray]:
     ],
 )  # fmt: skip
 def test_rings_that_are_no_track_are_refused_with_row_and_place(rings: dict[str, np.ndarray], words: str) -> None:
-    with pytest.raises(BadTrack) as told:
-        Track("bad", **rings)
-    assert words in str(told.value) and "\n" not in str(told.value)
+    assert words in refusal(Track, "bad", **rings, error=BadTrack)
 
 
 def test_a_hairpin_may_turn_about_one_point_of_its_inner_border() -> None:
@@ -189,3 +192,47 @@ def test_every_preset_can_be_driven_both_ways() -> None:
         assert (there.direction, back.direction) == (COUNTER_CLOCKWISE, CLOCKWISE)
         np.testing.assert_array_equal(there.center[0], back.center[0])
         np.testing.assert_array_equal(there.inner[1:], back.inner[:0:-1])
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store").open()
+
+
+def test_a_name_means_a_preset_a_seed_or_a_track_of_the_store(store: Store) -> None:
+    kept = make_random(5, "hills", length=40.0)
+    keep(store, kept, {"seed": 5})
+    assert resolve("oval", None).digest == make_preset("oval").digest
+    assert resolve("random:7", None).digest == make_random(7).digest
+    found = resolve("hills", store)
+    assert (found.name, found.digest) == ("hills", kept.digest)
+    with pytest.raises(BadTrack, match="track oval: a preset is called so; choose another name"):
+        keep(store, make_random(1, "oval"), {})
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("ovall", "track 'ovall': there is no such track; did you mean oval?"),
+        ("hils", "did you mean hills?"),
+        ("random", "did you mean random:7?"),
+        ("random:x", "after random: stands a whole number from 0 to 9223372036854775807, such as random:7"),
+        ("random:-1", "after random: stands a whole number"),
+        (f"random:{2**63}", "after random: stands a whole number"),
+        ("random:" + "9" * 9999, "after random: stands a whole number"),
+        ("../hills", "there is no such track"),
+        ("q\nq", "track 'q\\nq': there is no such track; there are oval, rounded-rectangle, chicane, hills, random:7"),
+    ],
+)
+def test_a_name_that_means_nothing_is_refused_with_the_nearest_one(store: Store, name: str, words: str) -> None:
+    keep(store, make_preset("oval", "hills"), {})
+    assert words in refusal(resolve, name, store, error=BadTrack)
+
+
+def test_a_picture_has_the_shape_of_its_track() -> None:
+    long, tall = (Image.open(io.BytesIO(picture_of(make_preset(name)))) for name in ("chicane", "oval"))
+    assert long.format == "PNG" and long.width > 1.4 * long.height
+    assert tall.width / tall.height < long.width / long.height
+    colours = {tuple(pixel) for _, pixel in long.convert("RGB").getcolors(1 << 20)}
+    for drawn in ((0xD9, 0xDC, 0xE1), (0xC0, 0x20, 0x2A)):  # asphalt, start line
+        assert min(sum(abs(a - b) for a, b in zip(drawn, each, strict=True)) for each in colours) < 24, drawn

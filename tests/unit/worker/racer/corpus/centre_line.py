@@ -1,6 +1,3 @@
-"""Three bands around the centre line."""
-
-
 def reward_function(params):
     track_width = params["track_width"]
     distance_from_center = params["distance_from_center"]

@@ -1,5 +1,3 @@
-"""The closest waypoint by its distance, with min and a key."""
-
 import math
 
 

@@ -1,5 +1,3 @@
-"""How much the next waypoints turn decides the speed."""
-
 import math
 
 

@@ -1,5 +1,3 @@
-"""Progress, growing."""
-
 import math
 
 

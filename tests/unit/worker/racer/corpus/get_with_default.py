@@ -1,6 +1,3 @@
-"""Keys read with get, tested with in."""
-
-
 def reward_function(params):
     speed = params.get("speed", 1.0)
     bonus = params.get("bonus", 0.25)

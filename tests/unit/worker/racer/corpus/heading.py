@@ -1,5 +1,3 @@
-"""Look along the track: the direction between the closest waypoints."""
-
 import math
 
 

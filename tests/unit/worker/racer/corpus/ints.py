@@ -1,6 +1,3 @@
-"""Whole numbers, remainders and integer division."""
-
-
 def reward_function(params):
     steps = params["steps"]
     angle = int(params["steering_angle"])

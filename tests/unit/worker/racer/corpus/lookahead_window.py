@@ -1,5 +1,3 @@
-"""The mean direction of a window of waypoints, with a default argument."""
-
 import math
 
 WINDOW = 5

@@ -1,5 +1,3 @@
-"""NumPy, for numbers one at a time."""
-
 import numpy as np
 
 

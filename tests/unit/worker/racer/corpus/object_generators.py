@@ -1,5 +1,3 @@
-"""The same in one line each."""
-
 import math
 
 

@@ -1,5 +1,3 @@
-"""Keep the lane, and away from the next object in the same lane."""
-
 import math
 
 

@@ -1,6 +1,3 @@
-"""Progress over steps, and a bonus for a lap."""
-
-
 def reward_function(params):
     TOTAL_NUM_STEPS = 300
     steps = params["steps"]

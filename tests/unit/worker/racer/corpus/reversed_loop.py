@@ -1,5 +1,3 @@
-"""Waypoints behind the car, counted backwards."""
-
 import math
 
 

@@ -1,6 +1,3 @@
-"""Distance to the segment between the closest waypoints."""
-
-
 def project(px, py, ax, ay, bx, by):
     length = (bx - ax) ** 2 + (by - ay) ** 2
     if length == 0:

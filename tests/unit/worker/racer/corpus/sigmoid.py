@@ -1,5 +1,3 @@
-"""A smooth mixture."""
-
 from math import exp, pi, radians
 
 

@@ -1,5 +1,3 @@
-"""Bands of speed, as a dictionary of constants."""
-
 BANDS = [(0.0, 0.1), (1.0, 0.4), (2.0, 0.8), (3.0, 1.2)]
 PENALTY = 0.7 * 0.5
 MAX_STEERING = 30.0

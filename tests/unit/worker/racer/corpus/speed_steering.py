@@ -1,5 +1,3 @@
-"""Fast on straights, slow where it steers; a table of speeds."""
-
 SPEEDS = {0: 3.5, 15: 2.0, 30: 1.2}
 
 

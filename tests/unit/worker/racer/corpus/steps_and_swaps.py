@@ -1,6 +1,3 @@
-"""Swaps, several targets and augmented assignments."""
-
-
 def reward_function(params):
     low, high = params["speed"], params["distance_from_center"] * 4
     if low > high:

@@ -1,6 +1,3 @@
-"""A sum of parts, each in a function with params."""
-
-
 def distance_reward(params):
     half = params["track_width"] / 2
     return (1.0 - min(params["distance_from_center"], half) / half) ** 2

@@ -1,5 +1,3 @@
-"""Steer towards a point ahead of the car, as pure pursuit does."""
-
 import math
 
 

@@ -1,6 +1,3 @@
-"""The objects in front and behind by their headings and speeds."""
-
-
 def reward_function(params):
     reward = 1.0
     if not params["objects_location"]:

@@ -1,5 +1,3 @@
-"""A while with break and continue."""
-
 import math
 
 

@@ -1,4 +1,4 @@
-"""The tasks as Gymnasium vector environments."""
+"""The tasks as Gymnasium's vector environments and as one of rsl_rl: what is copied, what is logged, the clocks."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from collections.abc import Iterator
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_space_limit
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
+from tests.support.worker.rsl_loop import Seen
 from worker.tasks import BUILT_IN
+from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.rsl_rl_env import TaskVecEnv
 
 WORLDS = 8
 
@@ -46,18 +50,6 @@ def test_reset_honours_the_seed(env: VectorEnv) -> None:
     assert len({row.tobytes() for row in first}) == WORLDS, "every world starts differently"
     with pytest.raises(ValueError, match="seed is -1"):
         env.reset(seed=-1)
-
-
-def test_same_seed_and_actions_give_the_same_history(env: VectorEnv) -> None:
-    env.action_space.seed(3)
-    actions = [env.action_space.sample() for _ in range(40)]
-    histories = []
-    for _ in range(2):
-        env.reset(seed=11)
-        histories.append([env.step(action)[:4] for action in actions])
-    for left, right in zip(*histories, strict=True):
-        for a, b in zip(left, right, strict=True):
-            assert np.array_equal(a, b)
 
 
 def test_same_step_reset_keeps_the_final_observation(env: VectorEnv) -> None:
@@ -120,6 +112,9 @@ def test_every_built_in_task_has_its_id() -> None:
     *_, terminations, truncations, _ = made.step(made.action_space.sample())
     assert not terminations.any() and not truncations.any()
     made.close()
+    made = gymnasium.make_vec("Muster/Cartpole-v0", num_envs=2, rewards={"alive": 5.0})
+    assert made.unwrapped.task.config.rewards == {**CartpoleConfig().rewards, "alive": 5.0}
+    made.close()
 
 
 def test_mistakes_are_named(env: VectorEnv) -> None:
@@ -127,5 +122,37 @@ def test_mistakes_are_named(env: VectorEnv) -> None:
         env.step(np.zeros((WORLDS + 1, 1), np.float32))
     with pytest.raises(ValueError, match="no setting speed"):
         gymnasium.make_vec("Muster/Cartpole-v0", num_envs=2, speed=3)
+    with pytest.raises(ValueError, match="did you mean alive"):
+        gymnasium.make_vec("Muster/Cartpole-v0", num_envs=2, rewards={"alife": 5.0})
     with pytest.raises(ValueError, match="reset_mask"):
         env.reset(options={"reset_mask": np.ones(WORLDS, bool)})
+
+
+def test_an_environment_hands_out_copies_in_floats() -> None:
+    task = Seen(seed=3)
+    env = TaskVecEnv(task)  # type: ignore[arg-type]
+    first = env.get_observations()
+    image = first["image"].clone()
+    assert list(first.keys()) == ["policy", "critic", "place", "image"] and image.dtype == torch.float32
+    assert {float(image.min()), float(image.max())} == {-0.5, 0.5}
+    observations, rewards, dones, extras = env.step(torch.ones(8, 1))
+    assert torch.equal(first["image"], image) and not torch.equal(observations["policy"], first["policy"])
+    assert rewards.data_ptr() != task.rewards.data_ptr() and dones.dtype == torch.int64
+    assert extras["time_outs"].dtype == torch.float32 and "log" not in extras
+    assert env.unwrapped.step_dt == pytest.approx(0.1) and env.cfg["control_hz"] == 10.0
+
+
+def test_an_environment_logs_what_the_terms_of_the_reward_came_to_and_its_clock_is_that_of_the_task() -> None:
+    task = Seen(seed=3)
+    env = TaskVecEnv(task)  # type: ignore[arg-type]
+    returns = torch.zeros(8)
+    for _ in range(5):
+        *_, dones, extras = env.step(torch.zeros(8, 1))
+        returns += task.rewards
+    assert dones.bool().all()  # episodes of 0.5 s
+    torch.testing.assert_close(extras["log"]["reward_place"], returns.mean().expand(8))
+    buffer = task.episode_length
+    env.episode_length_buf = torch.tensor([4, 3, 2, 1, 0, 0, 0, 0])
+    *_, dones, extras = env.step(torch.zeros(8, 1))
+    assert dones.tolist() == [1, 0, 0, 0, 0, 0, 0, 0] and extras["time_outs"].tolist() == dones.tolist()
+    assert task.episode_length is buffer and env.episode_length_buf.tolist() == [0, 4, 3, 2, 1, 1, 1, 1]

@@ -1,4 +1,4 @@
-"""The line between a gang's nodes: how the main node learns of its children's ends."""
+"""The line between a gang's nodes, and what a node of a Slurm job makes of its surroundings."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import time
 
 import pytest
 
-from shared_store.contract import NodeContract
+from shared_store.contract import NodeContract, job_variables
 from tests.conftest import wait_for
 from worker.node import lifeline
 from worker.node.lifeline import ChildEnd, Loss, MainEnd
+from worker.node.slurm import environment_of
 
 
 def contract(node: int, nodes: int, address: str) -> NodeContract:
@@ -75,3 +76,12 @@ def test_a_child_that_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     child = ChildEnd(contract(1, 3, "127.91.0.3"))
     child.attach()
     assert heard(main).reason.startswith("node 2 has not come within")
+
+
+def test_a_node_gets_slurms_variables_but_not_the_token_that_its_controller_called_sbatch_with() -> None:
+    contract = NodeContract("job", 1, 0, 1, 0, "127.0.0.1", 29500, "run", "/store", 1, 1)
+    told = {"kind": [0], "kinds": [{"environment": {"LEVEL": "3"}}]}
+    found = environment_of(told, contract, {"SLURM_JWT": "secret", "SLURM_NNODES": "2", "PATH": "/bin"})
+    assert "secret" not in found.values()
+    assert (found["SLURM_NNODES"], found["MUSTER_RUN"]) == ("2", "run")
+    assert job_variables(found) == {"LEVEL": "3"}
