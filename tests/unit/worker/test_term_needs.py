@@ -18,6 +18,7 @@ from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.sensors.imu import Imu
 from worker.tasks import Action, Choice, Command, Event, Metric, Observation, Robot, Term, WorldArrays, terms
+from worker.tasks.binding import has_columns
 
 TURN = (-1.0, 1.0)
 VELOCITIES: Mapping[str, Any] = {"names": ("a", "b", "c"), "forward": TURN, "left": TURN, "turn": TURN}
@@ -132,6 +133,25 @@ def test_sensors_of_a_term_have_as_many_columns() -> None:
     wanted = r"foot_slide needs as many columns of each of its sensors; feet has 2 and soles has 1$"
     with pytest.raises(ValueError, match=wanted):
         sliders(sensors=sensors, metrics={"slide": Metric(terms.foot_slide)}).sketch(SlidersConfig())
+
+
+@wp.struct
+class Called:
+    values: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class Subscripted:
+    values: wp.array2d[wp.float32]
+
+
+@wp.struct
+class RowsAlone:
+    values: wp.array[wp.vec3]
+
+
+def test_both_notations_of_an_array_tell_the_columns_of_a_sensor() -> None:
+    assert [has_columns(kind) for kind in (Called, Subscripted, RowsAlone)] == [True, True, False]
 
 
 def refused(message: str, **sections: Any) -> None:
