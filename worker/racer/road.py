@@ -266,10 +266,10 @@ def road_arrays(tracks: Sequence[Track], corners: np.ndarray, device: str) -> Ro
         device: ``"cpu"`` or ``"cuda:<n>"``.
     """
 
-    def floats(values: Any, dtype: Any = wp.float32) -> wp.array:
+    def floats(values: Any, dtype: Any = wp.float32) -> wp.array[Any]:
         return wp.array(np.asarray(values, np.float32), dtype=dtype, device=device)
 
-    def joined(name: str, dtype: Any = wp.float32) -> wp.array:
+    def joined(name: str, dtype: Any = wp.float32) -> wp.array[Any]:
         return floats(np.concatenate([getattr(track, name) for track in tracks]), dtype)
 
     counts = [len(track.center) for track in tracks]

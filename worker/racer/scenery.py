@@ -69,8 +69,9 @@ def add_scenery(builder: newton.ModelBuilder, circuit: Circuit) -> None:
                 wp.vec3(x + corner[0], y + corner[1], BOX[2] / 2),
                 wp.quat_from_axis_angle(wp.vec3(0, 0, 1), float(heading)),
             )
-            half = {"hx": BOX[0] / 2, "hy": BOX[1] / 2, "hz": BOX[2] / 2}
-            builder.add_shape_box(-1, xform=place, **half, cfg=_seen(), color=CARDBOARD, label=f"box_{number}_{box}")
+            x, y, z = (length / 2 for length in BOX)
+            label = f"box_{number}_{box}"
+            builder.add_shape_box(-1, xform=place, hx=x, hy=y, hz=z, cfg=_seen(), color=CARDBOARD, label=label)
 
 
 def _seen() -> newton.ModelBuilder.ShapeConfig:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import newton
 import warp as wp
@@ -24,6 +24,9 @@ FREQUENCY = "mujoco:actuator"
 
 Number = float | Mapping[str, float]
 """One number for all joints of an actuator, or numbers by joint pattern; the first matching pattern wins."""
+
+Input = Literal["effort", "position", "velocity"]
+"""What an actuator takes."""
 
 MOTOR_ATTRIBUTES = {
     "explicit": (wp.int32, 0),

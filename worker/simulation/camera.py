@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import newton
 import torch
@@ -144,11 +144,11 @@ def renderer(model: newton.Model, samples: int) -> SensorCamera:
 
 def look(position: Sequence[float], target: Sequence[float]) -> wp.transformf:
     """Pose of a camera at ``position`` that looks at ``target`` along its own -z, with its +y as close to +z as possible [m]."""
-    back = wp.normalize(wp.vec3f(*position) - wp.vec3f(*target))
-    upward = wp.vec3f(0.0, 1.0, 0.0) if abs(back[2]) > 0.999 else wp.vec3f(0.0, 0.0, 1.0)
-    right = wp.normalize(wp.cross(upward, back))
-    up = wp.cross(back, right)
-    return wp.transformf(wp.vec3f(*position), wp.quat_from_matrix(wp.matrix_from_cols(right, up, back)))
+    back: Any = wp.normalize(wp.vec3(*position) - wp.vec3(*target))  # Any: to Warp's annotations it has no items
+    upward = wp.vec3(0.0, 1.0, 0.0) if abs(back[2]) > 0.999 else wp.vec3(0.0, 0.0, 1.0)
+    right: Any = wp.normalize(wp.cross(upward, back))
+    up: Any = wp.cross(back, right)
+    return wp.transform(wp.vec3(*position), wp.quat_from_matrix(wp.matrix_from_cols(right, up, back)))
 
 
 def shapes_of_worlds(model: newton.Model) -> int:
@@ -163,7 +163,7 @@ def paint(worlds: Worlds, episodes: EpisodeArrays, amount: float) -> None:
     wp.launch(_paint, dim=count, inputs=[amount, episodes], outputs=[colors], device=worlds.model.device)
 
 
-def draw_light(ends: Sequence[float], episodes: EpisodeArrays, light: wp.array) -> None:
+def draw_light(ends: Sequence[float], episodes: EpisodeArrays, light: wp.array[wp.float32]) -> None:
     """Draw how bright each world is, the same for all its cameras, shape ``(worlds,)``."""
     wp.launch(_draw_light, dim=light.shape, inputs=[wp.vec2(*ends), episodes, light], device=light.device)
 

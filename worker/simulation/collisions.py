@@ -177,8 +177,8 @@ def _values(builder: newton.ModelBuilder, name: str) -> dict[int, Any]:
     attribute = builder.custom_attributes[f"mujoco:{name}"]
     if attribute.values is None:
         attribute.values = {}
-    values: Any = attribute.values
-    return values
+    assert isinstance(attribute.values, dict)  # a list belongs to an attribute with a frequency of its own
+    return attribute.values
 
 
 def _set_masks(builder: newton.ModelBuilder, shape: int, contype: int, conaffinity: int) -> None:

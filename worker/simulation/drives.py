@@ -74,7 +74,7 @@ class Drives:
     """
 
     def __init__(self, model: newton.Model, solver: SolverMuJoCo, world_count: int) -> None:
-        attributes: Any = model.muster
+        attributes: Any = vars(model)["muster"]
         self._attributes, device = attributes, model.device
         data, compiled = solver.mjw_data, solver.mj_model
         shape = (world_count, compiled.nu)
@@ -90,7 +90,7 @@ class Drives:
         references = np.where(explicit, compiled.qpos0[compiled.jnt_qposadr[joints]], 0.0)
         self._references = wp.array(references, dtype=wp.float32, device=device)
 
-        def rows(columns: Any, width: int) -> wp.array:
+        def rows(columns: Any, width: int) -> wp.array[wp.uint32]:
             of_worlds = np.arange(world_count)[:, None] * width + columns
             return wp.array(of_worlds.ravel(), dtype=wp.uint32, device=device)
 
@@ -134,7 +134,7 @@ class Drives:
         if self._has_motors:
             self._actuator.step(self._state, self._control)
 
-    def settle(self, ages: wp.array) -> None:
+    def settle(self, ages: wp.array[wp.int32]) -> None:
         """Forget the inputs of worlds whose episode begins (``ages[world] == 0``)."""
         wp.launch(_forget, dim=self.controls.shape, inputs=[ages, self._pushes], device=self.controls.device)
 

@@ -15,6 +15,7 @@ import mujoco
 import newton
 import numpy as np
 import warp as wp
+from newton.solvers import SolverMuJoCo
 
 from worker.simulation.worlds import Worlds
 
@@ -68,7 +69,7 @@ class Inertials:
 class Scratch:
     """Scratch memory for one pass through the tree, leading dimension worlds."""
 
-    matrices: wp.array2d[wp.spatial_matrix]
+    matrices: wp.array2d[wp.spatial_matrixf]
     forces: wp.array2d[wp.spatial_vectorf]
     diagonal: wp.array2d[wp.float32]
 
@@ -199,8 +200,8 @@ class InverseWeights:
         device, worlds_there = worlds.model.device, worlds.world_count
         self._tree = _tree(model, solver.mjw_model.qpos0.numpy()[0], device)
         self._scratch = Scratch()
-        self._scratch.matrices = wp.zeros((worlds_there, model.nbody), dtype=wp.spatial_matrix, device=device)
-        self._scratch.forces = wp.zeros((worlds_there, model.nv), dtype=wp.spatial_vector, device=device)
+        self._scratch.matrices = wp.zeros((worlds_there, model.nbody), dtype=wp.spatial_matrixf, device=device)
+        self._scratch.forces = wp.zeros((worlds_there, model.nv), dtype=wp.spatial_vectorf, device=device)
         self._scratch.diagonal = wp.zeros((worlds_there, model.nv), dtype=wp.float32, device=device)
         self._inertials = Inertials()
         for name, field in {
@@ -215,9 +216,9 @@ class InverseWeights:
         }.items():
             setattr(self._inertials, name, getattr(solver.mjw_model, field))
 
-    def update(self, changed: wp.array) -> None:
+    def update(self, changed: wp.array[wp.bool]) -> None:
         """Launches that bring the worlds with ``changed`` (shape ``(worlds,)``, bool) up to date; they can be captured."""
-        solver = self._worlds.solver
+        solver: SolverMuJoCo = self._worlds.solver
         if self.whole:
             solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
             return
@@ -256,7 +257,7 @@ def _tree(model: mujoco.MjModel, reference: np.ndarray, device: wp.Device) -> Tr
     tree.welded = wp.array(model.body_weldid == 0, dtype=wp.bool, device=device)
     tree.positions = wp.array(data.xpos - origins, dtype=wp.vec3, device=device)
     tree.rotations = wp.array(np.roll(data.xquat, -1, axis=1), dtype=wp.quat, device=device)
-    tree.axes = wp.array(np.hstack([angular, linear]), dtype=wp.spatial_vector, device=device)
+    tree.axes = wp.array(np.hstack([angular, linear]), dtype=wp.spatial_vectorf, device=device)
     tree.group_firsts = wp.array(firsts, dtype=wp.int32, device=device)
     tree.group_counts = wp.array(counts, dtype=wp.int32, device=device)
     return tree

@@ -54,7 +54,7 @@ def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str
     if not isinstance(values, Mapping):
         return [values] * len(names)
     resolved: list[Value | None] = [None] * len(names)
-    for pattern, value in reversed(values.items()):
+    for pattern, value in reversed(list(values.items())):
         for index in find(names, pattern, what):
             resolved[index] = value
     return resolved

@@ -7,7 +7,7 @@ a run resumes bit for bit and its worlds are the same on any number of ranks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import newton
 import torch
@@ -121,7 +121,7 @@ class Randomizer:
         self._push_probability = min(1.0, 1.0 / (config.push_interval * control_hz)) if config.push_interval else 0.0
         count, actuators = worlds.arrays.controls.shape
         self._delays = wp.zeros(count, dtype=wp.int32, device=self._device)
-        self._noise = wp.array(noise, dtype=wp.float32, device=self._device) if any(noise) else None
+        self._noise = wp.array(list(noise), dtype=wp.float32, device=self._device) if any(noise) else None
         slots = config.action_latency + 1 if config.action_latency else 0
         self._history = wp.zeros((count, slots * actuators), dtype=wp.float32, device=self._device)
         factors = wp.ones((count, len(FACTORS)), dtype=wp.float32, device=self._device)
@@ -173,7 +173,7 @@ class Randomizer:
         """Scale the physics of every world."""
         model, solver, drawn = self._worlds.model, self._worlds.solver, self._drawn
 
-        def scale(array: wp.array, factor: torch.Tensor) -> None:
+        def scale(array: wp.array[Any], factor: torch.Tensor) -> None:
             rows = wp.to_torch(array).view(len(factor), -1)
             rows.mul_(factor[:, None])
 

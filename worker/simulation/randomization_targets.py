@@ -200,8 +200,8 @@ def _joints(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]
 
 
 def _actuators(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> Target:
-    sources = worlds.solver.mjc_actuator_to_newton_idx.numpy() if worlds.solver.mj_model.nu else np.zeros(0, int)
-    columns = {int(source): column for column, source in enumerate(sources)}
+    sources = worlds.solver.mjc_actuator_to_newton_idx
+    columns = {int(source): column for column, source in enumerate([] if sources is None else sources.numpy())}
     names = tuple(view.joint_names[joint] for joint in chosen)
     changes: list[Change] = []
     for element, joint in enumerate(chosen):

@@ -144,7 +144,7 @@ class Randomizations:
             interval ``<entry>.seconds``, shape ``(2,)``; float32.
         """
         ranges, seconds = wp.to_torch(self._table.ranges), wp.to_torch(self._table.seconds)
-        found = {}
+        found: dict[str, torch.Tensor] = {}
         for index, (name, entry) in enumerate(self._entries.items()):
             first = self._first_ranges[index]
             if isinstance(entry.range, Mapping):
@@ -203,7 +203,7 @@ class Randomizations:
             _NumberChanges(changes, _array(array, self._worlds, robots)) for array, changes in grouped.items()
         ]
 
-    def _write(self, changed: wp.array, live: bool) -> None:
+    def _write(self, changed: wp.array[wp.bool], live: bool) -> None:
         """Write the model's numbers in the worlds with ``changed``; with ``live``, only the numbers that can change after startup."""
         if self._bodies and (self._bodies.is_live or not live):
             self._bodies.launch(changed, self._draws)
@@ -225,14 +225,14 @@ class _NumberChanges:
         values: The array as numbers, shape ``(worlds, columns)``; it holds the model's own values.
     """
 
-    def __init__(self, drawn: list[_Drawn], values: wp.array) -> None:
+    def __init__(self, drawn: list[_Drawn], values: wp.array[wp.float32]) -> None:
         self.is_live = any(_is_live(each.entry) for each in drawn)
         self._device = values.device
         self._values = values
         self._changes, columns = _table(drawn, self._device)
         self._defaults = wp.array(values.numpy()[:, columns], dtype=wp.float32, device=self._device)
 
-    def launch(self, changed: wp.array, draws: wp.array) -> None:
+    def launch(self, changed: wp.array[wp.bool], draws: wp.array2d[wp.float32]) -> None:
         inputs = [changed, self._changes, draws, self._defaults, self._values]
         wp.launch(change_numbers, dim=self._defaults.shape, inputs=inputs, device=self._device)
 
@@ -247,11 +247,12 @@ class _BodyChanges:
         self._changes, bodies = _table(drawn, self._device)
         shape = (worlds.world_count, model.body_count // worlds.world_count)
         self._values, self._defaults, self._fields = Bodies(), Bodies(), BodyFields()
-        for field, source in {
+        sources: dict[str, wp.array[Any]] = {
             "masses": model.body_mass,
             "centers": model.body_com,
             "inertias": model.body_inertia,
-        }.items():
+        }
+        for field, source in sources.items():
             values = source.reshape(shape)
             setattr(self._values, field, values)
             own = wp.array(values.numpy()[:, bodies], dtype=source.dtype, device=self._device)
@@ -265,7 +266,7 @@ class _BodyChanges:
         self._fields.moments, self._fields.frames = solver.mjw_model.body_inertia, solver.mjw_model.body_iquat
         self._shape = (worlds.world_count, len(bodies))
 
-    def launch(self, changed: wp.array, draws: wp.array) -> None:
+    def launch(self, changed: wp.array[wp.bool], draws: wp.array2d[wp.float32]) -> None:
         inputs = [changed, self._changes, draws, self._defaults, self._values, self._fields]
         wp.launch(change_bodies, dim=self._shape, inputs=inputs, device=self._device)
 
@@ -275,11 +276,11 @@ def _is_live(entry: Randomize) -> bool:
     return MOMENTS.index(entry.when) != STARTUP
 
 
-def _pairs(values: Iterable[tuple[float, float]], device: wp.Device) -> wp.array:
+def _pairs(values: Iterable[tuple[float, float]], device: wp.Device | None) -> wp.array[wp.vec2]:
     return wp.array(np.array(list(values), np.float32).reshape(-1, 2), dtype=wp.vec2, device=device)
 
 
-def _table(drawn: list[_Drawn], device: wp.Device) -> tuple[Changes, list[int]]:
+def _table(drawn: list[_Drawn], device: wp.Device | None) -> tuple[Changes, list[int]]:
     """The changes in the layout of a kernel, and the changed columns, ascending."""
     columns = sorted({each.change.column for each in drawn})
     of_column: dict[int, list[_Drawn]] = {column: [] for column in columns}
@@ -304,7 +305,7 @@ def _table(drawn: list[_Drawn], device: wp.Device) -> tuple[Changes, list[int]]:
     return table, columns
 
 
-def _array(name: str, worlds: Worlds, robots: Mapping[str, RobotArrays]) -> wp.array:
+def _array(name: str, worlds: Worlds, robots: Mapping[str, RobotArrays]) -> wp.array[wp.float32]:
     """The array of a :class:`Change` as rows of numbers, one row a world: a view, which keeps the array."""
     model: Any = worlds.solver.mjw_model
     if name.startswith("bias "):
@@ -314,18 +315,18 @@ def _array(name: str, worlds: Worlds, robots: Mapping[str, RobotArrays]) -> wp.a
     elif name == "opt.gravity":
         source = model.opt.gravity
     elif name.startswith("muster."):
-        motors: Any = worlds.model.muster
+        motors: Any = vars(worlds.model)["muster"]
         source = getattr(motors, name.removeprefix("muster.")).reshape((worlds.world_count, -1))
     else:
         source = getattr(model, name)
     if source.shape[0] != worlds.world_count or not source.is_contiguous:
         raise RuntimeError(f"{name} has shape {source.shape}: it is shared by the {worlds.world_count} worlds")
-    rows = wp.array(
+    rows: wp.array[wp.float32] = wp.array(
         ptr=source.ptr,
         shape=(worlds.world_count, source.size * wp.types.type_size_in_bytes(source.dtype) // 4 // worlds.world_count),
         dtype=wp.float32,
         device=source.device,
         copy=False,
     )
-    rows.owner_of_memory = source
+    vars(rows)["owner_of_memory"] = source
     return rows

@@ -208,9 +208,10 @@ def _take_controls(own: newton.ModelBuilder) -> None:
         own.joint_target_ke[dof] = own.joint_target_kd[dof] = 0.0
     rows: Any = own.custom_attributes["mujoco:actuator_trnid"].values
     labels: Any = own.custom_attributes["mujoco:joint_dof_label"].values or {}
+    sources: Any = own.custom_attributes["mujoco:ctrl_source"].values
     dofs = {label: dof for dof, label in labels.items()}
     for actuator, target in enumerate(rows or ()):
-        own.custom_attributes["mujoco:ctrl_source"].values[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
+        sources[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
         label = actuator_value(own, "actuator_target_label", actuator)
         if int(target[0]) < 0 and label in dofs:  # a USD file's: the label would not say of which of two equal robots
             rows[actuator] = wp.vec2i(dofs[label], 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import newton
@@ -13,6 +13,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.wording import nearest
+from worker.simulation.actuators import Input
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import Worlds
@@ -271,7 +272,7 @@ def _gain(template: newton.ModelBuilder, actuator: int) -> float:
     return gear * float(actuator_value(template, "actuator_gainprm", actuator)[0]) or 1.0
 
 
-def _input(template: newton.ModelBuilder, actuator: int) -> str:
+def _input(template: newton.ModelBuilder, actuator: int) -> Input | Literal[""]:
     """What an actuator takes, by the shortcuts of MuJoCo's file format: motor, position, velocity; empty for any other."""
     if actuator < 0 or int(actuator_value(template, "actuator_dyntype", actuator)) == mujoco.mjtDyn.mjDYN_INTEGRATOR:
         return ""

@@ -138,7 +138,8 @@ class Terrain:
             return np.full(self.column_count, 1 / self.column_count)
         shares = list(self.kinds.values())
         each = np.array([shares[kind] / self.column_kinds.count(kind) for kind in self.column_kinds])
-        return each / each.sum()
+        whole: np.ndarray = each / each.sum()
+        return whole
 
     @cached_property
     def heights(self) -> np.ndarray:
@@ -283,9 +284,9 @@ class Terrain:
 
 def _free_memory(device: str) -> float:
     """Bytes that are free on the host, or on the device where it has less."""
-    free = psutil.virtual_memory().available
+    free: float = psutil.virtual_memory().available
     target = wp.get_device(device)
-    return min(free, target.free_memory) if target.is_cuda else free
+    return min(free, float(target.free_memory)) if target.is_cuda else free
 
 
 ROUGH_KINDS: Mapping[Patch, float] = {

@@ -40,12 +40,14 @@ class PatchGrid:
 
     def from_middle(self) -> np.ndarray:
         """Distance of each point from the middle along the axis on which it is farther [m]: its lines of equal value are squares."""
-        return np.maximum(np.abs(self.x), np.abs(self.y))
+        distances: np.ndarray = np.maximum(np.abs(self.x), np.abs(self.y))
+        return distances
 
     def from_edge(self, border: float) -> np.ndarray:
         """Distance of each point from the nearest inner edge of a border [m], negative on the border."""
         width, length = (size / 2 - border for size in self.size)
-        return np.minimum(width - np.abs(self.x), length - np.abs(self.y))
+        distances: np.ndarray = np.minimum(width - np.abs(self.x), length - np.abs(self.y))
+        return distances
 
 
 def between(ends: Range, difficulty: float) -> float:
@@ -145,7 +147,7 @@ class Slope(Patch):
         ramp_x = np.clip(1 - np.abs(grid.x) / width, 0, 1)
         ramp_y = np.clip(1 - np.abs(grid.y) / length, 0, 1)
         half = self.platform / 2
-        heights = np.minimum(top * ramp_x * ramp_y, top * (1 - half / width) * (1 - half / length))
+        heights: np.ndarray = np.minimum(top * ramp_x * ramp_y, top * (1 - half / width) * (1 - half / length))
         return -heights if self.inverted else heights
 
 
@@ -171,7 +173,7 @@ class Stairs(Patch):
         steps = int((min(grid.size) - 2 * self.border - self.platform) / (2 * self.step_width) + SLACK)
         inside = grid.from_edge(self.border) / self.step_width
         rings = np.clip(np.floor(inside + SLACK) + 1, 0, steps + 1)
-        heights = rings * between(self.step_heights, difficulty)
+        heights: np.ndarray = rings * between(self.step_heights, difficulty)
         return -heights if self.inverted else heights
 
 
@@ -281,7 +283,8 @@ def _between_points(drawn: np.ndarray, grid: PatchGrid, spacing: float) -> np.nd
     right, down = right[None, :], down[:, None]
     upper = drawn[np.ix_(row, column)] * (1 - right) + drawn[np.ix_(row, beside)] * right
     lower = drawn[np.ix_(below, column)] * (1 - right) + drawn[np.ix_(below, beside)] * right
-    return upper * (1 - down) + lower * down
+    heights: np.ndarray = upper * (1 - down) + lower * down
+    return heights
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,13 +117,17 @@ def _gather_overflow(solver_overflow: wp.array[wp.int32], overflow: wp.array[wp.
     overflow[world] = overflow[world] | (solver_overflow[world] & _CAPACITY_BITS)
 
 
-_SET_HERE = {"disable_sensors": True, "kinematic_switchable_roots": False, "separate_worlds": True}
+_SET_HERE: Mapping[str, Any] = {"disable_sensors": True, "kinematic_switchable_roots": False, "separate_worlds": True}
 """Solver options that a task can't set: neither MuJoCo's sensors nor kinematic roots are used, and both cost time in every step."""
 
 
 class _Solver(SolverMuJoCo):
     """Takes all substeps between one push of Newton's state to MuJoCo and one pull back: substeps don't need Newton's coordinates."""
 
+    # which Newton declares as optional: its constructor sets them
+    mjc_body_to_newton: wp.array2d[wp.int32]
+    mjc_dof_to_newton_dof: wp.array2d[wp.int32]
+    mjc_geom_to_newton_shape: wp.array2d[wp.int32]
     substeps = 1
     before_substep: Sequence[Callable[[], None]] = ()
     after_substep: Sequence[Callable[[], None]] = ()
@@ -240,7 +244,7 @@ class Worlds:
         self.arrays.start_qd = self.model.joint_qd.reshape((world_count, -1))
         self.drives = Drives(self.model, self.solver, world_count) if has_drives(self.model) else None
         if self.drives is None:
-            self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))
+            self.arrays.controls = vars(self.control)["mujoco"].ctrl.reshape((world_count, -1))
         else:
             self.arrays.controls = self.drives.controls
             self.solver.before_substep = [self.drives.launch]
@@ -330,7 +334,7 @@ def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.C
             "task only writes inputs of actuators; give worker.simulation.robot.Robot its actuators, or describe the robot in MJCF, "
             "with an <actuator> section, and add it with builder.add_mjcf(file, ctrl_direct=True)"
         )
-    attributes: Any = model.mujoco
+    attributes: Any = vars(model)["mujoco"]
     count = controls.size // max(1, model.world_count)
     unread = [column for column in range(count) if attributes.ctrl_source.numpy()[column] != direct]
     if unread:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from worker.simulation.actuators import Input
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.differential_ik import DifferentialIK
 from worker.tasks.binding import Bound
@@ -26,7 +27,7 @@ def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
     yield from (name for name, sensor in sensors.items() if name in given and isinstance(sensor, DifferentialIK))
 
 
-TAKING = {
+TAKING: Mapping[Input, tuple[str, str, str]] = {
     "effort": ("an effort", "terms.effort", "an EffortActuator"),
     "position": ("a position", "terms.position_target", "a PositionActuator"),
     "velocity": ("a velocity", "terms.velocity_target", "a VelocityActuator"),
@@ -34,7 +35,7 @@ TAKING = {
 """Each kind of input in words, a function that writes it, and an actuator that takes it."""
 
 
-def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> str:
+def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> Input:
     """Refuse a term that drives neither joints nor a frame, or joints without an actuator that takes what it writes.
 
     The names of a frame's columns are filled in.
@@ -69,7 +70,7 @@ def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[
     return _input_of(bound, view)
 
 
-def _input_of(bound: Bound, view: RobotView) -> str:
+def _input_of(bound: Bound, view: RobotView) -> Input:
     """What a term of joints writes to their actuators. Raises ValueError if it contradicts itself, or an actuator takes another input."""
     place, term, joints = bound.place, bound.term, bound.elements or []
     assert isinstance(term, Action)
@@ -78,7 +79,7 @@ def _input_of(bound: Bound, view: RobotView) -> str:
         raise ValueError(
             f"{place}: kind is {term.kind!r}, and {term.function_name} writes {TAKING[known][0]}; leave kind= out"
         )
-    taken = sorted({view.inputs[joint] for joint in joints} - {""})
+    taken = sorted({each for joint in joints if (each := view.inputs[joint])})
     if len(taken) > 1 and not (term.kind or known):
         raise ValueError(
             f"{place}: the actuators of its joints take {' and '.join(TAKING[each][0] for each in taken)}; "

@@ -16,7 +16,7 @@ class Ant(Running):
     asset = "nv_ant.xml"
     # ankles bent outwards: the pose that the model file gives as init_qpos
     start_pose: ClassVar[Mapping[str, float]] = {"ankle_1": 1.0, "ankle_2": -1.0, "ankle_3": -1.0, "ankle_4": 1.0}
-    solver_options: ClassVar[dict[str, object]] = {
+    solver_options = {
         # The worst case: 12 capsules with two contacts and one sphere with one, four rows each, and eight joint limits.
         "nconmax": 25,
         "njmax": 108,

@@ -164,7 +164,7 @@ class Binder:
         counts: dict[str, int] = {}
         names: list[str] = []
         for parameter, kind in found.parameters.items():
-            if not _is_sensor(kind) or not _has_columns(kind):
+            if not _is_sensor(kind) or not has_columns(kind):
                 continue
             if needed.columns is not None and parameter not in needed.columns:
                 continue
@@ -332,7 +332,8 @@ class Binder:
         if kind in STRUCTS:
             variable = STRUCTS[kind]
         elif is_robot(kind):
-            robots = [key for key, each in bound.signature.parameters.items() if is_robot(each)]  # type: ignore[union-attr]
+            assert bound.signature is not None
+            robots = [key for key, each in bound.signature.parameters.items() if is_robot(each)]
             robot = given.get(name, bound.term.robot if name == robots[0] else None)
             if robot is None:
                 raise ValueError(f"{place}: say which robot or object {name} is, with {name}=")
@@ -405,6 +406,6 @@ def _is_sensor(kind: Any) -> bool:
     return is_struct(kind) and kind not in STRUCTS and not is_robot(kind) and shown_type(kind) != "TerrainArrays"
 
 
-def _has_columns(kind: Any) -> bool:
+def has_columns(kind: Any) -> bool:
     """Whether a sensor's struct has a column for each measured element, besides the row of each world."""
-    return any(getattr(each.type, "ndim", 0) > 1 for each in kind.vars.values())
+    return any(wp.types.is_array(each.type) and each.type.ndim > 1 for each in kind.vars.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
 
 import warp as wp
 
@@ -47,7 +46,7 @@ class Cartpole(DeclaredTask):
     """Cart and pole: 4 observations, 1 action, 60 control steps a second, episodes of 5 s."""
 
     config_type = CartpoleConfig
-    solver_options: ClassVar[dict[str, object]] = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
+    solver_options = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
 
     def robot(self, config: CartpoleConfig) -> Robot:
         """Cart on a slide joint, pole on a free hinge, motor on the slide; nothing collides."""

@@ -10,6 +10,7 @@ import hashlib
 import linecache
 import re
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -112,7 +113,7 @@ def act(source: Source) -> str:
         if driven.clip is not None:
             action = f"wp.clamp({action}, numbers[{driven.clip}], numbers[{driven.clip + 1}])"
         value = f"value = {driven.offset.at('k')} + {driven.scale.at('k')} * {action}"
-        lines += calls(source, driven.bound, lambda call, value=value: [value, call])  # type: ignore[misc]
+        lines += calls(source, driven.bound, partial(lambda value, call: [value, call], value))
     return kernel("act", COMMON, source, lines)
 
 
@@ -193,7 +194,7 @@ def terminations(source: Source) -> list[str]:
     body = []
     for number, bound in enumerate(plan.terminations):
         hit = f"ended_{number} = True"
-        body += calls(source, bound, lambda call, hit=hit: [f"if {call}:", f"    {hit}"])  # type: ignore[misc]
+        body += calls(source, bound, partial(lambda hit, call: [f"if {call}:", f"    {hit}"], hit))
         flag = "cut" if isinstance(bound.term, Termination) and bound.term.time_out else "terminated"
         body += [f"if ended_{number}:", f"    {flag} = True"]
     return [*lines, *(["if valid:", *indent(body)] if body else [])]

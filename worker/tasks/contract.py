@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
+from shared_store.policy_contract import Action
 from worker.simulation.sensors.differential_ik import AXES, DifferentialIK
 from worker.tasks.acting import frame_of
 from worker.tasks.declaration import Action as DeclaredAction
 from worker.tasks.declaration import Choice, Command
-from worker.tasks.interface import Action, Interface, Observation
+from worker.tasks.interface import Interface, Observation
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView

@@ -258,8 +258,9 @@ class Observation(Term):
     ) -> None:
         super().__init__(function, **options)
         self.scale, self.offset = scale, offset
-        is_pair = isinstance(noise, tuple | list) and len(noise) == 2
-        self.noise_kind, self.noise = noise if is_pair else ("uniform", noise)  # type: ignore[misc]
+        given: Any = noise if isinstance(noise, tuple | list) and len(noise) == 2 else ("uniform", noise)
+        self.noise_kind: str = given[0]
+        self.noise: float = given[1]
         self.clip = clip
         self.delay = (0, delay) if isinstance(delay, int) else delay
         self.history = history
@@ -411,9 +412,8 @@ class Declaration:
     @property
     def groups(self) -> Mapping[str, Mapping[str, Observation]]:
         """The terms of each observation group that has terms; if the policy sees an image, the critic's terms are under ``policy``."""
-        if not self._nested:
-            return {"policy": self.observations}  # type: ignore[dict-item]
-        groups = {name: each for name, each in self.observations.items() if isinstance(each, Mapping)}
+        nested: Mapping[str, Any] = self.observations if self._nested else {"policy": self.observations}
+        groups = {name: each for name, each in nested.items() if isinstance(each, Mapping)}
         if "policy" in self.images and "critic" in groups:
             groups = {"policy": groups.pop("critic"), **groups}
         return groups

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import Any
 
 import newton
 import torch
@@ -68,7 +68,7 @@ class DeclaredTask(Task):
         randomizations: The declared quantities that differ from world to world.
     """
 
-    solver_options: ClassVar[Mapping[str, Any]] = {}
+    solver_options: Mapping[str, Any] = {}
     randomizations: Randomizations | None = None
 
     def robot(self, config: Any) -> Any:

@@ -25,7 +25,7 @@ import textwrap
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeGuard
 
 import warp as wp
 
@@ -33,7 +33,8 @@ from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
 
-ELEMENTS = ("joint", "body", "site", "index", "action")
+Element = Literal["joint", "body", "site", "index", "action"]
+ELEMENTS: tuple[Element, ...] = ("joint", "body", "site", "index", "action")
 """Parameters over whose values a function is called."""
 GIVEN = ("world", "stream", "memory", "lasting", "value", "choice", "terminated", "seconds")
 """Parameters that the compiler fills by their names."""
@@ -69,7 +70,7 @@ class Signature:
     returns: Any
 
     @property
-    def element(self) -> str | None:
+    def element(self) -> Element | None:
         """The parameter over whose values the function is called."""
         return next((name for name in ELEMENTS if name in self.parameters), None)
 
@@ -87,7 +88,7 @@ class Signature:
         }
 
 
-def is_warp(function: Any) -> bool:
+def is_warp(function: Any) -> TypeGuard[wp.Function]:
     """Whether a term's function is a Warp function; else it is one of torch."""
     return isinstance(function, wp.Function)
 
@@ -176,6 +177,7 @@ def _reads(function: Any, names: set[str]) -> bool:
             isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)
             and is_warp(called := known.get(node.func.id))
+            and called.func is not None  # as of a function of Warp's own
         ):
             parameters = list(inspect.signature(called.func).parameters)
             handed = {name: value for name, value in zip(parameters, node.args, strict=False)}

@@ -74,9 +74,9 @@ G1 = Walker(
 class G1Flat(Velocity):
     """G1 on a plane: 99 observations, 29 actions, 50 control steps a second, episodes of 20 s."""
 
-    config_type = G1FlatConfig
+    config_type: ClassVar[type[VelocityConfig]] = G1FlatConfig
     walker = G1
-    solver_options: ClassVar[dict[str, Any]] = {
+    solver_options = {
         "integrator": "implicitfast",
         "cone": "pyramidal",
         "impratio": 1.0,
@@ -104,7 +104,7 @@ class G1Rough(G1Flat):
 
     config_type = G1RoughConfig
     rough = True
-    solver_options: ClassVar[dict[str, Any]] = {
+    solver_options = {
         **G1Flat.solver_options,
         "ccd_iterations": 500,
         # In 8 worlds x 60 steps, as above, at most 34 contacts and 136 rows.

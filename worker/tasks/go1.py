@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.height_scan import RingPattern
@@ -63,7 +63,7 @@ class Go1Flat(Velocity):
 
     config_type = Go1FlatConfig
     walker = GO1
-    solver_options: ClassVar[dict[str, Any]] = {
+    solver_options = {
         "integrator": "implicitfast",
         "cone": "elliptic",
         "impratio": 10.0,
@@ -83,7 +83,7 @@ class Go1Rough(Velocity):
     config_type = Go1RoughConfig
     walker = GO1
     rough = True
-    solver_options: ClassVar[dict[str, Any]] = {
+    solver_options = {
         **Go1Flat.solver_options,
         "ccd_iterations": 500,
         # In 8 worlds x 60 steps, as above, at most 8 contacts and 48 rows. Several corners of the ground may touch one foot.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from worker.tasks.configs.running import HumanoidConfig
 from worker.tasks.running import Running
 
@@ -13,7 +11,7 @@ class Humanoid(Running):
 
     config_type = HumanoidConfig
     asset = "nv_humanoid.xml"
-    solver_options: ClassVar[dict[str, object]] = {
+    solver_options = {
         # At most 16 contacts and 37 rows were seen in 96 worlds x 400 steps of random, zero and held random actions with
         # 1,232 falls (data.nacon and data.nefc after each step, limits at the worst case of 35 and 161).
         "nconmax": 25,

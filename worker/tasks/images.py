@@ -70,9 +70,12 @@ def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
 
 def described(task: Task) -> dict[str, dict[str, Any]]:
     """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
-    camera, plan = getattr(task.config, "camera", None), getattr(task, "plan", None)
+    camera = getattr(task.config, "camera", None)
+    plan: Plan | None = getattr(task, "plan", None)
     found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
-    for group, name in plan.images.items() if plan else ():
+    if plan is None:
+        return found
+    for group, name in plan.images.items():
         sensor = plan.declaration.sensors[name]
         found[group] = {"sensor": name, **dataclasses.asdict(sensor), "channels": sensor.rows(plan.views)}
     return found

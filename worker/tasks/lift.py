@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 from worker.simulation.objects import Box
 from worker.simulation.robot import Robot
@@ -31,7 +31,7 @@ class LiftCube(DeclaredTask):
 
     config_type = LiftCubeConfig
     ground = True
-    solver_options: ClassVar[dict[str, object]] = {
+    solver_options = {
         "integrator": "implicitfast",
         "cone": "elliptic",
         "impratio": 10.0,
@@ -47,7 +47,7 @@ class LiftCube(DeclaredTask):
         """The arm, its gripper half open."""
         return yam()
 
-    def objects(self, config: LiftCubeConfig) -> Mapping[str, Any]:
+    def objects(self, config: Any) -> Mapping[str, Any]:
         """The cube; the command places it."""
         return {
             "cube": Box("cube", size=(EDGE, EDGE, EDGE), mass=0.05, position=(0.3, 0.0, EDGE), color=(0.8, 0.2, 0.2))

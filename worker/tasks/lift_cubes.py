@@ -11,7 +11,7 @@ import newton
 
 from worker.simulation.sensors.selection import ObjectSelection
 from worker.tasks import terms
-from worker.tasks.configs.lift import LiftCubesConfig
+from worker.tasks.configs.lift import LiftCubeConfig, LiftCubesConfig
 from worker.tasks.declaration import Command, Declaration, Metric, Observation, Reward
 from worker.tasks.lift import LiftCube
 
@@ -44,15 +44,16 @@ class LiftCubes(LiftCube):
     def build(self, builder: newton.ModelBuilder) -> None:
         """As :meth:`DeclaredTask.build`; the solver has room for the contacts of all cubes."""
         super().build(builder)
-        more = {name: (self.config.cubes - 1) * each for name, each in ROOM.items()}
+        config: Any = self.config
         options = type(self).solver_options
-        self.solver_options = options | {name: options[name] + each for name, each in more.items()}  # type: ignore[misc]
+        more = {name: options[name] + (config.cubes - 1) * each for name, each in ROOM.items()}
+        self.solver_options = {**options, **more}
 
-    def declare(self, config: LiftCubesConfig) -> Declaration:
+    def declare(self, config: LiftCubeConfig) -> Declaration:
         """LiftCube's terms and numbers for the chosen cube; also the choice, and the positions of all cubes."""
         single = super().declare(config)
         rewards, metrics, lift = single.rewards, single.metrics, single.commands["lift_height"]
-        seen = dict(single.observations)
+        seen: dict[str, Any] = dict(single.observations)
         ways = {
             "ee_to_cube": Observation(terms.hand_to_chosen_object, noise=0.01, unit="m"),
             "cube_to_goal": Observation(terms.chosen_object_to_target, noise=0.01, unit="m", kind="measured"),
@@ -60,14 +61,23 @@ class LiftCubes(LiftCube):
             "chosen": Observation(terms.object_is_chosen, kind="command"),
             "actions": seen.pop("actions"),
         }
-        told = {"names": lift.names, "units": lift.units, "ranges": lift.ranges, "seconds": lift.seconds}
-        command = Command(terms.lift_one_command, apart=APART, **told, **lift.parameters)
+        command = Command(
+            terms.lift_one_command,
+            apart=APART,
+            names=lift.names,
+            units=lift.units,
+            ranges=lift.ranges,
+            seconds=lift.seconds,
+            **lift.parameters,
+        )
         return dataclasses.replace(
             single,
             sensors={**single.sensors, "cubes": ObjectSelection("cube_*")},
             observations=seen | ways,
-            rewards=rewards
-            | {name: Reward(each, per_second=True, **rewards[name].parameters) for name, each in REWARDS},
+            rewards={
+                **rewards,
+                **{name: Reward(each, per_second=True, **rewards[name].parameters) for name, each in REWARDS},
+            },
             metrics={name: Metric(each, **metrics[name].parameters) for name, each in METRICS},
             commands={"lift_height": command},
         )

@@ -25,9 +25,9 @@ def group_function(source: Source, group: str, terms: list[Seen]) -> str:
 
 
 def _term(source: Source, seen: Seen) -> list[str]:
-    bound = seen.bound
+    bound, signature = seen.bound, seen.bound.signature
     lines = _draw_delay(seen) if seen.past >= 0 else []
-    if bound.signature is None:
+    if signature is None:
         for column in range(bound.width):
             lines += [f"x = external[world, {bound.external + column}]", *_column(seen, str(column))]
         return lines
@@ -35,9 +35,9 @@ def _term(source: Source, seen: Seen) -> list[str]:
     def use(call: str) -> list[str]:
         loop = bound.elements is not None
         if bound.width == 1:
-            as_number = f"wp.where({call}, 1.0, 0.0)" if bound.signature.returns is bool else f"float({call})"  # type: ignore[union-attr]
+            as_number = f"wp.where({call}, 1.0, 0.0)" if signature.returns is bool else f"float({call})"
             return [f"x = {as_number}", *_column(seen, "k" if loop else "0")]
-        vector = f"vector_{getattr(bound.signature.returns, '__name__', 'of')}"  # type: ignore[union-attr]
+        vector = f"vector_{getattr(signature.returns, '__name__', 'of')}"
         found = [f"{vector} = {call}"]
         for axis in range(bound.width):
             column = f"(k * {bound.width} + {axis})" if loop else str(axis)

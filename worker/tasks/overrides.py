@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BeforeValidator, TypeAdapter, ValidationError, WrapValidator
 from pydantic.errors import PydanticUserError
@@ -15,7 +15,10 @@ from pydantic_core import ArgsKwargs
 from shared_store.wording import Path, explain, nearest
 from shared_store.wording import Refused as Refused
 
-C = TypeVar("C")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+C = TypeVar("C", bound="DataclassInstance")
 
 
 @functools.cache
@@ -44,7 +47,7 @@ def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:
 
 
 def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mapping[str, Any], where: Path) -> C:
-    known = [item.name for item in dataclasses.fields(kind) if item.init and item.name not in training_sections()]  # type: ignore[arg-type]
+    known = [item.name for item in dataclasses.fields(kind) if item.init and item.name not in training_sections()]
     for key, value in overrides.items():
         if key in training_sections() and not where:
             raise Refused((key,), f"not a key of {kind.__name__}; settings of {key} stand under train.{key}")
@@ -53,13 +56,13 @@ def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mappin
         values[key] = _as(getattr(default, key), value, (*where, key))
     try:
         # as pydantic's own __init__ does; a plain dataclass that extends a pydantic one lacks it
-        made = TypeAdapter(kind).validator.validate_python(ArgsKwargs((), values), self_instance=kind.__new__(kind))
+        made: C = TypeAdapter(kind).validator.validate_python(ArgsKwargs((), values), self_instance=kind.__new__(kind))
     except ValidationError as error:
         raise _refused(error, where, overrides) from error
     except (PydanticUserError, NameError) as error:
         first = str(error).partition("\n")[0]
         raise Refused(where, f"{kind.__name__} has a type that can't be checked: {first}") from error
-    return made  # type: ignore[no-any-return]
+    return made
 
 
 def _as(default: Any, value: Any, where: Path) -> Any:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from shared_store.wording import nearest
+from worker.simulation.actuators import Input
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_view import RobotView
 from worker.tasks.acting import check_action, check_driven
@@ -85,7 +86,7 @@ class Driven:
     scale: Column
     offset: Column
     clip: int | None
-    kind: str
+    kind: Input
 
 
 @dataclass
@@ -405,7 +406,7 @@ def by_pattern(place: str, values: Mapping[str, float], names: list[str]) -> lis
         ValueError: A pattern fits no name, or a name has no pattern.
     """
     try:
-        found = resolve(names, values, "column")
+        found: list[float | None] = resolve(names, values, "column")
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
     lacking = [name for name, value in zip(names, found, strict=True) if value is None]

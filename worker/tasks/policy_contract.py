@@ -35,7 +35,7 @@ def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = Non
     inputs = {group: group for group in groups}
     states: list[State] = []
     if exported is not None:
-        inputs = dict(zip(exported.sample.keys(), exported.inputs, strict=False))
+        inputs = dict(zip(map(str, exported.sample.keys()), exported.inputs, strict=False))
         states = [State(each, f"{each}_out", tuple(exported.inputs[each].shape[1:])) for each in exported.states]
     interface = task.interface()
     actions = interface.actions if interface else ()
@@ -141,7 +141,7 @@ def _term(plan: Plan, seen: Seen, first: int) -> Term:
         quantity=term.function_name,
         parameters={name: tuple(plan.numbers.values[at : at + count]) for name, (at, count) in numbers.items()},
         robot=term.robot,
-        element=(signature.element or "") if signature else "",  # type: ignore[arg-type]
+        element=(signature.element or "") if signature else "",
         elements=tuple(bound.element_names) if bound.elements is not None else (),
         sensors={name: _sensor(plan.declaration.sensors[name]) for name in sensors},
         command=command,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 import warp as wp
 
@@ -64,7 +64,7 @@ class Quadruped(DeclaredTask):
 
     config_type = QuadrupedConfig
     ground = True
-    solver_options: ClassVar[dict[str, object]] = {
+    solver_options = {
         # The worst case: eight corners and eight spheres with a contact of four rows each, and twelve joint limits. In 96
         # worlds x 300 steps of random, zero and held random actions there were at most 16 contacts and 26 rows.
         "nconmax": 16,
@@ -86,7 +86,7 @@ class Quadruped(DeclaredTask):
     def declare(self, config: QuadrupedConfig) -> Declaration:
         """The terms; each but the fall is one per second."""
 
-        def rate(function: wp.Function, **options: object) -> Reward:
+        def rate(function: wp.Function, **options: Any) -> Reward:
             return Reward(function, per_second=True, **options)
 
         return Declaration(

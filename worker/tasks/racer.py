@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import newton
 import torch
@@ -49,7 +49,7 @@ class Racer(DeclaredTask):
     """A car that sees the road ahead as numbers: 21 observations, 2 actions, 15 control steps a second, episodes of 60 s."""
 
     config_type = RacerConfig
-    solver_options: ClassVar[dict[str, object]] = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
+    solver_options = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -308,11 +308,10 @@ def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
         return Choice(racing.choose, names=space.names, targets=targets)
     low, high = (math.radians(end) for end in space.steering)
     slow, fast = space.speed
-    steering = {"scale": (high - low) / 2, "offset": (high + low) / 2, "unit": "rad"}
-    speed = {"scale": (fast - slow) / 2, "offset": (fast + slow) / 2, "unit": "m/s"}
+    turning, driving = ((high - low) / 2, (high + low) / 2), ((fast - slow) / 2, (fast + slow) / 2)
     return {
-        "steering": Action(terms.position_target, joints="steering", **steering),
-        "speed": Action(terms.velocity_target, joints="speed", **speed),
+        "steering": Action(terms.position_target, joints="steering", scale=turning[0], offset=turning[1], unit="rad"),
+        "speed": Action(terms.velocity_target, joints="speed", scale=driving[0], offset=driving[1], unit="m/s"),
     }
 
 
@@ -326,9 +325,9 @@ def mishap_metrics(config: RacerConfig) -> Mapping[str, Metric]:
     """Metrics if cars are put back: how often and why, and the penalties [s]."""
     if not config.continuous:
         return {}
-    penalties = {"off_track": config.off_track_penalty, "crash": config.crash_penalty}
+    off_track, crash = config.off_track_penalty, config.crash_penalty
     counts = {name: Metric(resets.happened, at_end=True, column=number) for number, name in enumerate(resets.COUNTS)}
-    return {**counts, "penalty": Metric(resets.penalty, at_end=True, **penalties)}
+    return {**counts, "penalty": Metric(resets.penalty, at_end=True, off_track=off_track, crash=crash)}
 
 
 def tracks_of(config: RacerConfig) -> list[Track]:

@@ -104,11 +104,11 @@ class Task(Telling):
     """Numbers per world in ``episodes.memory``, such as commands; they are part of the state."""
     lasting_size: int = 0
     """Numbers that survive episodes, in ``episodes.lasting``."""
-    solver_options: ClassVar[Mapping[str, Any]] = {}
+    solver_options: Mapping[str, Any] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
     template: newton.ModelBuilder  # of a sketch
     adapting: Adapting | None = None
-    _exact: tuple[wp.array, wp.array] | None = None
+    _exact: tuple[wp.array[Any], wp.array[Any]] | None = None
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -340,7 +340,8 @@ class Task(Telling):
         def buffer(name: str, shape: tuple[int, ...], dtype: Any) -> torch.Tensor:
             array = wp.zeros(shape, dtype=dtype, device=device)
             setattr(self._episodes, name, array)
-            return wp.to_torch(array)
+            shared: torch.Tensor = wp.to_torch(array)
+            return shared
 
         self._episodes = EpisodeArrays()
         self._episodes.warm_start = self.worlds.arrays.warm_start

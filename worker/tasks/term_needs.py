@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 _Function = TypeVar("_Function")
 
@@ -48,7 +48,7 @@ class Needs:
     some_ranges: bool = False
     efforts: bool = False
     free_root: bool = False
-    kind: str = ""
+    kind: Literal["", "effort", "position", "velocity"] = ""
 
 
 NOTHING = Needs()

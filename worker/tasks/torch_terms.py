@@ -30,7 +30,7 @@ class TorchTerms:
         observe_any: Whether any is an observation.
     """
 
-    def __init__(self, task: DeclaredTask, plan: Plan, external: wp.array) -> None:
+    def __init__(self, task: DeclaredTask, plan: Plan, external: wp.array2d[wp.float32]) -> None:
         self._task = task
         self._terms = list({bound.place: bound for bound in plan.terms if bound.signature is None}.values())
         self._seen = [bound for bound in self._terms if bound.place.startswith("observations")]

@@ -114,7 +114,7 @@ class Velocity(DeclaredTask):
                     )
         super().build(builder)
         limits = {"iterations": config.solver_iterations, "ls_iterations": config.solver_line_search}
-        self.solver_options = {**type(self).solver_options, **limits}  # type: ignore[misc]
+        self.solver_options = {**type(self).solver_options, **limits}
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Set this iteration's ranges of commands, then apply ``config.curriculum``."""

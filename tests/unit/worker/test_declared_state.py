@@ -59,6 +59,14 @@ def centre(world: int, bodies: BodyArrays) -> float:
     return centre_of_near(world=world, bodies=bodies) + centre_of_near(bodies, world)
 
 
+clamp = wp.clamp
+
+
+@wp.func
+def clamped_centre(world: int, bodies: BodyArrays) -> float:
+    return clamp(centre_of_near(bodies, world), 0.0, 1.0)
+
+
 @wp.func
 def note_place(world: int, bodies: BodyArrays, episodes: EpisodeArrays, lasting: int):
     episodes.lasting[world, lasting] = place_of_near(bodies, world)
@@ -70,7 +78,8 @@ def push_by_place(world: int, bodies: BodyArrays, worlds: WorldArrays, robot: Ro
 
 
 @pytest.mark.parametrize(
-    ("function", "reads"), [(by_position, True), (by_keyword, True), (by_another_name, True), (centre, False)]
+    ("function", "reads"),
+    [(by_position, True), (by_keyword, True), (by_another_name, True), (centre, False), (clamped_centre, False)],
 )
 def test_reads_of_poses_are_detected_in_the_source_of_a_function(function: Any, reads: bool) -> None:
     assert reads_poses(function) == reads

@@ -19,6 +19,7 @@ from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.sensors.imu import Imu
 from worker.tasks import Action, Choice, Command, Event, Metric, Observation, Robot, Term, WorldArrays, terms
+from worker.tasks.binding import has_columns
 
 TURN = (-1.0, 1.0)
 VELOCITIES: Mapping[str, Any] = {"names": ("a", "b", "c"), "forward": TURN, "left": TURN, "turn": TURN}
@@ -162,6 +163,25 @@ REFUSED: Mapping[str, dict[str, Any]] = {
 def test_a_term_whose_needs_the_task_does_not_meet_is_refused(message: str) -> None:
     said = refusal(sliders(**REFUSED[message]).sketch, SlidersConfig())
     assert said.startswith(f"task Changed: {message}") and (said.endswith(message) or "slide" not in message)
+
+
+@wp.struct
+class Called:
+    values: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class Subscripted:
+    values: wp.array2d[wp.float32]
+
+
+@wp.struct
+class RowsAlone:
+    values: wp.array[wp.vec3]
+
+
+def test_both_notations_of_an_array_tell_the_columns_of_a_sensor() -> None:
+    assert [has_columns(kind) for kind in (Called, Subscripted, RowsAlone)] == [True, True, False]
 
 
 def test_a_share_of_the_effort_is_one_of_the_force_on_the_joint() -> None:

@@ -73,7 +73,8 @@ def main() -> None:
                 rows = [cells[place : place + of_object] for place in range(0, len(cells), of_object)]
                 params = parameters.parameters_of(row, rows, tracks[int(row[parameters.TRACK])])
                 printed.count = 0
-                told, line, result = "", 0, None
+                told, line = "", 0
+                result: Any = None
                 try:
                     alarm.set(seconds)
                     result = function(params)
@@ -82,7 +83,7 @@ def main() -> None:
                 except BaseException as error:
                     alarm.set(0)
                     told, line = confined.told_error(error), confined.line_of(error, file)
-                rewards[car] = math.nan if told else float(result)  # type: ignore[arg-type]
+                rewards[car] = math.nan if told else float(result)
                 if told and ((told, line) in failures or len(failures) < _MOST_TOLD):
                     failures.setdefault((told, line), [car, 0])[1] += 1
             answer([[told, line, *rest] for (told, line), rest in failures.items()])

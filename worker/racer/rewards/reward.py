@@ -76,7 +76,7 @@ class RewardFunction:
         """
         return cls(read_file(path), tracks, worlds, file=str(path), **options)
 
-    def rewards(self) -> wp.array:
+    def rewards(self) -> wp.array[wp.float32]:
         """The rewards of the cars in ``race``, shape ``(worlds,)``, float32, on the device; the same array each time.
 
         NaN where the function raised an error or gave no finite number: :meth:`failures` says which and how often. The compiled function

@@ -28,8 +28,7 @@ from worker.simulation.camera import (
 from worker.simulation.episodes import EpisodeArrays, random_stream
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.frames import only_one
-from worker.simulation.sensors.places import Place, find_places, place_names, place_pose
+from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
 from worker.simulation.sensors.sensor import SensorContext, views_of
 
 if TYPE_CHECKING:
@@ -353,7 +352,9 @@ class Camera:
             self._displace(self._stream - 1, *own, self._usual, self._mounts)
         draw_light(randomize.light, self._episodes, self._light)
 
-    def _displace(self, stream: int, position: Any, angle: Any, given: wp.array, poses: wp.array) -> None:
+    def _displace(
+        self, stream: int, position: Any, angle: Any, given: wp.array[wp.transform], poses: wp.array[wp.transform]
+    ) -> None:
         inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, given]
         wp.launch(displace, dim=given.shape, inputs=inputs, outputs=[poses], device=self._device)
 
@@ -369,7 +370,8 @@ class Camera:
             wp.launch(_redraw, dim=count, inputs=inputs, outputs=[self._mounts], device=self._device)
         wp.launch(_follow, dim=count, inputs=[self._bodies, self._body, self._mounts, self.arrays], device=self._device)
         output = {"depth": "forward_depth_image", "segmentation": "shape_index_image"}.get(declared.kind, "color_image")
-        self._sensor.update(self._worlds.state, self.arrays.poses, self._rays, **{output: self._pixels})
+        image: dict[str, Any] = {output: self._pixels}
+        self._sensor.update(self._worlds.state, self.arrays.poses, self._rays, **image)
         inputs = [self._pixels, self._episodes, self.arrays]
         if declared.kind == "depth":
             kernel, inputs = _stack_depth, [declared.near, declared.far, *inputs]

@@ -65,7 +65,9 @@ def _groups(declared: ContactSensor, view: RobotView, solid: set[int]) -> dict[s
     names = view.body_names if of_bodies else view.geom_names
     find = view.find_bodies if of_bodies else view.find_geoms
     found: dict[int, list[int]] = {}
-    for pattern in patterns or find(patterns):  # it refuses an empty result
+    if not patterns:
+        find(patterns)  # which refuses that
+    for pattern in patterns:
         matching = {index: _shapes_on(view, index) if of_bodies else [view.geoms[index]] for index in find(pattern)}
         colliding = {index: measured for index, measured in matching.items() if not solid.isdisjoint(measured)}
         if not colliding:
@@ -85,7 +87,8 @@ def _shapes_of_geoms(context: SensorContext) -> np.ndarray:
     shapes = solver.mjc_geom_to_newton_shape.numpy()[0]
     world = model.shape_world.numpy()
     first = int((world == 0).argmax())  # those of the first world are in one piece
-    return np.where((shapes >= 0) & (world[shapes] == 0), shapes - first, -1)
+    own: np.ndarray = np.where((shapes >= 0) & (world[shapes] == 0), shapes - first, -1)
+    return own
 
 
 def _others(declared: ContactSensor, context: SensorContext, shapes: np.ndarray) -> np.ndarray:
@@ -100,7 +103,8 @@ def _others(declared: ContactSensor, context: SensorContext, shapes: np.ndarray)
     shape = context.worlds.solver.mjc_geom_to_newton_shape.numpy()[0]
     owned = np.isin(shapes, [geom for view in context.views.values() for geom in view.geoms])
     plane = model.shape_type.numpy()[shape] == int(newton.GeoType.PLANE)
-    return (shape >= 0) & (model.shape_body.numpy()[shape] < 0) & (plane | ~owned)
+    ground: np.ndarray = (shape >= 0) & (model.shape_body.numpy()[shape] < 0) & (plane | ~owned)
+    return ground
 
 
 def _choices(context: SensorContext, declared: ContactSensor | None = None) -> str:

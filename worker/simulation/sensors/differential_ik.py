@@ -205,7 +205,7 @@ class IkSolver:
         chain.goes_on = declared.from_targets
         chain.targets = context.array((count, len(joints)), wp.float32)
 
-    def _array(self, values: Any, dtype: Any) -> wp.array:
+    def _array(self, values: Any, dtype: Any) -> wp.array[Any]:
         return wp.array(values, dtype=dtype, device=self._device)
 
     def _read_joints(self, view: RobotView, joints: list[int]) -> None:

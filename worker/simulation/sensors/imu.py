@@ -243,7 +243,8 @@ def _chain(place: Place, solver: Any) -> list[int]:
     columns = solver.mjc_body_to_newton.numpy()[0].tolist()
     if place.body not in columns[1:]:
         raise ValueError(f"Imu: {place.name} is fixed to the world, so it never moves; name one on a moving body")
-    body, chain = columns.index(place.body, 1), []
+    body: int = columns.index(place.body, 1)
+    chain: list[int] = []
     while body:
         chain.insert(0, body)
         body = int(solver.mj_model.body_parentid[body])

@@ -61,7 +61,7 @@ class SensorContext:
             raise ValueError(f"{what}: there is no robot {name!r}; {nearest(name, self.views)}")
         return self.views[name]
 
-    def array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+    def array(self, shape: tuple[int, ...], dtype: Any) -> wp.array[Any]:
         """A cleared array on the device of the worlds."""
         return wp.zeros(shape, dtype=dtype, device=self.device)
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
-from worker.simulation.sensors.differential_ik import IkArrays
+from worker.simulation.sensors.ik_kernels import IkArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.term_needs import needs
 

@@ -95,6 +95,8 @@ BODIES = {
     "a step of zero": "return sum(range(0, 10, int(y)))",
     "a text": "side = 'left' if x > 0 else 'right'\n    return 1.0 if side in ('left', 'ahead') else -1",
     "a function that gives a list": "def both(a):\n        return [a, a * 2]\n    low, high = both(x)\n    return both(low)[1] - high",
+    "a function that fails before it gives a constant": "def table(a):\n        b = 1 / a\n        return NAMED\n    return table(y)['b'] + x",
+    "a function that gives an empty tuple": "def nothing():\n        return ()\n    return x + len(nothing())",
     "None as a default": "def plus(a, b=None):\n        return a if b is None else a + b\n    return plus(x) + plus(x, y)",
     "a function that is given a function": "def twice(f, a):\n        return f(f(a))\n    return twice(lambda v: v + y, x) + twice(double, x)",
     "a dictionary's items": "return sum(a * b for a, b in {1: 2.5, 2: 4}.items()) + x",

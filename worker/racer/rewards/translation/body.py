@@ -129,11 +129,9 @@ class Body(Calls):
             else:
                 called = text  # it sees the variables of the function around it, and so stays where it is called
         self.may_fail = True
-        if result is None:
+        if result is None or not flat(result):
             self.emit(f"{called}({values});")
-            return self.program.wrap(None, node)
-        if not flat(result):
-            return result  # type: ignore[no-any-return]
+            return self.program.wrap(None, node) if result is None else rebuilt(result, [])
         name = self.fresh()
         self.emit(f"const {returns} {name} = {called}({values});")
         if isinstance(result, str):
@@ -217,7 +215,7 @@ class Body(Calls):
         """Assign a value to a local variable."""
         _check_kept(value, node)
         shape = shape_of(value)
-        old = self.slots.get(name)
+        old: Any = self.slots.get(name)
         new = shape if old is None else joined(old, shape)
         if new is None:
             raise Outside(node, f"{name}, which is {described(old)} and then {described(shape)}")
@@ -274,7 +272,7 @@ class Body(Calls):
         if test.constant is not None:
             return self.block(node.body if test.constant else node.orelse)
         if self.may_fail:
-            test = self.hold(test)  # type: ignore[assignment]
+            test = self.numeric(self.hold(test), node)
             self.check()
         before = set(self.assigned)
         self.emit(f"if {parenthesised(test.code)} {{")
@@ -308,7 +306,7 @@ class Body(Calls):
         self.emit(self.round(node))
         test = self.condition(node.test)
         if test.constant is None:
-            test = self.hold(test)  # type: ignore[assignment]
+            test = self.numeric(self.hold(test), node)
             self.check()
         if test.constant is not True:
             self.emit(f"if (!{test.code}) break;")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from worker.racer.rewards.translation.prelude import LOOP, UNBOUND
 from worker.racer.rewards.translation.program import Program
@@ -24,6 +24,9 @@ from worker.racer.rewards.translation.values import (
 BUILTINS = (  # noqa: SIM905
     "abs all any bool divmod enumerate float int len list max min pow print range reversed round sum tuple zip str"
 ).split()
+
+
+Made = TypeVar("Made")
 
 
 class Emitting:
@@ -68,7 +71,7 @@ class Emitting:
             self.emit("if (error) return {};")
             self.may_fail = False
 
-    def captured(self, make: Callable[[], Any]) -> tuple[Any, list[str]]:
+    def captured(self, make: Callable[[], Made]) -> tuple[Made, list[str]]:
         """The result of ``make`` and the lines that it added, which are removed again."""
         before, self.lines = self.lines, []
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+from functools import partial
 from typing import Any
 
 from worker.racer.rewards.parameters import BY_NAME
@@ -162,7 +163,7 @@ class Expressions(Items):
         sign, decides = ("&&", False) if isinstance(node.op, ast.And) else ("||", True)
         parts: list[str] = []
         for place, each in enumerate(node.values):
-            value, lines = self.captured(lambda each=each: self.condition(each))  # type: ignore[misc]
+            value, lines = self.captured(partial(self.condition, each))
             if value.constant is not None and not lines:
                 if value.constant == decides:
                     if not parts:
@@ -199,14 +200,13 @@ class Expressions(Items):
         if test.constant is not None:
             return self.expression(node.body if test.constant else node.orelse)
         (one, before), (other, otherwise) = (
-            self.captured(lambda branch=branch: self.expression(branch))  # type: ignore[misc]
-            for branch in (node.body, node.orelse)
+            self.captured(partial(self.expression, branch)) for branch in (node.body, node.orelse)
         )
         shape = joined(shape_of(one), shape_of(other))
         if shape is None:
             raise Outside(node, f"a value that is {described(shape_of(one))} or {described(shape_of(other))}")
         if isinstance(shape, str) and not before and not otherwise:
-            return Number(shape, f"({test.code} ? {cast(one, shape)} : {cast(other, shape)})")
+            return Number(shape, f"({test.code} ? {codes(one, shape)[0]} : {codes(other, shape)[0]})")
         names = [self.fresh() for _ in flat(shape)]
         self.lines += [f"{C_TYPES[kind]} {name} = 0;" for kind, name in zip(flat(shape), names, strict=True)]
         for opening, lines, value in (

@@ -59,7 +59,7 @@ class Items(Emitting):
         """``base[index]``."""
         if isinstance(base, Thing) and base.kind == "params":
             return self.key(index, node)
-        known = index.constant if isinstance(index, Number) else None
+        known: int | None = index.constant if isinstance(index, Number) else None
         if isinstance(base, Constant) and isinstance(base.value, dict):
             return self._entry(base.value, index, node)
         index = self.numeric(index, node)

@@ -308,8 +308,11 @@ def _check_harmless(statement: ast.stmt) -> None:
             raise Outside(node, "a statement of the module that changes something")
 
 
-def _plain(group: Group) -> list[Any]:
-    return [_plain(item) if isinstance(item, Group) else item.constant for item in group.items]  # type: ignore[union-attr]
+def _plain(value: Value) -> Any:
+    if isinstance(value, Group):
+        return [_plain(item) for item in value.items]
+    assert isinstance(value, Number)  # the groups of a module hold nothing else
+    return value.constant
 
 
 def _count(value: Any) -> int:

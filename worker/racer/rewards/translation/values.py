@@ -114,6 +114,8 @@ class Thing:
 
 
 Value = Number | Group | Constant | Rows | Thing
+Shape = str | tuple["Shape", ...] | Constant | Rows | Thing
+"""The type of a variable: the kind of a number, those of a group's items, or the value itself where nothing has to be held."""
 
 
 def number(value: bool | int | float) -> Number:
@@ -150,8 +152,8 @@ def parenthesised(code: str) -> str:
     return f"({code})"
 
 
-def shape_of(value: Value) -> Any:
-    """The type of a variable that holds a value: a kind, a tuple of such, or the value itself where nothing has to be held."""
+def shape_of(value: Value) -> Shape:
+    """The type of a variable that holds a value."""
     if isinstance(value, Number):
         return value.kind
     if isinstance(value, Group):
@@ -171,7 +173,7 @@ def joined(one: Any, other: Any) -> Any:
     return None
 
 
-def described(shape: Any) -> str:
+def described(shape: Shape) -> str:
     """A variable's type in words."""
     if isinstance(shape, tuple):
         return f"a list of {len(shape)}"
@@ -184,7 +186,7 @@ def described(shape: Any) -> str:
     return {"bool": "a truth value", "int": "an int", "float": "a float", "text": "a text"}[shape]
 
 
-def flat(shape: Any) -> list[str]:
+def flat(shape: Shape) -> list[str]:
     """The kinds of all numbers in a type, in order; of what need not be held none."""
     if isinstance(shape, str):
         return [shape]
@@ -200,10 +202,10 @@ def codes(value: Value, shape: Any) -> list[str]:
     return []
 
 
-def rebuilt(shape: Any, names: list[str]) -> Value:
+def rebuilt(shape: Shape, names: list[str]) -> Value:
     """The value of a type whose numbers are held by ``names``, in order."""
     if isinstance(shape, str):
         return Number(shape, names.pop(0))
     if isinstance(shape, tuple):
         return Group(tuple(rebuilt(item, names) for item in shape))
-    return shape  # type: ignore[no-any-return]
+    return shape
