@@ -10,7 +10,7 @@ import torch
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
-from tests.support.worker.point_task import Point
+from tests.support.worker.point_task import TASK
 from worker.distributed import Gang, Placement
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
@@ -22,7 +22,7 @@ def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | No
     job = Job.from_env(env, "train")
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
-    training = Training.of(job, Point)  # type: ignore[arg-type]
+    training = Training.of(job, TASK)
     return Loop(training, gang or Gang(Placement(), "cpu", None, ["here"]), stop or StopRequest())
 
 
