@@ -56,7 +56,8 @@ def raw(url: str) -> Callable[[str, dict[str, Any]], dict[str, Any]]:
         answer = connection.getresponse()
         body = answer.read()
         assert answer.status == 200, body[:500]
-        return json.loads(body)  # type: ignore[no-any-return]
+        told: dict[str, Any] = json.loads(body)
+        return told
 
     return call
 
@@ -115,7 +116,8 @@ def _client(
 ) -> None:
     call, draw = CLIENTS[kind](url), random.Random(seed)
     call("DescribeJobQueues", {})  # connected, and everything imported
-    latencies, ids = [], []
+    latencies: list[float] = []
+    ids: list[str] = []
     ready.wait()
     first = now = time.perf_counter()
     while now < first + seconds and len(latencies) < most:
@@ -322,7 +324,8 @@ def _latencies(muster: Muster, arrays: list[str]) -> Iterator[tuple[str, str]]:
         ("of the queue", {"jobQueue": "bench", "jobStatus": "RUNNABLE"}),
         ("of an array", {"arrayJobId": arrays[-1], "jobStatus": "RUNNABLE"}),
     ):
-        pages, token = [], {}
+        pages: list[float] = []
+        token: dict[str, str] = {}
         while True:
             begin = time.perf_counter()
             page = call("ListJobs", {**query, **token})

@@ -19,7 +19,6 @@ FIELDS = ("name", "status", "reason", "queue", "nodes", "progress", "rate", "rew
 changed = {"count": 0}
 
 
-@app.middleware("http")
 async def policy(request: Any, call_next: Any) -> Any:
     answer = await call_next(request)
     if GIVEN:
@@ -32,7 +31,6 @@ def change() -> None:
     JOBS[changed["count"] % 50]["status"] = "FAILED" if changed["count"] // 50 % 2 == 0 else "RUNNABLE"
 
 
-@ui.page("/")
 def jobs() -> None:
     ui.label("Jobs").classes("text-h4")
     columns = [{"name": name, "label": name.capitalize(), "field": name, "align": "left"} for name in FIELDS]
@@ -47,5 +45,7 @@ def jobs() -> None:
     ui.timer(0.5, look)
 
 
+app.middleware("http")(policy)
+ui.page("/")(jobs)
 app.timer(1.0, change)
 ui.run(host="127.0.0.1", port=int(PORT), show=False, reload=False, title="Jobs")

@@ -162,7 +162,12 @@ def measured(browser: Browser, name: str, url: str, pid: int, row: str, change: 
         each.new_page().goto(url, wait_until="commit", timeout=120_000)
     contexts[0].pages[0].wait_for_timeout(1000 * SETTLING)
     over = threading.Event()
-    changing = threading.Thread(target=lambda: [change() for _ in iter(lambda: over.wait(1), True)])
+
+    def keep_changing() -> None:
+        while not over.wait(1):
+            change()
+
+    changing = threading.Thread(target=keep_changing)
     changing.start()
     began, cpu = time.monotonic(), load.own_seconds(str(pid))
     contexts[0].pages[0].wait_for_timeout(1000 * WATCHED)

@@ -16,11 +16,11 @@ from typing import Any
 
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import wait_for
 from tests.support.engines.fixtures import sites
 from tests.support.engines.sites import SITES, Site
 from tests.support.engines.training import submit
 from tests.support.processes import kill_rank, kill_supervisor, processes_of_job
+from tests.support.waiting import wait_for
 
 TRIES = 3
 site = sites(*SITES)
@@ -44,31 +44,38 @@ def seconds(since: float, what: Callable[[], Any]) -> float:
 def test_measure(site: Site) -> None:
     times: dict[str, list[float]] = {name: [] for name in ("first", "rank", "node", "again", "stop")}
     for _ in range(TRIES):
-        begun = time.monotonic()
-        job = site.submit(STAYS, nodes=2, attempts=4)
-        times["first"].append(seconds(begun, lambda job=job: site.printed(job)))
-        site.ready(job, 1, 2)
-        for attempt, (name, kill) in enumerate((("rank", kill_rank), ("node", kill_supervisor)), 1):
-            begun = time.monotonic()
-            kill(job, 1)
-
-            def noticed(job: str = job, attempt: int = attempt) -> bool:
-                attempts = site.serving.detail(job)["attempts"]
-                return len(attempts) > attempt or bool(attempts[attempt - 1]["statusReason"])
-
-            times[name].append(seconds(begun, noticed))
-            again = seconds(begun, lambda job=job, a=attempt: site.printed(job, a + 1).count("ready") == 2)
-            if name == "node":
-                times["again"].append(again)
-        memory = _memory(site)
-        begun = time.monotonic()
-        site.serving.client.batch("TerminateJob", jobId=job, reason="measured")
-        times["stop"].append(
-            seconds(begun, lambda job=job: not processes_of_job(job) and site.serving.detail(job)["status"] == "FAILED")
-        )
+        memory = _try(site, times)
     row = {name: f"{statistics.median(found):.2f}" for name, found in times.items()}
     ROWS[site.engine] = {**row, **memory, "speed": _speed(site)}
     _write()
+
+
+def _try(site: Site, times: dict[str, list[float]]) -> dict[str, str]:
+    """One gang from its start to its stop; the memory of the engine while it ran."""
+
+    def noticed() -> bool:
+        attempts = site.serving.detail(job)["attempts"]
+        return len(attempts) > attempt or bool(attempts[attempt - 1]["statusReason"])
+
+    begun = time.monotonic()
+    job = site.submit(STAYS, nodes=2, attempts=4)
+    times["first"].append(seconds(begun, lambda: site.printed(job)))
+    site.ready(job, 1, 2)
+    kill: Callable[[str, int], None]
+    for attempt, (name, kill) in enumerate((("rank", kill_rank), ("node", kill_supervisor)), 1):
+        begun = time.monotonic()
+        kill(job, 1)
+        times[name].append(seconds(begun, noticed))
+        again = seconds(begun, lambda: site.printed(job, attempt + 1).count("ready") == 2)  # noqa: B023 at once
+        if name == "node":
+            times["again"].append(again)
+    memory = _memory(site)
+    begun = time.monotonic()
+    site.serving.client.batch("TerminateJob", jobId=job, reason="measured")
+    times["stop"].append(
+        seconds(begun, lambda: not processes_of_job(job) and site.serving.detail(job)["status"] == "FAILED")
+    )
+    return memory
 
 
 def _speed(site: Site) -> str:

@@ -11,6 +11,7 @@ import contextlib
 import os
 import platform
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def machine() -> str:
     return f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
 
 
-def told(rows: list[dict[str, Any]]) -> str:
+def told(rows: Sequence[Mapping[str, Any]]) -> str:
     """A sentence for the table of ``rows``, each with its result of :meth:`Watch.check`."""
     known = [row for row in rows if "others" in row]
     if not known:

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,12 +126,13 @@ def rates(url: str, home: str, controller: int) -> list[tuple[str, int, float, f
             job = submit(client, f"flood-{nodes}", _FLOOD.format(lines=MANY // nodes) + _LAST, nodes)
             finish(client, job)
             what = "one node" if nodes == 1 else f"{nodes} nodes merged"
-            for name, read in (
-                ("GET /api/jobs/X/logs", lambda job=job: received(url, job)),
-                ("GET …?follow=true", lambda job=job: received(url, job, follow="true")),
-                ("orchestrator.client", lambda job=job: sum(map(len, client.log_batches(job)))),
-                ("muster logs", lambda job=job: printed(url, home, job)),
-            ):
+            readers: dict[str, Callable[[], int]] = {
+                "GET /api/jobs/X/logs": partial(received, url, job),
+                "GET …?follow=true": partial(received, url, job, follow="true"),
+                "orchestrator.client": partial(batched, client, job),
+                "muster logs": partial(printed, url, home, job),
+            }
+            for name, read in readers.items():
                 took, worked = [], []
                 for _ in range(3):
                     began, before = time.monotonic(), cpu_seconds(controller)
@@ -139,6 +141,10 @@ def rates(url: str, home: str, controller: int) -> list[tuple[str, int, float, f
                     worked.append(cpu_seconds(controller) - before)
                 rows.append((f"{name}, {what}", count, count / min(took), min(worked) / count))
     return rows
+
+
+def batched(client: Client, job: str) -> int:
+    return sum(map(len, client.log_batches(job)))
 
 
 def cpu_seconds(pid: int) -> float:

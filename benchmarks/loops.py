@@ -14,8 +14,11 @@ import io
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_config, stock_runner
@@ -31,7 +34,8 @@ WARM = 10
 def in_muster(task: str, worlds: int, iterations: int, algorithm: str) -> float:
     """Steps per second, from the metrics of a whole run of the loop."""
     with tempfile.TemporaryDirectory() as directory:
-        store, own = Path(directory), {}
+        store = Path(directory)
+        own: dict[str, Any] = {}
         if algorithm == "rsl_rl":
             template = build(task, 1, store / "template")
             own["rsl_rl"] = stock_config(template.task, template.config.ppo)
@@ -59,18 +63,17 @@ def in_rsl_rl(task: str, worlds: int, iterations: int, **changes: Any) -> float:
             wait()
             logged.append(time.perf_counter())
 
-        runner.logger.log = noting  # type: ignore[method-assign]
-        with contextlib.redirect_stdout(io.StringIO()):
+        with mock.patch.object(runner.logger, "log", noting), contextlib.redirect_stdout(io.StringIO()):
             runner.learn(iterations)
         loop.close()
     return worlds * ppo.steps * (iterations - WARM) / (logged[-1] - logged[WARM - 1])
 
 
-WAYS = {
-    "Muster, ppo": lambda *case: in_muster(*case, "ppo"),
-    "Muster, rsl_rl": lambda *case: in_muster(*case, "rsl_rl"),
+WAYS: dict[str, Callable[[str, int, int], float]] = {
+    "Muster, ppo": partial(in_muster, algorithm="ppo"),
+    "Muster, rsl_rl": partial(in_muster, algorithm="rsl_rl"),
     "rsl-rl's runner": in_rsl_rl,
-    "rsl-rl's runner, tuned": lambda *case: in_rsl_rl(*case, check_for_nan=False),
+    "rsl-rl's runner, tuned": partial(in_rsl_rl, check_for_nan=False),
 }
 
 

@@ -8,11 +8,13 @@ Writes ``objective.md``: milliseconds of learning and of an iteration. Everythin
 from __future__ import annotations
 
 import argparse
+import contextlib
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import torch
 
@@ -26,29 +28,28 @@ STRETCHES, ITERATIONS = 5, 15
 
 def measure(task: str, worlds: int, way: str) -> dict[str, float]:
     """Medians [ms] of an iteration, and of learning in it, on this device."""
-    plain = fused.Gaussian, heads.clipped_loss, heads.gaussian_terms
-    try:
+    with contextlib.ExitStack() as stack:
         if way != "kernel":
-            fused.Gaussian = lambda *given, **named: plain[0](*given, **{**named, "plain": True})  # type: ignore[misc, assignment]
-        if way == "torch.compile":
-            compiled: list[Callable[..., object]] = [torch.compile(each) for each in plain[1:]]
-            heads.clipped_loss, heads.gaussian_terms = compiled  # type: ignore[assignment]
-        with tempfile.TemporaryDirectory() as directory:
-            loop = build(task, worlds, Path(directory))
-            for _ in range(6):
-                loop._iterate()
-            found = []
-            for _ in range(STRETCHES):
-                wait()
-                started = time.perf_counter()
-                learnt = [loop._iterate()[0]["learn_seconds"] for _ in range(ITERATIONS)]
-                wait()
-                found.append(((time.perf_counter() - started) / ITERATIONS, statistics.median(learnt)))
-            loop.close()
-    finally:
-        fused.Gaussian, heads.clipped_loss, heads.gaussian_terms = plain  # type: ignore[misc]
+            stack.enter_context(mock.patch.object(fused, "Gaussian", _plain))
+        for name in ("clipped_loss", "gaussian_terms") if way == "torch.compile" else ():
+            stack.enter_context(mock.patch.object(heads, name, torch.compile(getattr(heads, name))))
+        loop = build(task, worlds, Path(stack.enter_context(tempfile.TemporaryDirectory())))
+        for _ in range(6):
+            loop._iterate()
+        found = []
+        for _ in range(STRETCHES):
+            wait()
+            started = time.perf_counter()
+            learnt = [loop._iterate()[0]["learn_seconds"] for _ in range(ITERATIONS)]
+            wait()
+            found.append(((time.perf_counter() - started) / ITERATIONS, statistics.median(learnt)))
+        loop.close()
     iteration, learn = (1000 * statistics.median(each) for each in zip(*found, strict=True))
     return {"iteration": iteration, "learn": learn}
+
+
+def _plain(*given: Any, **named: Any) -> heads.Gaussian:
+    return heads.Gaussian(*given, **{**named, "plain": True})
 
 
 def main() -> None:

@@ -204,7 +204,7 @@ def measure(folder: Path) -> Measured:
 
     from muster_policy.messages import Messages
     from worker.deploy.simulated_robot import SimulatedRobot
-    from worker.tasks import find_task
+    from worker.tasks import DeclaredTask, find_task
     from worker.tasks.policy_contract import policy_contract
 
     task_type = find_task("Go1Flat")
@@ -212,7 +212,8 @@ def measure(folder: Path) -> Measured:
     contract = policy_contract(task, "Go1Flat")
     groups = tuple(group for group in contract.groups if group.name == "policy")
     inputs = tuple(dataclasses.replace(group, input="obs") for group in groups)
-    robot = SimulatedRobot(task, dataclasses.replace(contract, groups=inputs), Messages())  # type: ignore[arg-type]
+    assert isinstance(task, DeclaredTask)
+    robot = SimulatedRobot(task, dataclasses.replace(contract, groups=inputs), Messages())
     bundle = make_bundle(folder / "bundle", robot.contract)
     found: Measured = {}
     for _ in range(REPEATS):
@@ -221,11 +222,11 @@ def measure(folder: Path) -> Measured:
         for rate in RATES:
             common = ("--rate", f"{rate:g}", "--timeout", "1")
             node = NodeProcess(bundle, folder / "log", "--trigger", "joint_states", *common)
-            times = drive(node.endpoint, robot, rate, SECONDS)
+            took = drive(node.endpoint, robot, rate, SECONDS)
             node.end()
-            if len(times) < 0.5 * SECONDS * rate:
-                raise SystemExit(f"only {len(times)} commands in {SECONDS:g} s at {rate:g} Hz")
-            found.setdefault(f"{ANSWER}, {rate:g} Hz", []).append(percentiles(times))
+            if len(took) < 0.5 * SECONDS * rate:
+                raise SystemExit(f"only {len(took)} commands in {SECONDS:g} s at {rate:g} Hz")
+            found.setdefault(f"{ANSWER}, {rate:g} Hz", []).append(percentiles(took))
         for rate in RATES:
             common = ("--rate", f"{rate:g}", "--timeout", "1")
             node = NodeProcess(bundle, folder / "log", *common)

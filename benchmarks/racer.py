@@ -40,6 +40,7 @@ from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
 from worker.learning.setup import build_task
 from worker.tasks.adapting import adaptive_steps, begin_evaluation
+from worker.tasks.configs.racer import RacerConfig
 from worker.tasks.task import Task
 
 HERE = Path(__file__).parent
@@ -102,9 +103,7 @@ class RacingLoop(Loop):
             wait()
             self._next = seconds + self._every
             spent = self._now()
-            self._apart = tuple(
-                apart + now - then for apart, now, then in zip(self._apart, spent, (seconds, cpu), strict=True)
-            )  # type: ignore[assignment]
+            self._apart = self._apart[0] + spent[0] - seconds, self._apart[1] + spent[1] - cpu
             self._stopwatch.begin()  # the run's own records exclude it too
         self.stop.requested |= over  # it saves after the next iteration, then exits
         return record, signals
@@ -114,11 +113,12 @@ class RacingLoop(Loop):
         played = evaluate(self._worlds, self.algorithm.policy(), self.gang, checkpoint="-").played
         laps, times, progress = played.successes, played.term("metric_lap_time"), played.term("metric_progress")
         assert laps is not None
-        tracks = self._worlds.config.tracks
-        share = laps.double().mean().item()
+        config = self._worlds.config
+        assert isinstance(config, RacerConfig)
+        share, count = laps.double().mean().item(), len(config.tracks)
         by_track = {
-            name: [round(value, 3) for value in times[number :: len(tracks)][laps[number :: len(tracks)]].tolist()]
-            for number, name in enumerate(tracks)
+            name: [round(value, 3) for value in times[number::count][laps[number::count]].tolist()]
+            for number, name in enumerate(config.tracks)
         }
         ends = played.ends
         row = at | {"share": share, "progress": progress.mean().item(), "lap_times": by_track}

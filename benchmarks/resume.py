@@ -99,7 +99,9 @@ class Restarts(Bench):
         resumed = self.await_line(job, attempt + 1, "resumed from checkpoint")
         first = seconds(self.await_line(job, attempt + 1, r"iteration +\d+/")["time"])
         stopped = self.detail(job)["attempts"][attempt - 1]["stoppedAt"] / 1000
-        load = float(re.search(r" in ([\d.]+) s", resumed["text"])[1])  # type: ignore[index]
+        took = re.search(r" in ([\d.]+) s", resumed["text"])
+        assert took is not None
+        load = float(took[1])
         loaded = seconds(resumed["time"])
         return stopped, loaded, load, Restart(decided - killed, stopped - decided, 0.0, 0.0, load, first - loaded)
 

@@ -13,6 +13,7 @@ import random
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,9 +72,9 @@ def rate(reward: RewardFunction, cars: int) -> float:
     return statistics.median(found)
 
 
-def measure(name: str, cars: int) -> dict[str, object]:
+def measure(name: str, cars: int) -> dict[str, Any]:
     """Both forms of a function."""
-    row: dict[str, object] = {"name": name, "cars": cars}
+    row: dict[str, Any] = {"name": name, "cars": cars}
     for form, compiled in (("compiled", True), ("workers", False)):
         device = f"cuda:{torch.cuda.current_device()}" if CUDA else "cpu"
         reward = RewardFunction(FUNCTIONS[name], [oval()], cars, device, compiled=compiled)
@@ -84,7 +85,7 @@ def measure(name: str, cars: int) -> dict[str, object]:
     return row
 
 
-def table(rows: list[dict[str, object]]) -> str:
+def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
         f"# Reward functions on {device_name()}",
@@ -95,7 +96,7 @@ def table(rows: list[dict[str, object]]) -> str:
         "|---|--:|--:|--:|--:|",
     ]
     for row in rows:
-        ratio = row["compiled"] / row["workers"]  # type: ignore[operator]
+        ratio = row["compiled"] / row["workers"]
         lines.append(
             f"| {row['name']} | {row['cars']:,} | {row['compiled']:,.0f} | {row['workers']:,.0f} | {ratio:,.0f} |"
         )

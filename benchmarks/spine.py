@@ -68,7 +68,8 @@ class Bench:
     def rate(self, detail: dict[str, Any]) -> float:
         """Median steps per second of the gang, without the first two iterations."""
         records = self.client.get(f"/api/runs/{detail['run']}/metrics")[2:]
-        return statistics.median(record["steps_per_second"] for record in records)
+        median: float = statistics.median(record["steps_per_second"] for record in records)
+        return median
 
     def log_latency(self, lines: int = 50) -> list[float]:
         """Line written by a rank → seen by ``muster logs -f``, one value per line [s]."""

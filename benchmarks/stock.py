@@ -25,7 +25,7 @@ def stock_config(task: Task, ppo: PPOConfig) -> dict[str, Any]:
     }
     images = len(task.observation_shape) > 1
     if images:
-        layers = {"output_channels": list(ppo.channels), "kernel_size": list(ppo.kernel_sizes)}
+        layers: dict[str, Any] = {"output_channels": list(ppo.channels), "kernel_size": list(ppo.kernel_sizes)}
         layers |= {"stride": list(ppo.strides), "activation": ppo.activation}
         network |= {"class_name": "CNNModel", "cnn_cfg": layers}
     return {

@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,11 +72,11 @@ def sensors(task: str) -> dict[str, Any]:
 
 def eyes(task: str) -> dict[str, Any]:
     """What follows rays, which costs so much more that it is measured by itself alone."""
-    trunk, pixels = TRUNKS[task], {"width": 64, "height": 64}
+    trunk = TRUNKS[task]
     return {
         "rays_64": RayCaster(body=trunk, pattern=LidarPattern(count=64), start=0.5),
-        "depth_64x64": CameraSensor(body=trunk, kind="depth", **pixels),
-        "colour_64x64": CameraSensor(body=trunk, **pixels),
+        "depth_64x64": CameraSensor(body=trunk, kind="depth", width=64, height=64),
+        "colour_64x64": CameraSensor(body=trunk, width=64, height=64),
     }
 
 
@@ -107,6 +108,17 @@ def parts(task: DeclaredTask) -> dict[str, Callable[[], None]]:
         "observe": lambda: task._observe_alone(int(STEP)),
         "bodies": task.worlds.update_bodies,
     }
+
+
+def judged_and_observed(task: DeclaredTask) -> Callable[[], None]:
+    """The launches of a control step that hold terms."""
+    own = parts(task)
+
+    def launch() -> None:
+        own["judge"]()
+        own["observe"]()
+
+    return launch
 
 
 def measured(sensor: Any) -> Callable[[], None]:
@@ -193,10 +205,9 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
     graphs |= {f"sensor {key}": copies(measured(sensed.sensors[key])) for key in added}
     graphs |= {f"sensor {key}": copies(measured(seeing.sensors[key])) for key in looking}
     for term in TERMS:
-        crowd = parts(made(varied(name, lambda given, term=term: more(term, given)), worlds))  # type: ignore[misc]
-        graphs[f"term {term}"] = copies(lambda crowd=crowd: (crowd["judge"](), crowd["observe"]()))  # type: ignore[misc]
-    own = parts(plain)
-    graphs["term none"] = copies(lambda: (own["judge"](), own["observe"]()))  # type: ignore[func-returns-value]
+        crowd = made(varied(name, partial(more, term)), worlds)
+        graphs[f"term {term}"] = copies(judged_and_observed(crowd))
+    graphs["term none"] = copies(judged_and_observed(plain))
     found = seconds(graphs)
     times = {
         key: statistics.median(values) / (1 if key.startswith("step") else COPIES) for key, values in found.items()

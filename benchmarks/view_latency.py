@@ -20,6 +20,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import rerun as rr
@@ -91,9 +92,9 @@ def train(task: str, worlds: int, folder: Path) -> None:
         taps.append(tap)
         opened(tap)
 
-    loop.task.step, Tap.open = timed, kept  # type: ignore[method-assign]
-    (folder / "built").touch()
-    loop.train()
+    with mock.patch.object(loop.task, "step", timed), mock.patch.object(Tap, "open", kept):
+        (folder / "built").touch()
+        loop.train()
 
 
 class Timed(Training):
@@ -154,7 +155,7 @@ def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, A
         "--worlds",
         str(worlds),
         "--train",
-        folder,
+        str(folder),
     ]
     trained = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
@@ -171,8 +172,8 @@ def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, A
             threading.Thread(target=look_on, args=given).start()
             return page
 
-        screen.Screen = Marked  # type: ignore[misc]
-        Timed(run, "bench", SHOWN, stop, Activity()).show(start)
+        with mock.patch.object(screen, "Screen", Marked):
+            Timed(run, "bench", SHOWN, stop, Activity()).show(start)
     finally:
         trained.terminate()
         trained.wait()

@@ -12,7 +12,7 @@ import os
 import re
 import threading
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice, takewhile
@@ -212,6 +212,10 @@ class _File:
                     yield iteration, record
 
 
+def _until(limit: float, records: Iterable[tuple[int, dict[str, Any]]]) -> Iterator[tuple[int, dict[str, Any]]]:
+    return takewhile(lambda each: each[0] <= limit, records)
+
+
 class MetricsHistory:
     """A run's history, read incrementally. Thread-safe."""
 
@@ -233,8 +237,7 @@ class MetricsHistory:
             for file, section in reversed(self._refresh()):
                 if section.marks and min(section.last, limit) > iteration:
                     wanted = (each for each in file.read(section, iteration) if each[0] > iteration)
-                    counting = takewhile(lambda each, limit=limit: each[0] <= limit, wanted)  # type: ignore[misc]
-                    found = dict(islice(counting, most)) | found  # the later section counts
+                    found = dict(islice(_until(limit, wanted), most)) | found  # the later section counts
                 limit = limit if section.resumed_from is None else min(limit, section.resumed_from)
         return [found[i] for i in sorted(found)[:most]]
 

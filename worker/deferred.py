@@ -45,7 +45,7 @@ class _Deferred(types.ModuleType):
         if sys.modules.get(_NAME) is self:
             del sys.modules[_NAME]
             real = importlib.import_module(_NAME)
-            torch._dynamo = real  # type: ignore[attr-defined]
+            torch._dynamo = real
             for kind, function in self._noted:
                 getattr(real, kind)(function)
         return getattr(sys.modules[_NAME], name)
@@ -54,4 +54,4 @@ class _Deferred(types.ModuleType):
 def defer_compiler() -> None:
     """Leave ``torch._dynamo`` out until it is needed; nothing where it is there already."""
     if _NAME not in sys.modules:
-        sys.modules[_NAME] = torch._dynamo = _Deferred()  # type: ignore[attr-defined]
+        sys.modules[_NAME] = torch._dynamo = _Deferred()

@@ -137,12 +137,11 @@ class Gang:
                 The marker is a hint. Where it is wrong, kernels are compiled several times, and nothing else happens.
         """
         first = self._sites.index(self._sites[self.rank])
-        alone = self._sites.count(self._sites[self.rank]) == 1
-        if self.store is not None and not alone and self.rank == first:
-            self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
-        wait = self.store is not None and not alone and self.rank != first
-        if wait and self.store.get(f"warm/{what}/{first}") == b"0":
-            self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
+        if self.store is not None and self._sites.count(self._sites[self.rank]) > 1:
+            if self.rank == first:
+                self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
+            elif self.store.get(f"warm/{what}/{first}") == b"0":
+                self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
         try:
             yield
             if warm is not None and self.rank == first:

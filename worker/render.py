@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import os
 import time
+from typing import TYPE_CHECKING
 
 from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def main() -> int:
@@ -44,7 +48,8 @@ def main() -> int:
     if ending == ".png":
         stride = max(1, steps // picture.MOMENTS)
     camera = picture.Camera(stage, width, height)
-    taken, spent = [], 0.0
+    taken: list[np.ndarray] = []
+    spent = 0.0
     for number, rows in enumerate(rollout.steps(steps)):
         activity.count("rendering: step", number + 1, steps)
         if number % stride == 0 and not (ending == ".png" and len(taken) == picture.MOMENTS):

@@ -144,7 +144,7 @@ class Sender:
 
 def _results(run: Run) -> tuple[dict[str, float], list[Path]]:
     files = [run.metrics / "policy.png", run.metrics / "reward.png"]
-    figures: dict[str, float] = {}
+    figures: dict[str, Any] = {}
     own = [each for each in list_evaluations(run) if not each.get("config")]
     if own:
         last = max(own, key=lambda each: (each["checkpoint"], each["time"]))

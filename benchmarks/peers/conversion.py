@@ -82,7 +82,7 @@ class PlainPolicy:
     def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Mean actions, shape (n, actions), for the group ``policy`` of ``observations``, shape (n, observations), float32."""
         values = observations[POLICY]
-        if self._mean is not None:
+        if self._mean is not None and self._deviation is not None:
             values = (values - self._mean) / self._deviation
         for index, (weight, bias) in enumerate(self._layers):
             values = torch.nn.functional.linear(self._activation(values) if index else values, weight, bias)
@@ -121,9 +121,9 @@ def read_rsl_rl(path: Path | str, activation: str = "elu", device: str = "cpu") 
     if strange or not numbers:
         raise ValueError(f"{path}: its actor is no plain network, it has {', '.join(strange) or 'no layers'}")
     layers = [(actor[f"mlp.{number}.weight"], actor[f"mlp.{number}.bias"]) for number in numbers]
-    mean, deviation = (actor.get(f"obs_normalizer.{name}") for name in ("_mean", "_std"))
-    flat = [None if each is None else each.flatten() for each in (mean, deviation)]
-    return PlainPolicy(layers, *flat, activation=activation, device=device)
+    moments = (actor.get(f"obs_normalizer.{name}") for name in ("_mean", "_std"))
+    mean, deviation = (None if each is None else each.flatten() for each in moments)
+    return PlainPolicy(layers, mean, deviation, activation, device)
 
 
 def check_fit(policy: PlainPolicy, observations: int, actions: int, task: str) -> None:
@@ -178,12 +178,12 @@ def check_contract(contract: Mapping[str, Any], interface: Interface, task: str)
     scales = scales if isinstance(scales, Sequence) else [scales] * len(joints)
     positions = dict(zip(contract["joints"], contract["positions"], strict=True))
     for action, scale in zip(interface.actions, scales, strict=True):
-        for what, theirs, ours in (
+        for what, there, here in (
             ("scale", scale, action.scale),
             ("offset", positions[action.name], action.offset),
         ):
-            if not math.isclose(theirs, ours, abs_tol=TOLERANCE):
-                raise ValueError(f"joint {action.name}: its {what} is {theirs:g} in mjlab and {ours:g} in task {task}")
+            if not math.isclose(there, here, abs_tol=TOLERANCE):
+                raise ValueError(f"joint {action.name}: its {what} is {there:g} in mjlab and {here:g} in task {task}")
     _check_order(widths, [seen.name for seen in interface.observations], joints, task)
 
 

@@ -100,7 +100,8 @@ def rotate_back(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     """Vectors of the world frame, shape (n, 3), in frames of these rotations, quaternions xyzw, shape (n, 4)."""
     axis, real = -rotation[:, :3], rotation[:, 3:]
     twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector + real * twice + torch.linalg.cross(axis, twice)
+    turned: torch.Tensor = vector + real * twice + torch.linalg.cross(axis, twice)
+    return turned
 
 
 def judge(task: Task, policy: Acting) -> Judgement:

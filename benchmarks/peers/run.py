@@ -88,7 +88,7 @@ def measure(peer: str, parser: argparse.ArgumentParser, command: Command, argume
     options.out.mkdir(parents=True, exist_ok=True)
     watch = Watch(options.loaded_anyway)
     chosen = ((key, getattr(options, key, None)) for key in ("algorithm", "frontend"))
-    named = [peer, *(value for key, value in chosen if value != parser.get_default(key))]
+    named = [peer, *(str(value) for key, value in chosen if value != parser.get_default(key))]
     for number in range(options.repeats):
         with tempfile.TemporaryDirectory() as passing:
             name = "-".join([*named, case.name, options.limits, str(options.worlds), str(options.seed + number)])

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -83,7 +84,7 @@ def _examine(engines: Sequence[str], store: Path, worker: bool) -> Iterator[Find
     yield _shared_memory()
     yield _controller()
     for name in engines:
-        yield _checked(f"engine {name}", lambda name=name: _engine(name))  # type: ignore[misc]
+        yield _checked(f"engine {name}", partial(_engine, name))
 
 
 def _checked(what: str, look: Callable[[], str]) -> Finding:

@@ -6,7 +6,7 @@ expects. Nothing here looks into the store or waits for an engine: a volume that
 
 from __future__ import annotations
 
-from collections import Counter as Sums
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _WAITS = (0.1, 0.5, 1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 24 * 3600)
 _PASSES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
 _USED = ("queue", "engine")
+_Sums = defaultdict[tuple[str, ...], float]
 
 
 class Monitoring:
@@ -162,14 +163,14 @@ class _Moment(Collector):
         yield _gauge("muster_queue_longest_wait_seconds", oldest, ["queue"], waits)
 
     def _attempts(self, session: Session) -> Iterator[GaugeMetricFamily]:
-        held: dict[str, Sums[tuple[str, ...]]] = {"gpus": Sums(), "cpus": Sums()}
+        held = {"gpus": _Sums(float), "cpus": _Sums(float)}
         rates: dict[tuple[str, ...], float] = {}
         iterations: dict[tuple[str, ...], float] = {}
         for job, attempt in open_attempts(session, self._reconciler.work_queue.active()):
             labels = (job.queue, _engine(attempt))
             given = held_by(attempt)
             held["gpus"][labels] += given.gpus
-            held["cpus"][labels] += given.cpus  # type: ignore[assignment]
+            held["cpus"][labels] += given.cpus
             try:
                 main = job.gang.main
             except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
@@ -194,13 +195,13 @@ class _Moment(Collector):
         return _gauge("muster_volume_short", said, ["volume"], short)
 
     def _hosts(self) -> Iterator[GaugeMetricFamily]:
-        hosts, gpus, cpus = Sums[tuple[str, ...]](), Sums[tuple[str, ...]](), Sums[tuple[str, ...]]()
+        hosts, gpus, cpus = _Sums(float), _Sums(float), _Sums(float)
         for name, capacity in self._reconciler.engine.capacity().items():
             for host in [host for host in capacity.places if not host.away]:
                 if not host.queue:
                     hosts[(name,)] += 1
                 gpus[(name,)] += len(host.gpus)
-                cpus[(name,)] += host.cpus  # type: ignore[assignment]
+                cpus[(name,)] += host.cpus
         for name, amounts in (("hosts", hosts), ("gpus", gpus), ("cpus", cpus)):
             what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as it told them last."
             yield _gauge(f"muster_{name}", what, ["engine"], amounts)

@@ -6,7 +6,7 @@ Times are Unix milliseconds, as in the Batch API. A change here needs a migratio
 from __future__ import annotations
 
 import time
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar, overload
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
@@ -104,9 +104,13 @@ class _OfArray(Generic[_T]):
         """``own``: the column that holds it; NULL in a child."""
         self._own = own
 
-    def __get__(self, job: Job | None, owner: type[Job]) -> _T:
-        if job is None:
-            return self  # type: ignore[return-value]  # how SQLAlchemy looks at a class
+    @overload
+    def __get__(self, job: None, owner: type[Job]) -> Self: ...
+    @overload
+    def __get__(self, job: Job, owner: type[Job]) -> _T: ...
+    def __get__(self, job: Job | None, owner: type[Job]) -> _T | Self:
+        if job is None:  # so SQLAlchemy looks at a class
+            return self
         holder = job if job.array is None else job.array
         value: _T = getattr(holder, self._own)
         return value

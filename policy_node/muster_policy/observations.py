@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -215,7 +216,16 @@ class Observations:
         raise Refused(f"{term.quantity} is none of the actions that the node keeps")
 
 
-def is_twist(command: Command) -> bool:
+class Drawn(Protocol):
+    """A command, by the function that draws it in training."""
+
+    @property
+    def quantity(self) -> str: ...
+    @property
+    def library(self) -> bool: ...
+
+
+def is_twist(command: Drawn) -> bool:
     """Whether a command comes as a ``geometry_msgs/Twist``; else as a ``std_msgs/Float64MultiArray``."""
     return command.library and command.quantity in VELOCITIES
 

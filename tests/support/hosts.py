@@ -32,7 +32,7 @@ def two_hosts() -> Iterator[None]:
 
 
 def start_ranks(
-    arguments: list[str], gpus: int, env: Mapping[str, str], **options: object
+    arguments: list[str], gpus: int, env: Mapping[str, str], stdout: int | None = None, stderr: int | None = None
 ) -> list[subprocess.Popen[str]]:
     """``python ARGUMENTS`` once for each of ``gpus`` GPUs, half of them on each host, with the environment that a supervisor gives a rank.
 
@@ -58,7 +58,9 @@ def start_ranks(
             "TORCH_NCCL_ASYNC_ERROR_HANDLING": "1",
         }
         command = ["ip", "netns", "exec", NAMES[host], sys.executable, *arguments]
-        processes.append(subprocess.Popen(command, env={**os.environ, **given, **env}, text=True, **options))  # type: ignore[call-overload]
+        processes.append(
+            subprocess.Popen(command, env={**os.environ, **given, **env}, text=True, stdout=stdout, stderr=stderr)
+        )
     return processes
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import REPOSITORY, wait_for
+from tests.conftest import REPOSITORY
+from tests.support.waiting import wait_for
 
 PORT = 8080
 """The controller's, on the pages."""

@@ -27,7 +27,7 @@ def to_onnx(policy: ExportedPolicy, metadata: Mapping[str, str]) -> bytes:
     import onnx
 
     inputs, outputs = list(policy.inputs), list(policy.outputs)
-    buffer = io.BytesIO()
+    buffer: Any = io.BytesIO()  # torch's annotation leaves out the files that this exporter takes
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         # torch's newer exporter takes ten times as long here and writes two files by default
         warnings.simplefilter("ignore")

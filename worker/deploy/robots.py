@@ -52,7 +52,8 @@ def _package(name: str | None) -> dict[str, str]:
         about = metadata.metadata(name)
     except metadata.PackageNotFoundError:
         return {"package": name, "licence": "not known"}
-    licence = about.get("License-Expression") or about.get("License") or "not known"
+    named = (about[key] for key in ("License-Expression", "License") if key in about)
+    licence = next(filter(None, named), "not known")
     return {"package": f"{name} {about['Version']}", "licence": f"{licence.splitlines()[0]} (of the package)"}
 
 

@@ -96,7 +96,9 @@ class SimulatedRobot:
         make, view, arrays = self.messages.make, self._view, self.task.worlds.arrays
         pose = arrays.joint_q.numpy()[0, view.root_coordinate : view.root_coordinate + 7].astype(np.float64)
         velocity = arrays.joint_qd.numpy()[0, view.root_dof : view.root_dof + 6].astype(np.float64)
-        com = self.task.worlds.model.body_com.numpy().reshape(-1, 3)[view.root_body].astype(np.float64)
+        coms = self.task.worlds.model.body_com
+        assert coms is not None
+        com = coms.numpy().reshape(-1, 3)[view.root_body].astype(np.float64)
         turn = _matrix(pose[3:])
         angular = turn.T @ velocity[3:]
         linear = turn.T @ velocity[:3] - np.cross(angular, com)
@@ -211,7 +213,8 @@ def play(
     empty = messages.make("std_msgs/msg/Empty", structure_needs_at_least_one_member=0)
     reset = node.publisher("/muster_policy/reset", "std_msgs/msg/Empty")
     period = 1.0 / task.config.control_hz
-    actions, returns, total, late, steps = torch.zeros_like(task.actions), [], 0.0, 0, 0
+    actions, total, late, steps = torch.zeros_like(task.actions), 0.0, 0, 0
+    returns: list[float] = []
     simulated = 0
     begun = False
     deadline = time.monotonic()

@@ -115,7 +115,13 @@ class Evaluation:
             **facts: What else the summary says.
         """
         name = evaluation_name(self.checkpoint, job)
-        summary = {**self.summary(), **facts, "job": job or None, "table": f"{name}.parquet", "time": time.time()}
+        summary: dict[str, Any] = {
+            **self.summary(),
+            **facts,
+            "job": job or None,
+            "table": f"{name}.parquet",
+            "time": time.time(),
+        }
         if race is not None:
             summary["race"] = race.summary()
         earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]

@@ -52,11 +52,11 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
         return None
     iteration, epoch = name.split("-e")
     checkpoint = Checkpoint(job.run.parent / name, int(iteration), int(epoch))
-    learnt = read_file(checkpoint, "learner.pt", gang.device).get("algorithm")
+    learnt: Any = read_file(checkpoint, "learner.pt", gang.device).get("algorithm")
     here = json.loads(json.dumps(facts))
     _check_settings(checkpoint, here, algorithm)
     try:
-        algorithm.load_state_dict(learnt, weights_only=True)  # type: ignore[arg-type]
+        algorithm.load_state_dict(learnt, weights_only=True)
     except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         why = _difference(algorithm.state_dict(), learnt) or " ".join(str(error).split())[:300]
         raise UserError(

@@ -7,7 +7,7 @@ it, and :meth:`Algorithm.learn` may replay graphs of its own (:class:`worker.lea
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -138,7 +138,8 @@ class ExportedPolicy:
 
     def named(self, observations: TensorDict) -> dict[str, torch.Tensor]:
         """Observations, with the groups of the sample in its order, by the names of the inputs."""
-        return dict(zip(self.inputs, observations.values(), strict=False))
+        groups: Iterable[Any] = observations.values()
+        return dict(zip(self.inputs, groups, strict=False))
 
 
 class Algorithm(Protocol):

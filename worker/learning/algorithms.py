@@ -56,11 +56,11 @@ def find_algorithm(name: str) -> type[Algorithm]:
     if place == name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # as for a user's own task (worker.tasks)
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        found: type[Algorithm] = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UserError(f"train.algorithm: {name}: {error}") from error
     refuse_incomplete(found, name, ("config_type", "captures_rollout", *_METHODS))
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 _METHODS = [name for name in vars(Algorithm) if not name.startswith("_")]
@@ -121,8 +121,8 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
     given = section.get(where) or {}
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in dataclasses.fields(own) if item.init} if own else {}
-    kind = algorithm.config_type
-    if not dataclasses.is_dataclass(kind):
+    kind: Any = algorithm.config_type
+    if not dataclasses.is_dataclass(algorithm.config_type):
         raise UserError(f"train.algorithm: {name}: its config_type must be a dataclass, not {kind.__name__}")
     known = [item.name for item in dataclasses.fields(kind)]
     for key in given:

@@ -77,7 +77,8 @@ def within_memory(
 def free_bytes(gang: Gang) -> int:
     """Memory that this rank can still take: of its GPU, or its share of the host's memory (or of its control group's)."""
     if gang.device != "cpu":
-        return torch.cuda.mem_get_info(gang.device)[0]
+        free: int = torch.cuda.mem_get_info(gang.device)[0]
+        return free
     free = psutil.virtual_memory().available
     group = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):  # no control groups of version 2, or no limit

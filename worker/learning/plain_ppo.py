@@ -27,6 +27,10 @@ from worker.learning.ppo.settings import PPOConfig
 class Network(nn.Module):
     """A multi-layer perceptron after a normaliser, which scales its inputs to about unit variance."""
 
+    mean: torch.Tensor
+    variance: torch.Tensor
+    count: torch.Tensor
+
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, config: PPOConfig) -> None:
         super().__init__()
         self.normalizes = config.normalize_observations
@@ -42,7 +46,8 @@ class Network(nn.Module):
         """Shape (…, outputs) for observations of shape (…, inputs)."""
         if self.normalizes:
             observations = (observations - self.mean) / (self.variance.sqrt() + 0.01)
-        return self.layers(observations)
+        outputs: torch.Tensor = self.layers(observations)
+        return outputs
 
     @torch.no_grad()
     def update_normalizer(self, observations: torch.Tensor, setting: Setting) -> None:
@@ -73,7 +78,8 @@ class Actor(Network):
     @torch.no_grad()
     def act(self, observations: TensorDict) -> torch.Tensor:
         """The best action is the mean: shape (worlds, actions)."""
-        return self(observations[POLICY])
+        best: torch.Tensor = self(observations[POLICY])
+        return best
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
         """Do nothing: the policy has no recurrent state."""
@@ -150,6 +156,7 @@ class PlainPPO:
             self.optimizer.zero_grad()
             (weight * loss).backward()
             for parameter in self.parameters:
+                assert parameter.grad is not None
                 self.gang.sum(parameter.grad)
             told = self.gang.sum(weight * told)
             sums += told
@@ -224,7 +231,11 @@ class PlainPPO:
 
     def state_dict(self) -> dict[str, Any]:
         """Networks with their normalisers, optimizer and learning rate."""
-        parts = {"policy": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+        parts: dict[str, nn.Module | torch.optim.Optimizer] = {
+            "policy": self.actor,
+            "critic": self.critic,
+            "optimizer": self.optimizer,
+        }
         return {**{name: part.state_dict() for name, part in parts.items()}, "learning_rate": self.rate}
 
     def load_state_dict(self, state: Any, *, weights_only: bool = False, changed: Collection[str] = ()) -> list[str]:

@@ -30,11 +30,16 @@ def seed_generators(seed: int, rank: int | None = None) -> None:
 def generator_state() -> dict[str, Any]:
     """The states of torch's, numpy's and Python's global generators, as tensors and numbers."""
     version, internal, gauss = random.getstate()
-    _, keys, position, has_gauss, cached = np.random.get_state()
+    numpy = np.random.get_state(legacy=False)
+    keys, position = numpy["state"]["key"], numpy["state"]["pos"]
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
-        "numpy": {"keys": torch.from_numpy(keys.astype(np.int64)), "position": position, "gauss": [has_gauss, cached]},
+        "numpy": {
+            "keys": torch.from_numpy(keys.astype(np.int64)),
+            "position": position,
+            "gauss": [numpy["has_gauss"], numpy["gauss"]],
+        },
         "python": {"version": version, "internal": torch.tensor(internal), "gauss": gauss},
     }
 

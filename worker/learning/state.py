@@ -100,7 +100,7 @@ class Progress:
         self.recent.append(list(Ended(steps, episodes, returns, squares)))
         span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
-            entry = Ended(*self.recent[index])
+            entry = Ended._make(self.recent[index])
             span, ended = span + entry.steps, ended + entry.episodes
             total, spread = total + entry.returns, spread + entry.squares
             if span >= longest and ended >= max(EPISODES, worlds):

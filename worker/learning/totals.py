@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 
@@ -21,7 +21,8 @@ class Totals:
         self.layout = dict(sizes)
         self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device, pin_memory=pinned)
         """All parts, one after the other, shape (n,)."""
-        self._parts = dict(zip(sizes, self.values.split(list(sizes.values())), strict=True))
+        parts: Iterable[torch.Tensor] = self.values.split(list(sizes.values()))
+        self._parts = dict(zip(sizes, parts, strict=True))
 
     def __getitem__(self, name: str) -> torch.Tensor:
         """A live view of one part, shape (its size,)."""

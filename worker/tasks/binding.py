@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
-import warp as wp
-
 from shared_store.wording import nearest, shown
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import HeightScanArrays
@@ -408,4 +406,4 @@ def _is_sensor(kind: Any) -> bool:
 
 def has_columns(kind: Any) -> bool:
     """Whether a sensor's struct has a column for each measured element, besides the row of each world."""
-    return any(wp.types.is_array(each.type) and each.type.ndim > 1 for each in kind.vars.values())
+    return any(getattr(each.type, "ndim", 0) > 1 for each in kind.vars.values())  # of an array, or of its annotation

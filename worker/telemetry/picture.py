@@ -9,7 +9,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import worker.simulation  # noqa: F401 - before Newton, which it keeps from importing Rerun
 
@@ -21,6 +21,7 @@ from newton.sensors import SensorCamera
 
 from worker.errors import UserError
 from worker.simulation.camera import look
+from worker.simulation.on_host import numbers
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Reading, Tap
 
@@ -69,11 +70,10 @@ class Camera:
             default_render_config=configuration,
             load_textures=False,
         )
-        self._sensor.create_default_light(
-            enable_shadows=True, direction=wp.normalize(wp.vec3f(0.5, 0.35, -0.8)), color=_LIGHT
-        )
+        direction: Any = wp.vec3f(0.5, 0.35, -0.8)  # Warp's annotation of normalize takes none of its own vectors
+        self._sensor.create_default_light(enable_shadows=True, direction=wp.normalize(direction), color=_LIGHT)
         self._sensor.set_ambient_light(_AMBIENT, _AMBIENT)
-        planes = np.flatnonzero((model.shape_type.numpy() == newton.GeoType.PLANE) & (model.shape_world.numpy() < 0))
+        planes = np.flatnonzero((numbers(model.shape_type) == newton.GeoType.PLANE) & (numbers(model.shape_world) < 0))
         if len(planes):
             self._sensor.assign_checkerboard_material(shape_indices=planes)
         self._rays = SensorCamera.compute_camera_rays_pinhole(
@@ -127,9 +127,9 @@ class Camera:
     def _extent(self, poses: np.ndarray) -> tuple[np.ndarray, float]:
         """Middle and radius of what is seen of the first world [m]."""
         model = self.stage.model
-        owners, bodies, flags = (array.numpy() for array in (model.shape_world, model.shape_body, model.shape_flags))
-        radii, places = model.shape_collision_radius.numpy(), model.shape_transform.numpy()
-        scales = model.shape_scale.numpy()
+        owners, bodies, flags = map(numbers, (model.shape_world, model.shape_body, model.shape_flags))
+        radii, places = map(numbers, (model.shape_collision_radius, model.shape_transform))
+        scales = numbers(model.shape_scale)
         links = len(self.stage.links)
         least, most = np.full(3, np.inf), np.full(3, -np.inf)
         for shape in np.flatnonzero((owners == 0) & (bodies >= 0) & (flags & int(newton.ShapeFlags.VISIBLE) > 0)):

@@ -58,7 +58,9 @@ class Layout:
         shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items() if tensor.ndim == 4}
         # the present frame comes first; of masks and the like that are not colours, the first channel is shown
         seen = (
-            tuple((name, 3 if shape[0] % 3 == 0 else 1, *shape[1:]) for name, shape in shapes.items()) if images else ()
+            tuple((name, 3 if shape[0] % 3 == 0 else 1, shape[1], shape[2]) for name, shape in shapes.items())
+            if images
+            else ()
         )
         return cls(*numbers, *names, task.config.control_hz, seen, tuple(task.ended.names))
 

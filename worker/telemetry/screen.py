@@ -189,7 +189,8 @@ class Screen:
 
     def _fix(self, frame: str, place: np.ndarray) -> None:
         """A frame of shapes that do not move."""
-        where = rr.Transform3D(translation=place, quaternion=_UPRIGHT, child_frame=frame, parent_frame=_ROOT)
+        upright = rr.Quaternion(xyzw=_UPRIGHT)
+        where = rr.Transform3D(translation=place, quaternion=upright, child_frame=frame, parent_frame=_ROOT)
         self._rr.log(f"fixed/{frame}", where, static=True)
 
     def _placed(self, poses: np.ndarray) -> np.ndarray:

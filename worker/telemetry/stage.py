@@ -17,6 +17,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation import robot_files
+from worker.simulation.on_host import numbers
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
 from worker.tasks.declared import DeclaredTask
@@ -98,10 +99,11 @@ class Stage:
         Returns:
             Poses of the links in the world's frame: position [m], quaternion xyzw; shape ``(worlds, links, 7)``.
         """
-        self.state.joint_q.assign(np.ascontiguousarray(coordinates, np.float32).reshape(-1))
-        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
-        poses: np.ndarray = self.state.body_q.numpy().reshape(self.worlds, -1, 7)
-        return poses
+        joint_q, joint_qd = self.state.joint_q, self.state.joint_qd
+        assert joint_q is not None and joint_qd is not None
+        joint_q.assign(np.ascontiguousarray(coordinates, np.float32).reshape(-1))
+        newton.eval_fk(self.model, joint_q, joint_qd, self.state)
+        return numbers(self.state.body_q).reshape(self.worlds, -1, 7)
 
     def meshes(self) -> dict[str, bytes]:
         """The visible shapes of one world, each link in its own frame, as binary glTF (y up, as glTF has it).
@@ -114,9 +116,9 @@ class Stage:
 
         model = self.model
         names = self.links
-        bodies, owners, flags = (array.numpy() for array in (model.shape_body, model.shape_world, model.shape_flags))
-        kinds, sizes, places = (array.numpy() for array in (model.shape_type, model.shape_scale, model.shape_transform))
-        colors = model.shape_color.numpy()
+        bodies, owners, flags = map(numbers, (model.shape_body, model.shape_world, model.shape_flags))
+        kinds, sizes, places = map(numbers, (model.shape_type, model.shape_scale, model.shape_transform))
+        colors = numbers(model.shape_color)
         scenes: dict[str, Any] = {}
         for shape in range(model.shape_count):
             if owners[shape] > 0 or not flags[shape] & newton.ShapeFlags.VISIBLE:

@@ -180,12 +180,11 @@ class Reading:
         self._tap = tap
         self._cuda = tap.device.startswith("cuda")
         self._stream = torch.cuda.Stream(tap.device) if self._cuda else None
-        pinned = {"pin_memory": self._cuda}
-        self._values = torch.empty(tap.values.shape, dtype=torch.float32, **pinned)
-        self._marks = torch.empty(tap.marks.shape, dtype=torch.int32, **pinned)
-        self._images = torch.empty(tap.images.shape, dtype=torch.uint8, **pinned)
+        self._values = torch.empty(tap.values.shape, dtype=torch.float32, pin_memory=self._cuda)
+        self._marks = torch.empty(tap.marks.shape, dtype=torch.int32, pin_memory=self._cuda)
+        self._images = torch.empty(tap.images.shape, dtype=torch.uint8, pin_memory=self._cuda)
         self._pairs = (self._values, tap.values), (self._marks, tap.marks), (self._images, tap.images)
-        self._counts = torch.zeros(2, dtype=torch.int64, **pinned)
+        self._counts = torch.zeros(2, dtype=torch.int64, pin_memory=self._cuda)
         self.next = 0
         """Number of the step that is read next."""
 

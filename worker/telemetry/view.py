@@ -31,6 +31,7 @@ from worker.telemetry.rows import Rows
 
 if TYPE_CHECKING:
     from worker.telemetry.screen import Look, Screen
+    from worker.telemetry.segment import Segment
     from worker.telemetry.stage import Stage
 
 HZ = 20.0
@@ -61,7 +62,7 @@ class Training:
         self._run, self._stop = run, stop
         instead = f"see its newest checkpoint: muster view {run.name}"
         self._asking = Asking(run, worlds, instead, newest=True)
-        self._segment = self._asking.attach(PATIENCE, stop, activity)
+        self._segment: Segment | None = self._asking.attach(PATIENCE, stop, activity)
         try:
             activity.say(loading(run, self._asking.worlds))
             if self._asking.worlds < worlds:
@@ -230,7 +231,7 @@ class Policy:
         now = time.time_ns()
         for world in np.flatnonzero(rows.mark("done")[-1]):
             total, steps = self._sums[world]
-            text = f"world {world}: episode {self._ended[world]} ended by {rows.cause(-1, world)} after {counted(int(steps), 'step')}, return {total:.4g}"
+            text = f"world {world}: episode {self._ended[world]} ended by {rows.cause(-1, int(world))} after {counted(int(steps), 'step')}, return {total:.4g}"
             screen.say([(now, "muster", text)])
             screen.curve("episodes", [total], np.array([now]), [])
             self._sums[world], self._ended[world] = 0.0, self._ended[world] + 1

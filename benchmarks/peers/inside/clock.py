@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 
 class Clock:
@@ -55,7 +56,8 @@ class Clock:
             self._wait()
             self._logged(logger, options)
 
-        OnPolicyRunner.learn, Logger.log = timed_learn, timed_log  # type: ignore[method-assign]
+        mock.patch.object(OnPolicyRunner, "learn", timed_learn).start()
+        mock.patch.object(Logger, "log", timed_log).start()
 
     def _logged(self, logger: Any, said: dict[str, Any]) -> None:
         self.curve.append(

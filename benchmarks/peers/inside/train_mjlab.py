@@ -19,7 +19,7 @@ def contract(environment: Any) -> dict[str, Any]:
     """Meaning of the policy's numbers: its observations, and each action's joint, scale [rad] and offset [rad]."""
     from mjlab.rl.exporter_utils import get_base_metadata
 
-    known = get_base_metadata(environment, "-")
+    known: dict[str, Any] = get_base_metadata(environment, "-")
     action = environment.action_manager.get_term("joint_pos")
     widths = [shape[0] for shape in environment.observation_manager.group_obs_term_dim["actor"]]
     return {
@@ -58,7 +58,8 @@ def main() -> None:
     clock = Clock(asked["began"], asked["worlds"], asked["steps"], wait)
     clock.install()
     training = TrainConfig.from_task(asked["task"])
-    environment, agent = training.env, training.agent
+    environment = training.env
+    agent: Any = training.agent  # of the runner that has an actor and a critic, which the common base lacks
     environment.scene.num_envs = asked["worlds"]
     physics = environment.sim.mujoco
     for name, value in asked["limits"].items():

@@ -232,7 +232,7 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         if before.kind != after.kind:
             raise ClientError(f"run {run.name} is a {before.kind} job; it can't continue as {after.kind}")
         return
-    was, wanted = (dict(each.train) for each in (before, after))  # type: ignore[arg-type]
+    was, wanted = dict(before.train), dict(after.train)
     if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
         key, old, new = innermost(*difference)
         raise ClientError(

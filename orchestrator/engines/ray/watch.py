@@ -16,7 +16,7 @@ from typing import Any
 
 import ray
 from ray._private.state import GlobalState
-from ray._raylet import GcsClient, GcsClientOptions  # type: ignore[attr-defined]
+from ray._raylet import GcsClient, GcsClientOptions
 
 
 class NotUsable(Exception):

@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
-from tests.conftest import PATIENCE, Serving, wait_for
+from tests.conftest import Serving
 from tests.support.conformance.streams import GROUP, client_of
+from tests.support.waiting import PATIENCE, wait_for
 
 AWS = str(Path(sys.executable).parent / "aws")
 PREFIX = "arn:aws:batch:us-east-1:000000000000:"

@@ -37,7 +37,7 @@ _POOLS = ("fuzz", "local", f"{PREFIX}compute-environment/fuzz", "spare", "made")
 STREAMS = ("gang/<gang>/1/node-0", "gang/<gang>/1/node-1", "single/<single>/1/node-0", "gang/", "gang/<gang>/2/node-0")
 _GROUPS = ("/aws/batch/job", f"{logs.GROUP_ARN}", f"{logs.GROUP_ARN}:*", "/aws", "other")
 TARGETS = ("0:", "0", "0:0", "1:", "0:1", ":1", "1", ":", "5:1", "999999", "0:999999")
-_POSITIONS = ([], [0], ["a"], ["a", 1], [1, "a"], ["a", "b"], [2**63, "a"])
+_POSITIONS: tuple[list[Any], ...] = ([], [0], ["a"], ["a", 1], [1, "a"], ["a", "b"], [2**63, "a"])
 _POSITIONS += (["\ud800", 1], ["a\0", 1], ["\ud800"], [-1], [None, {}])
 KNOWN = {
     **dict.fromkeys(("jobid", "jobs"), _JOBS),

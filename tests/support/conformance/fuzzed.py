@@ -66,7 +66,8 @@ class Fuzzed(Serving):
                 "jobDefinitions"
             ]:
                 self._try("RegisterJobDefinition", **getattr(good, name)(name))
-        for name, more in (("waiting", {}), ("array", {"arrayProperties": {"size": 3}})):
+        kinds: dict[str, dict[str, Any]] = {"waiting": {}, "array": {"arrayProperties": {"size": 3}}}
+        for name, more in kinds.items():
             submitted = self._try("SubmitJob", **good.submission("single", **more))
             self.names |= {name: submitted["jobId"]} if submitted else {}
 

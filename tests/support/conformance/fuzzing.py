@@ -86,7 +86,7 @@ def _texts(shape: Any, name: str) -> st.SearchStrategy[str]:
 @st.composite
 def _good(draw: st.DrawFn, operation: str, shape: Any) -> dict[str, Any]:
     """A request that works, with members added or changed within the schema."""
-    request = copy.deepcopy(draw(st.sampled_from(GOOD[operation])))
+    request: dict[str, Any] = copy.deepcopy(draw(st.sampled_from(GOOD[operation])))
     if draw(st.booleans()):
         for name in draw(st.lists(st.sampled_from(sorted(shape.members)), max_size=2, unique=True)):
             request[name] = draw(shaped(shape.members[name], name, 1))
@@ -95,7 +95,7 @@ def _good(draw: st.DrawFn, operation: str, shape: Any) -> dict[str, Any]:
 
 # -- spoiling them ----------------------------------------------------------------------------------------------------
 
-ODD_VALUES = st.one_of(
+ODD_VALUES: st.SearchStrategy[Any] = st.one_of(
     st.sampled_from((None, True, [], {}, [None], [[]], {"": ""}, {"a": {"a": {}}}, DIGITS)),
     st.sampled_from(ODD_TEXTS),
     st.sampled_from(NUMBERS),

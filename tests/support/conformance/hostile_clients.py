@@ -136,7 +136,7 @@ def expansion(target: Target, count: int, rng: random.Random, meanwhile: Callabl
 
 def foreign_services(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
     """Requests for services of AWS that are not here."""
-    sent = (
+    sent: tuple[tuple[str, str, dict[str, str], str], ...] = (
         ("GET", "/bucket?list-type=2", {}, ""),
         (
             "POST",

@@ -8,7 +8,8 @@ from typing import Any
 
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, ViewportSize, expect
 
-from tests.conftest import PATIENCE, REPOSITORY
+from tests.conftest import REPOSITORY
+from tests.support.waiting import PATIENCE
 
 PICTURES = REPOSITORY / "build" / "console"
 """The pictures of the pages that the tests saw."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 
-from tests.conftest import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 class Page(HTMLParser):

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 
-from tests.conftest import wait_for
 from tests.support.engines.sites import POLITE, Site
 from tests.support.processes import kill_rank, kill_supervisor, processes_of_job
+from tests.support.waiting import wait_for
 
 CONTRACT = """python3 - <<'PYTHON'
 import json, os

@@ -8,8 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.conftest import wait_for
 from tests.support.processes import command, find_processes, session_of, signal_all
+from tests.support.waiting import wait_for
 from tests.support.worker.ranks import free_port
 
 RAY = str(Path(sys.executable).parent / "ray")

@@ -7,7 +7,7 @@ from typing import Any
 from ray.autoscaler._private.fake_multi_node.node_provider import FakeMultiNodeProvider
 
 
-class Provider(FakeMultiNodeProvider):
+class Provider(FakeMultiNodeProvider):  # type: ignore[misc]  # ray has no types that could be followed
     """Machines that are processes on this one. Each has all of its memory, whatever its type says."""
 
     def _create_node_with_resources_and_labels(

@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, wait_for
+from tests.conftest import Serving
 from tests.support.definitions import container, multinode
 from tests.support.engines.images import PATH, SUPERVISED, host_files
+from tests.support.waiting import wait_for
 
 WAIT = "echo ready; exec sleep 600"
 POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
@@ -86,10 +87,10 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             patch.setenv(name, "any")
         with Serving(home / "aws", "--cpus", "8") as aws:
-            settings = {"store": str(home / "volume"), "poll": 0.1, "quiet": 1.0, "store_is_shared": False}
             told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url}
+            config = AwsConfig(**told, store=str(home / "volume"), store_is_shared=False, poll=0.1, quiet=1.0)
             (home / "home").mkdir()
-            save_config(home / "home", AwsConfig(**told, **settings))
+            save_config(home / "home", config)
             yield from _served("aws-batch", home / "home", volume=home / "volume")
 
 

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import PATIENCE, wait_for
 from tests.support.processes import command, environment, processes_running, signal_all
+from tests.support.waiting import PATIENCE, wait_for
 
 NODES = ("n1", "n2", "n3")
 CPUS, MEMORY, GPUS = 4, 8192, 2

@@ -9,15 +9,17 @@ import sqlite3
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
-from tests.conftest import submit_gang, wait_for
+from tests.conftest import submit_gang
 from tests.support.faults.home import Home
 from tests.support.processes import end_all, processes_of_job
+from tests.support.waiting import wait_for
 
 VOLUME = 48 << 20
 MOST_LOG = 1 << 20
@@ -85,10 +87,10 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
             filler.unlink()
             home.serve()
             with Client(home.url) as client:
-                if _status(client, steady) not in ("SUCCEEDED", "FAILED"):
+                if not _has_ended(client, steady):
                     client.batch("TerminateJob", jobId=steady, reason="the disk was full")
                 for job in taken:
-                    wait_for(lambda j=job: _status(client, j) in ("SUCCEEDED", "FAILED"), 90, f"job {job} ends")
+                    wait_for(partial(_has_ended, client, job), 90, f"job {job} ends")
                 last = submit_gang(client, "print('again')", name="last")
                 wait_for(lambda: _status(client, last) == "SUCCEEDED", 60, "a job runs when there is room")
                 done["jobs"] += len(taken) + 1
@@ -117,6 +119,10 @@ def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
             assert error.status != 500, error
             done["submissions refused"] += 1
     return taken
+
+
+def _has_ended(client: Client, job: str) -> bool:
+    return _status(client, job) in ("SUCCEEDED", "FAILED")
 
 
 def _status(client: Client, job: str) -> str:

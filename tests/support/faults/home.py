@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.layout import Run, Store
-from tests.conftest import MUSTER, PATIENCE, REPOSITORY
+from tests.conftest import MUSTER, REPOSITORY
+from tests.support.waiting import PATIENCE
 
 _START_SECONDS = 60.0
 _FRESH_SECONDS = 0.25

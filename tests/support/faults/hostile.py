@@ -13,12 +13,14 @@ import signal
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from shared_store.cgroups import own_group
-from tests.conftest import Serving, submit_gang, wait_for
+from tests.conftest import Serving, submit_gang
 from tests.support.processes import processes_running, signal_all
+from tests.support.waiting import wait_for
 
 _NATIVE = {"MUSTER_ON_CHILD_FAILURE": "fail"}
 _PRELUDE = """
@@ -157,7 +159,7 @@ def hostile_round(home: Path, seed: int, *, slow: bool = True) -> tuple[Counter[
             jobs[name] = submit_gang(serving.client, prelude + CASES[name].script, name="hostile", env=_NATIVE)
         for name in cases:
             if CASES[name].stop:
-                wait_for(lambda job=jobs[name]: "ready" in serving.log(job), 60, f"{name}: ready")
+                wait_for(partial(_is_ready, serving, jobs[name]), 60, f"{name}: ready")
                 time.sleep(0.5)
                 serving.client.batch("TerminateJob", jobId=jobs[name], reason="hostile")
         for name in cases:
@@ -177,6 +179,10 @@ def hostile_round(home: Path, seed: int, *, slow: bool = True) -> tuple[Counter[
         for token in tokens.values():
             signal_all(_left(token), signal.SIGKILL)
     return Counter(cases), violations
+
+
+def _is_ready(serving: Serving, job: str) -> bool:
+    return "ready" in serving.log(job)
 
 
 def _judge(name: str, detail: dict[str, Any], token: str) -> list[str]:

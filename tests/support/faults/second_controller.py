@@ -6,15 +6,16 @@ import random
 import sys
 import threading
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
-from tests.conftest import wait_for
 from tests.support.definitions import container, multinode
 from tests.support.faults.home import Home
 from tests.support.processes import end_all
+from tests.support.waiting import wait_for
 
 RACES = 4
 SCRIPT = """
@@ -41,7 +42,7 @@ def second_controller_round(directory: Path, seed: int) -> tuple[Counter[str], l
             run, shared = f"run-{race}", directory / f"written-{race}"
             environment = {"MUSTER_RUN": run, "SHARED": str(shared)}
             _race(clients, environment, rng.choice((1, 2, 3)), rng.choice((0.0, 0.0, rng.uniform(0, 0.05))), done)
-            jobs = wait_for(lambda r=run: _ended(homes, r), 90, f"the jobs of {run} end")
+            jobs = wait_for(partial(_ended, homes, run), 90, f"the jobs of {run} end")
             epochs = [each["epoch"] for job in jobs for each in job["attempts"]]
             done["attempts"] += len(epochs)
             if len(set(epochs)) != len(epochs):

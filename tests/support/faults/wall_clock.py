@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from orchestrator.client import Client
-from tests.conftest import MAIN_LAST, submit_gang, wait_for
+from tests.conftest import MAIN_LAST, submit_gang
 from tests.support.faults.home import Home
 from tests.support.processes import end_all
+from tests.support.waiting import wait_for
 
 JUMPS = (7200.0, -86400.0, 30.0, -5.0, 90 * 86400.0)
 """Seconds, to choose from."""

@@ -6,7 +6,8 @@ import json
 from typing import Any
 
 from shared_store.layout import Store
-from tests.conftest import Serving, wait_for
+from tests.conftest import Serving
+from tests.support.waiting import wait_for
 
 SMALL = ["train.worlds=16", "nodes=2", "checkpoint.every=5"]
 

@@ -15,7 +15,6 @@ from worker.tasks import (
     Command,
     Curriculum,
     Declaration,
-    DeclaredTask,
     EpisodeArrays,
     Event,
     Metric,
@@ -24,12 +23,13 @@ from worker.tasks import (
     Reward,
     Robot,
     RobotArrays,
-    TaskConfig,
     Termination,
     WorldArrays,
     reward_weights,
     terms,
 )
+from worker.tasks.config import TaskConfig
+from worker.tasks.declared import DeclaredTask
 
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody><body name="near" pos="0 0 1">
   <joint name="first" type="slide" axis="1 0 0" range="-2 2"/>
@@ -82,7 +82,8 @@ def far_away(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, li
 
 def both(task: DeclaredTask, gain: float) -> torch.Tensor:
     """A torch term: the positions of both sliders, times ``gain``."""
-    return gain * wp.to_torch(task.worlds.arrays.joint_q)
+    places: torch.Tensor = gain * wp.to_torch(task.worlds.arrays.joint_q)
+    return places
 
 
 def no_actions(task: DeclaredTask) -> torch.Tensor:

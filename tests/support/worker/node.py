@@ -14,13 +14,16 @@ from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Run, Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
-from tests.conftest import PATIENCE, wait_for
+from tests.support.waiting import PATIENCE, wait_for
 
 ENVIRONMENT = {
     name: value
     for name, value in os.environ.items()
     if not name.startswith(("MUSTER_", "AWS_", "OMP_", "NCCL_", "GLOO_", "TORCH", "PYTHONUN"))
 }
+
+
+PROGRAM = ("-P", "-m", "worker.supervisor")
 
 
 class Node:
@@ -48,7 +51,7 @@ class Node:
         self.environment = {**ENVIRONMENT, **self.contract.to_env()}
         self.stderr = home / "stderr"
 
-    def start(self, *command: str, program: tuple[str, ...] = ("-P", "-m", "worker.supervisor"), **env: str) -> None:
+    def start(self, *command: str, program: tuple[str, ...] = PROGRAM, **env: str) -> None:
         with open(self.stderr, "wb") as stderr:
             self.process = subprocess.Popen(
                 [sys.executable, *program, "--", *command],
@@ -63,7 +66,7 @@ class Node:
 
     def call(self, *command: str, **env: str) -> int:
         """Start ``command`` and wait for the node's end; returns its exit code."""
-        self.start(*command, **env)
+        self.start(*command, program=PROGRAM, **env)
         return self.wait()
 
     def shell(self, script: str, **env: str) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 import torch
 
@@ -140,3 +141,7 @@ class Point(Telling):
             if state[name].shape != tensor.shape:
                 raise ValueError(f"{name}: expected shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}")
             tensor.copy_(state[name])
+
+
+TASK: Any = Point
+""":class:`Point` where a task's class is expected: it has the interface without the base."""

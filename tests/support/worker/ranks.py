@@ -62,7 +62,7 @@ def run_ranks(
 def training(store: Path, *, epoch: int = 1, run: str = "run", **train: Any) -> dict[str, str]:
     """The environment of a training job on :class:`tests.support.worker.point_task.Point`."""
     checkpoint = {"every": train.pop("every", 100), "keep": train.pop("keep", 10)}
-    extra = {
+    extra: dict[str, str] = {
         key: str(train.pop(key)) for key in ("MUSTER_CHECKPOINT", "MUSTER_JOB_EPOCH", "MUSTER_PARENT") if key in train
     }
     section = {"task": "Point", "worlds": 8, "iterations": 6, "seed": 3, **train}
@@ -80,7 +80,7 @@ def training(store: Path, *, epoch: int = 1, run: str = "run", **train: Any) -> 
 
 def train() -> int:
     """What ``worker.train`` does, with the test double as the task."""
-    from tests.support.worker.point_task import Point
+    from tests.support.worker.point_task import TASK
     from worker.distributed import Placement, connect, use_cpu_threads
     from worker.learning import leaving
     from worker.learning.job import Job, StopRequest
@@ -91,7 +91,7 @@ def train() -> int:
     job = Job.from_env(os.environ, "train")
     use_cpu_threads(os.environ)
     gang = connect(Placement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60")))
-    code = leaving.train(Loop(Training.of(job, Point), gang, stop), stop)  # type: ignore[arg-type]
+    code = leaving.train(Loop(Training.of(job, TASK), gang, stop), stop)
     gang.close()
     return code
 

@@ -83,7 +83,7 @@ def need_mjlab() -> None:
 
 def build(
     *things: Any, worlds: int = 1, ground: bool = True, timestep: float = 0.005, substeps: int = 1, **options: Any
-):
+) -> tuple[newton.ModelBuilder, Worlds]:
     """A template of these robots and objects, and its worlds on the processor."""
     template = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(template)
@@ -105,10 +105,13 @@ def build(
 def reference(robot: Robot, timestep: float = 0.005) -> mujoco.MjModel:
     """The same robot, built by MuJoCo's own compiler from the same file and the same numbers."""
     package, _, inside = str(robot.file).partition(":")[2].partition("/")
-    spec = mujoco.MjSpec.from_file(str(Path(importlib.util.find_spec(package).origin).parent / inside))
+    found = importlib.util.find_spec(package)
+    assert found is not None and found.origin is not None
+    spec = mujoco.MjSpec.from_file(str(Path(found.origin).parent / inside))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for declared in robot.actuators:
+        assert isinstance(declared, PositionActuator) and isinstance(declared.effort_limit, float)
         for joint in spec.joints:
             if joint.type == mujoco.mjtJoint.mjJNT_FREE or not _matches(joint.name, declared.joints):
                 continue

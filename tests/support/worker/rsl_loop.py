@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -34,7 +35,7 @@ class GroupedPoint(Point):
 
 def settings(section: dict[str, Any]) -> RslRlConfig:
     """The settings of a job's ``rsl_rl`` section, as a rank reads them."""
-    read: RslRlConfig = algorithms.settings(RslRl, "rsl_rl", TaskConfig(), {"rsl_rl": section})  # type: ignore[type-abstract]
+    read: RslRlConfig = algorithms.settings(RslRl, "rsl_rl", TaskConfig(), {"rsl_rl": section})
     return read
 
 
@@ -140,5 +141,8 @@ class Recall(GroupedPoint):
 
 def mirror(env: Any, obs: TensorDict | None, actions: torch.Tensor | None) -> tuple[Any, Any]:
     """A symmetry function: left and right of the cart-pole, and of the point, are the same but for the sign."""
-    both = None if obs is None else TensorDict({k: torch.cat((v, -v)) for k, v in obs.items()}, [2 * obs.batch_size[0]])
+    both = None
+    if obs is not None:
+        groups: Iterable[tuple[str, Any]] = obs.items()
+        both = TensorDict({name: torch.cat((group, -group)) for name, group in groups}, [2 * obs.batch_size[0]])
     return both, None if actions is None else torch.cat((actions, -actions))

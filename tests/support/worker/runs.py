@@ -11,7 +11,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
 from tests.support.worker.loop import alone
-from tests.support.worker.point_task import Point
+from tests.support.worker.point_task import TASK
 from worker.distributed import Gang
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
@@ -23,8 +23,7 @@ def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | No
     job = Job.from_env(env, "train")
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
-    training = Training.of(job, Point)  # type: ignore[arg-type]
-    return Loop(training, gang or alone(), stop or StopRequest())
+    return Loop(Training.of(job, TASK), gang or alone(), stop or StopRequest())
 
 
 def train(env: dict[str, str], gang: Gang | None = None) -> Loop:

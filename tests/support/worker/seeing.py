@@ -36,7 +36,7 @@ CNN = {
     "cnn_cfg": {"output_channels": [4, 8], "kernel_size": [3, 3], "stride": [2, 2], "activation": "elu"},
 }
 """A small network that takes images of 12 x 16 and more."""
-NETWORKS = {
+NETWORKS: dict[str, Any] = {
     "obs_groups": {"actor": ["policy", "camera"], "critic": ["critic"]},
     "actor": CNN | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}},
     "critic": {"class_name": "MLPModel", "hidden_dims": [16], "activation": "elu"},
@@ -85,14 +85,14 @@ class Seeing(DeclaredTask):
     def objects(self, config: Any) -> Mapping[str, Any]:
         return {"box": Box("box", size=(0.4, 0.6, 0.8), position=(2.35, 0.0, 1.0), fixed=True, color=(0.0, 0.0, 1.0))}
 
-    def observations(self) -> dict[str, Any]:
-        """The groups of this task."""
+    def seen(self) -> dict[str, Any]:
+        """The observation groups of this task."""
         return {"policy": {"velocity": Observation(terms.joint_velocity)}, "camera": Image("front")}
 
     def declare(self, config: Any) -> Declaration:
         return Declaration(
             actions={"push": Action(terms.effort)},
-            observations=self.observations() | {"critic": {"position": Observation(terms.joint_position)}},
+            observations=self.seen() | {"critic": {"position": Observation(terms.joint_position)}},
             rewards={"middle": Reward(terms.joint_deviation_squared)},
             events={"place": Event(place, spread=config.spread)},
             sensors={"front": self.camera},
@@ -113,7 +113,7 @@ class SeeingDepth(Seeing):
         redraw=True,
     )
 
-    def observations(self) -> dict[str, Any]:
+    def seen(self) -> dict[str, Any]:
         return {
             "policy": {"velocity": Observation(terms.joint_velocity), "ahead": Observation(ahead)},
             "camera": Image("front"),
@@ -128,5 +128,5 @@ class SeeingAlone(Seeing):
 
     config_type = Config
 
-    def observations(self) -> dict[str, Any]:
+    def seen(self) -> dict[str, Any]:
         return {"policy": Image("front")}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from worker.simulation.episodes import STEP
 from worker.tasks.task import Task
 
 
-def put(task: Task, **rows: list) -> None:
+def put(task: Task, **rows: list[Any]) -> None:
     """Overwrite parts of a task's state; what is not named is as after a reset from seed 1."""
     task.seed(1)
     task.reset()
@@ -31,7 +33,7 @@ def statistics(task: Task) -> dict[str, float]:
 def play(task: Task, steps: int, seed: int) -> list[tuple[torch.Tensor, ...]]:
     """Act at random, the same in every world of the same global index; clones of all that a step gives."""
     generator = torch.Generator().manual_seed(seed)
-    history = []
+    history: list[tuple[torch.Tensor, ...]] = []
     for _ in range(steps):
         actions = torch.randn(64, task.action_size, generator=generator)[task.first_world :][: task.world_count]
         task.step(actions)

@@ -35,10 +35,11 @@ READS = {
 def rotations(random: np.random.Generator, *shape: int) -> np.ndarray:
     """Unit quaternions, of any rotation and either sign."""
     found = random.normal(size=(*shape, 4))
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    units: np.ndarray = found / np.linalg.norm(found, axis=-1, keepdims=True)
+    return units
 
 
-def array(values: Any, dtype: Any = wp.float32) -> wp.array:
+def array(values: Any, dtype: Any = wp.float32) -> wp.array[Any]:
     """A Warp array on the CPU."""
     kinds = {wp.int32: np.int32, wp.bool: np.bool_}
     return wp.array(np.asarray(values, dtype=kinds.get(dtype, np.float32)), dtype=dtype, device="cpu")
@@ -129,7 +130,7 @@ class Rig:
         wp.launch(getattr(self._kernels, f"call_{term.key}"), dim=WORLDS, inputs=inputs, device="cpu")
         returns = typing.get_type_hints(term.func).get("return", type(None))
         width = WIDTHS.get(returns, 0)
-        found = out.numpy().astype(np.float64)
+        found: np.ndarray = out.numpy().astype(np.float64)
         return found[:, 0] if width == 1 else found[:, :width]
 
     def _compile(self, terms: list[Any], folder: Path) -> Any:

@@ -23,7 +23,7 @@ def plain(name: str, worlds: int, *, numbers: dict[str, Any] | None = None, **co
     need_mjlab()
     kind: Any = find_task(name)
     # of the same name: its kernels are those of the task
-    alike = type(name, (kind,), {"walker": dataclasses.replace(kind.walker, randomize={})})
+    alike: type[Velocity] = type(name, (kind,), {"walker": dataclasses.replace(kind.walker, randomize={})})
     noisy = (*QUIET, "height_scan") if kind.rough else QUIET
     settings = kind.config_type(
         numbers={**{f"observations.{each}.noise": 0.0 for each in noisy}, **(numbers or {})},
@@ -74,9 +74,9 @@ class Twin:
         position, x, y, z, w = joint_q[:3], *joint_q[3:7]
         self.data.qpos[:7] = [*position, w, x, y, z]
         self.data.qpos[self.places] = joint_q[self.view.coordinates]
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
-        turn = turn.reshape(3, 3)
+        flat = np.zeros(9)
+        mujoco.mju_quat2Mat(flat, self.data.qpos[3:7])
+        turn = flat.reshape(3, 3)
         self.data.qvel[:3] = joint_qd[:3] - np.cross(joint_qd[3:6], turn @ self.model.body_ipos[1])
         self.data.qvel[3:6] = turn.T @ joint_qd[3:6]
         self.data.qvel[self.rates] = joint_qd[self.view.dofs]
@@ -118,7 +118,8 @@ class Twin:
 
     def turn(self, body: str) -> np.ndarray:
         """Rotation matrix of a body."""
-        return self.data.body(body).xmat.reshape(3, 3).copy()
+        turn: np.ndarray = self.data.body(body).xmat.reshape(3, 3).copy()
+        return turn
 
     def velocity(self, kind: Any, name: str, local: bool) -> tuple[np.ndarray, np.ndarray]:
         """Linear and angular velocity of the origin of a body or site."""

@@ -109,7 +109,7 @@ class PPO:
         self._rate = torch.tensor(self.config.learning_rate, device=self.device)
         options: dict[str, Any] = {"capturable": True} if self._side is not None else {}
         if self.config.optimizer == "adamw":
-            kind: type[torch.optim.Optimizer] = torch.optim.AdamW
+            kind: type[torch.optim.Adam] = torch.optim.AdamW
             options["weight_decay"] = self.config.weight_decay
         else:
             kind = torch.optim.Adam
@@ -250,13 +250,14 @@ class PPO:
     def _beside(self) -> Iterator[Callable[[], None]]:
         """On a GPU, run the work in this context (and its backward pass) concurrently with the work after it, until the yielded function
         is called."""
-        if self._side is None:
+        side = self._side
+        if side is None:
             yield lambda: None
             return
         main = torch.cuda.current_stream()
-        self._side.wait_stream(main)
-        with torch.cuda.stream(self._side):
-            yield lambda: main.wait_stream(self._side)
+        side.wait_stream(main)
+        with torch.cuda.stream(side):
+            yield lambda: main.wait_stream(side)
 
     @torch.no_grad()
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:

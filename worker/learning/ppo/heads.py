@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Protocol
 
 import torch
+from rsl_rl.models.mlp_model import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
 
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
-from worker.learning.ppo.models import MLPModel, PixelModel
+from worker.learning.ppo.models import PixelModel
 from worker.learning.ppo.objective import Objective
 from worker.learning.ppo.rollout import Rollout
 
@@ -60,6 +62,7 @@ class Gaussian:
         settings: Clipping,
         plain: bool = False,
     ) -> None:
+        assert isinstance(actor.distribution, GaussianDistribution)
         self._distribution, self._weight, self._settings = actor.distribution, weight, settings
         self.std = torch.zeros(actions, device=device)
         """The standard deviation of the rollout."""
@@ -91,8 +94,8 @@ class Gaussian:
         return self.std.mean()
 
     def _std(self) -> torch.Tensor:
-        distribution = self._distribution
-        return distribution.std_param.clamp(*distribution.std_range)
+        least, greatest = self._distribution.std_range
+        return self._distribution.std_param.clamp(least, greatest)
 
 
 class Categorical:

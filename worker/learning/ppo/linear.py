@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -39,7 +40,7 @@ class _Linear(torch.autograd.Function):
         return torch.addmm(bias, x, _as_wide(weight, x).t())
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, _ = ctx.saved_tensors
         weight, bias, ones = ctx.layer
         if x.shape[1] == weight.shape[1]:
@@ -48,6 +49,9 @@ class _Linear(torch.autograd.Function):
             weight.grad.copy_((gradient.t() @ x)[:, : weight.shape[1]])
         torch.mv(gradient.t(), ones, out=bias.grad)
         return gradient @ weight if ctx.needs_input_grad[0] else None, None, None, None
+
+
+_linear: Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] = _Linear.apply
 
 
 def forward(mlp: nn.Sequential, x: torch.Tensor, ones: torch.Tensor | None = None) -> torch.Tensor:
@@ -59,14 +63,15 @@ def forward(mlp: nn.Sequential, x: torch.Tensor, ones: torch.Tensor | None = Non
         ones: Shape (samples,), required on a GPU for gradients of an ``x`` of shape (samples, …).
     """
     if not x.is_cuda:
-        return mlp(x)
+        outputs: torch.Tensor = mlp(x)
+        return outputs
     for layer in mlp:
         if not isinstance(layer, nn.Linear):
             x = layer(x)
         elif ones is None:
             x = functional.linear(x, _as_wide(layer.weight, x), layer.bias)
         else:
-            x = _Linear.apply(x, layer.weight, layer.bias, ones)
+            x = _linear(x, layer.weight, layer.bias, ones)
     return x
 
 

@@ -26,7 +26,9 @@ class PixelModel(CNNModel):
     def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
         """Features, shape (batch, features), of images, shape (batch, channels, height, width), uint8."""
         # bytes are small: bring them into the fastest memory order for convolutions before they become floats
-        return self.cnns[POLICY](to_numbers(obs[POLICY].contiguous(memory_format=torch.channels_last)))
+        images = obs[POLICY].contiguous(memory_format=torch.channels_last)
+        features: torch.Tensor = self.cnns[POLICY](to_numbers(images))
+        return features
 
 
 class ActorPolicy:
@@ -37,7 +39,8 @@ class ActorPolicy:
 
     @torch.no_grad()
     def act(self, observations: TensorDict | Mapping[str, torch.Tensor]) -> torch.Tensor:
-        outputs = self.actor.mlp(self.actor.get_latent({POLICY: observations[POLICY]}))
+        seen: Any = {POLICY: observations[POLICY]}  # rsl-rl only looks its groups up
+        outputs: torch.Tensor = self.actor.mlp(self.actor.get_latent(seen))
         return outputs.argmax(1, keepdim=True).to(torch.float32) if self._spaces.discrete else outputs
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
@@ -68,7 +71,7 @@ class _Network(nn.Module):
             self.before = actor.obs_normalizer
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        outputs = self.mlp(self.before(obs))
+        outputs: torch.Tensor = self.mlp(self.before(obs))
         return outputs.argmax(1, keepdim=True).to(torch.float32) if self._discrete else outputs
 
 
@@ -88,8 +91,12 @@ def build_actor(config: PPOConfig, spaces: Spaces) -> MLPModel | PixelModel:
         common["obs_normalization"] = config.normalize_observations
         return MLPModel(example, groups, "actor", spaces.actions, **common)
     _check_layers(config, shape)
-    layers = {"output_channels": config.channels, "kernel_size": config.kernel_sizes, "stride": config.strides}
-    layers = {name: list(value) for name, value in layers.items()} | {"activation": config.activation}
+    layers = {
+        "output_channels": list(config.channels),
+        "kernel_size": list(config.kernel_sizes),
+        "stride": list(config.strides),
+        "activation": config.activation,
+    }
     return PixelModel(example, groups, "actor", spaces.actions, cnn_cfg=layers, **common)
 
 
@@ -104,7 +111,7 @@ def build_critic(config: PPOConfig, spaces: Spaces, actor: MLPModel | PixelModel
             f"critic_observations: the task has no group {group!r}; it has {', '.join(spaces.observations)}"
         )
     example, common = spaces.example(1, "cpu"), _common(config, config.critic_hidden_sizes or config.hidden_sizes)
-    groups = {"critic": [group]}
+    groups: dict[str, list[str]] = {"critic": [group]}
     if isinstance(actor, PixelModel) and group == POLICY:
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints that they are shared
             return PixelModel(example, groups, "critic", 1, cnns=actor.cnns, **common)

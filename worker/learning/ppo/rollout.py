@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
+from rsl_rl.models.mlp_model import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import Transition
 from worker.learning.ppo import linear
-from worker.learning.ppo.models import MLPModel, PixelModel
+from worker.learning.ppo.models import PixelModel
 
 
 class View:
@@ -41,7 +43,8 @@ class View:
 
     def latent(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (…, features) for observations of shape (…, *shape)."""
-        return self.model.get_latent({self.group: observations})
+        groups: Any = {self.group: observations}  # rsl-rl only looks its groups up
+        return self.model.get_latent(groups)
 
     def batch(self, rows: torch.Tensor) -> torch.Tensor:
         """Padded latents of the samples ``rows`` of the flattened rollout; for images, with gradients of the convolutions."""

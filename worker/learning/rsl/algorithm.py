@@ -21,7 +21,7 @@ from worker.learning.algorithm import POLICY, Policy, Setting, Spaces, Transitio
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.rsl import building
 from worker.learning.rsl.policy import RslRlPolicy
-from worker.learning.rsl.settings import RslRlConfig
+from worker.learning.rsl.settings import NETWORKS, RslRlConfig
 from worker.tasks.rsl_rl_env import as_floats
 
 
@@ -44,7 +44,7 @@ class RslRl:
         self._gang, self._worlds = setting.gang, setting.share.count
         self._networks = {
             name: getattr(self.algorithm, f"_raw_{name}", getattr(self.algorithm, name))
-            for name in building.NETWORKS
+            for name in NETWORKS
             if hasattr(self.algorithm, name)
         }
         self._distils = isinstance(self.algorithm, Distillation)

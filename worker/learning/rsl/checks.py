@@ -9,39 +9,39 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Required
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
 
 from shared_store.wording import Refused, explain, kind_of, nearest, shown
 
-_CHECKED = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+_checked = with_config(ConfigDict(strict=True, extra="forbid", allow_inf_nan=False))
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Widths = Annotated[list[int], Field(min_length=1)]
 
 
+@_checked
 class _Fixed(TypedDict):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     mode: Literal["constant"]
 
 
+@_checked
 class _Step(TypedDict):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     mode: Literal["step"]
     final_step: int
     final_value: float
 
 
+@_checked
 class _Linear(TypedDict):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     mode: Literal["linear"]
     initial_step: int
     final_step: int
     final_value: float
 
 
+@_checked
 class _Rnd(TypedDict, total=False):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     num_outputs: Required[Count]
     predictor_hidden_dims: Required[Widths]
     target_hidden_dims: Required[Widths]
@@ -53,8 +53,8 @@ class _Rnd(TypedDict, total=False):
     reward_normalization: bool
 
 
+@_checked
 class _Symmetry(TypedDict, total=False):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     data_augmentation_func: Required[str]
     use_data_augmentation: bool
     use_mirror_loss: bool
@@ -70,8 +70,8 @@ class _Any(TypedDict, total=False):
     grad_reduce_bucket_mb: float
 
 
+@_checked
 class _PPO(_Any, total=False):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     num_mini_batches: Count
     clip_param: float
     gamma: Fraction
@@ -88,8 +88,8 @@ class _PPO(_Any, total=False):
     symmetry_cfg: _Symmetry | None
 
 
+@_checked
 class _Distillation(_Any, total=False):
-    __pydantic_config__ = _CHECKED  # type: ignore[misc]
     gradient_length: Count
     max_grad_norm: float | None
     loss_type: Literal["mse", "huber"]

@@ -69,8 +69,8 @@ class Learner:
             for parameter in part:
                 parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
                 offset += parameter.numel()
-        self._policy_gradients = [parameter.grad for parameter in self._policy_parameters]
-        self._critic_gradients = [parameter.grad for parameter in self._critic_parameters]
+        self._policy_gradients = [each.grad for each in self._policy_parameters if each.grad is not None]
+        self._critic_gradients = [each.grad for each in self._critic_parameters if each.grad is not None]
         self._policy_gradient, self._critic_gradient = self._shared[:policy], self._shared[-critics:]
         self._temperature_gradient = self._shared[policy]
         self.losses = self._shared[losses : losses + len(LOSSES)]

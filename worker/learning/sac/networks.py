@@ -109,15 +109,16 @@ class Critics(nn.Module):
     def __init__(self, config: SACConfig, observations: int, actions: int) -> None:
         super().__init__()
         self.combine, self.atoms = config.combine, config.atoms
-        self.each = nn.ModuleList(
+        each = [
             nn.Sequential(
                 *hidden_layers((observations + actions, *config.critic_sizes), config.layer_norm),
                 nn.Linear(config.critic_sizes[-1], config.atoms),
             )
             for _ in range(config.critics)
-        )
+        ]
+        self.each = nn.ModuleList(each)
         with torch.no_grad():
-            for critic in self.each:
+            for critic in each:
                 for parameter in critic[-1].parameters():
                     parameter.mul_(HEAD_SCALE)
         atoms = torch.linspace(config.v_min, config.v_max, config.atoms)
