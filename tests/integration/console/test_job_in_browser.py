@@ -56,17 +56,19 @@ def test_the_log_is_read_back_searched_and_followed_and_stays_text(shared_server
     shared_server.client.batch("TerminateJob", jobId=job, reason="seen")
 
 
-def test_curves_are_drawn_and_a_window_of_them_is_read_again(server: Serving, people: People) -> None:
-    store = Store(server.home / "store")
-    add_run(store, "taught", SPEC)
-    add_checkpoint(store, "taught", 6)
-    with MetricsWriter(store.run("taught"), 1, 0) as metrics:
+def test_curves_are_drawn_and_a_window_of_them_is_read_again(shared_server: Serving, people: People) -> None:
+    store = Store(shared_server.home / "store")
+    add_run(store, "curved", SPEC)
+    add_checkpoint(store, "curved", 6)
+    with MetricsWriter(store.run("curved"), 1, 0) as metrics:
         for iteration in range(1, 2001):
             terms = {f"reward_term_{i}": iteration * i for i in range(8)}
             metrics.write({"iteration": iteration, "env_steps": 10 * iteration, "reward": iteration % 7, **terms})
-    server.wait(submit_gang(server.client, FOREVER, cpus="0.5"), "RUNNING")
-    job = server.client.post("/api/runs/taught/resume", {"set": ["train.iterations=9000", "resources.cpus=4"]})
-    page = people(server.url).goto(f"/jobs/{job['jobId']}")
+    blocker = submit_gang(shared_server.client, FOREVER, cpus="0.5")
+    shared_server.wait(blocker, "RUNNING")
+    changes = {"set": ["train.iterations=9000", "resources.cpus=8"]}  # it waits
+    job = shared_server.client.post("/api/runs/curved/resume", changes)["jobId"]
+    page = people(shared_server.url).goto(f"/jobs/{job}")
     assert int(see(page, "document.querySelector('.chart')?.dataset.points")) == 300
     assert page.evaluate("document.querySelectorAll('.chart')[1].querySelectorAll('path.curve.dashes-1').length") == 4
     window = "new CustomEvent('window', {detail: {from: 1, to: 50}})"
@@ -74,3 +76,5 @@ def test_curves_are_drawn_and_a_window_of_them_is_read_again(server: Serving, pe
     see(page, "document.querySelector('.chart').dataset.points === '50'")
     page.evaluate("document.querySelector('[data-whole]').click()")
     see(page, "document.querySelector('.chart').dataset.points === '300'")
+    for each in (job, blocker):
+        shared_server.client.batch("TerminateJob", jobId=each, reason="seen")
