@@ -254,7 +254,7 @@ class _Walk:
             if not (isinstance(parent, ast.Compare) and isinstance(parent.ops[0], ast.Is | ast.IsNot)):
                 yield ast.Constant(True)
         elif isinstance(value, str | bytes) and not self._is_message(parent, value):
-            yield ast.Constant(value + (" mutated" if isinstance(value, str) else b" mutated"))
+            yield ast.Constant(f"{value} mutated" if isinstance(value, str) else value + b" mutated")
 
     def _is_message(self, parent: ast.AST, value: str | bytes) -> bool:
         """Whether only people read a text: it has words and is no constant of the module, or it is a part of a longer text."""

@@ -27,6 +27,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -116,7 +117,7 @@ class _Run:
             self._need(_in_child(lambda: self._anew(later[0][0], None, tests)))
         for module, mutant in later:
             tests = self.reach.tests(module, None)
-            self._try(module, mutant, tests, lambda m=module, n=mutant.number, t=tests: self._anew(m, n, t))
+            self._try(module, mutant, tests, partial(self._anew, module, mutant.number, tests))
 
     def _need(self, status: int) -> None:
         if status != 0:
@@ -144,6 +145,8 @@ class _Run:
     def _in_functions(self, session: pytest.Session, kept: Path) -> None:
         """In the process that has collected the tests."""
         items = {item.nodeid: item for item in session.items}
+        for module in self.trial.modules:
+            importlib.import_module(_name(module))
         functions = self._functions()
         self._need(_in_child(lambda: self._measure(items, functions, kept)))
         self.reach = pickle.loads(kept.read_bytes())
@@ -152,29 +155,31 @@ class _Run:
             if _is_quick(mutant):
                 tests = self.reach.tests(module, mutant.line)
 
-                def act(module: str = module, mutant: Mutant = mutant, tests: Sequence[str] = tests) -> int:
-                    assert mutant.function is not None
-                    for function in functions[module, *mutant.function]:
-                        function.__code__ = _codes(mutated(self.sources[module], mutant.number), module)[
-                            mutant.function
-                        ]
-                    for test in tests:
-                        _limit(self.reach.seconds[test])
-                        session.config.hook.pytest_runtest_protocol(item=items[test], nextitem=None)
-                    return 0
-
+                act = partial(self._in_function, session, functions, module, mutant, [items[test] for test in tests])
                 self._try(module, mutant, tests, act)
+
+    def _in_function(
+        self, session: pytest.Session, functions: _Functions, module: str, mutant: Mutant, items: Sequence[pytest.Item]
+    ) -> int:
+        """Put the fault into its function and run the tests: the first failure ends this process."""
+        assert mutant.function is not None
+        code = _codes(mutated(self.sources[module], mutant.number), module)[mutant.function]
+        for function in functions[module, *mutant.function]:
+            function.__code__ = code
+        for item in items:
+            _limit(self.reach.seconds[item.nodeid])
+            session.config.hook.pytest_runtest_protocol(item=item, nextitem=None)
+        return 0
 
     def _measure(self, items: dict[str, pytest.Item], functions: _Functions, kept: Path) -> int:
         """Run every test, and note what it reaches; a test that fails is left out."""
         seen: defaultdict[str, set[int]] = defaultdict(set)
         for module, source in self.sources.items():
-            if loaded := sys.modules.get(_name(module)):
-                vars(loaded)["__reached__"] = seen[module].add
-                codes = _codes(noting(source), module)
-                for (where, *key), found in functions.items():
-                    for function in found if where == module else ():
-                        function.__code__ = codes[tuple(key)]
+            vars(sys.modules[_name(module)])["__reached__"] = seen[module].add
+            codes = _codes(noting(source), module)
+            for (where, *key), found in functions.items():
+                for function in found if where == module else ():
+                    function.__code__ = codes[tuple(key)]
         self.plugin.ends = False
         for name, item in items.items():
             for lines in seen.values():

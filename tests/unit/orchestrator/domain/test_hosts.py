@@ -1,9 +1,10 @@
-"""Machines and the capacity of engines; texts of others in bounded space."""
+"""Machines and the capacity of engines; texts of others in bounded space; errors."""
 
 from __future__ import annotations
 
 import pytest
 
+from orchestrator.domain.errors import NotServing
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.hosts import HERE, Host, Hosts, Limit, Placement, Queued, engine_of
 from orchestrator.domain.job import NodeEnd
@@ -44,3 +45,8 @@ def test_the_reason_of_a_node_s_end_has_1024_characters_at_most() -> None:
     for length in (1024, 1025):
         reason = NodeEnd(1, "x" * length, 1.0).reason
         assert len(reason) <= 1024 and reason.endswith("x" if length == 1024 else "more characters)")
+
+
+def test_a_refusal_has_its_words_and_its_status() -> None:
+    error = NotServing("later", 503)
+    assert (str(error), error.status) == ("later", 503)
