@@ -8,7 +8,7 @@ from orchestrator.domain.errors import NotServing
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.hosts import HERE, Host, Hosts, Limit, Placement, Queued, engine_of
 from orchestrator.domain.job import NodeEnd
-from orchestrator.domain.resources import Resources
+from orchestrator.domain.resources import EPSILON, Resources
 
 MACHINE = Host("ray/a", 4, ("0", "1"), 1024)
 
@@ -17,6 +17,7 @@ def test_a_host_and_a_placement_have_an_amount_of_each_kind() -> None:
     assert MACHINE.resources == Resources(4, 2, 1024)
     assert Placement("ray/a", ("1",), 0.5, 64).resources == Resources(0.5, 1, 64)
     assert MACHINE.left(1, ("1",), 24) == Host("ray/a", 1, ("1",), 24)
+    assert Resources(EPSILON) <= Resources(0) and not Resources(2 * EPSILON) <= Resources(0)
     assert not (MACHINE.single or MACHINE.away or MACHINE.queue or MACHINE.machine)
 
 
@@ -28,7 +29,7 @@ def test_gangs_are_placed_on_machines_where_they_are_known_and_else_on_the_limit
 
 
 def test_a_host_is_named_after_its_engine_but_that_of_the_local_one() -> None:
-    assert [engine_of(name) for name in (HERE, "ray/a/b", "docker/here")] == ["local", "ray", "docker"]
+    assert [engine_of(name) for name in (HERE, "ray/a/b", "docker/here", "/x")] == ["local", "ray", "docker", ""]
     assert HERE == "localhost"
 
 

@@ -24,6 +24,7 @@ CASES = {
     "an empty pattern is not named": ([{**EXIT, "onExitCode": "1", "onReason": ""}], 1, False),
     "without a container there is no code": ([{**EXIT, "onExitCode": "*"}], None, False),
     "and none equals it": ([{**EXIT, "onExitCode": "None"}], None, True),
+    "nor begins it": ([{**EXIT, "onExitCode": " *"}], None, True),
     "the first that matches decides": ([{**RETRY, "onExitCode": "1"}, {**EXIT, "onExitCode": "*"}], 1, True),
     "whatever follows": ([{**EXIT, "onExitCode": "*"}, {**RETRY, "onExitCode": "1"}], 1, False),
 }
