@@ -5,6 +5,7 @@
 # make unit integration training long robots services console engines    one tier of tests; docs/contributing.md says what each is
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
+# make mutants          small faults in the pure modules, and in a sample of PPO: which ones do the unit tests not notice?
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
 # make fuzz N=10000    malformed requests and hostile clients; no answer may be a 500, and others must be served meanwhile
 PYTHON ?= python3
@@ -15,7 +16,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test check unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run race test check unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -131,6 +132,10 @@ bits: $(READY)
 
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/integration/conformance/test_fuzz.py tests/integration/conformance/test_hostile_clients.py
+
+# MODULES="domain/job epoch" narrows it, SEED=2 takes other samples of PPO, WHICH=survivors tries only what survived the last time, WHICH=rest goes on
+mutants: $(READY)
+	$(BIN)/python -m tests.support.mutation.run $(MODULES) --seed $(or $(SEED),1) --which $(or $(WHICH),all)
 
 env: $(READY)
 

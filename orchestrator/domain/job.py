@@ -135,10 +135,9 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
         return Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
     if head is not None and head.exit_code == EX_TEMPFAIL:
         return Verdict(Ending.REQUEUE, head.reason, EX_TEMPFAIL)
-    if head is not None and (policy == "ignore" or len(failures) == 1):
-        certain = policy == "ignore" or not (head.asked and is_unseen)
-        return Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code, certain)
-    if not failures or policy == "ignore":
+    if policy == "ignore":
+        return None if head is None else Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code)
+    if not failures:
         return None
     # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
     index, first = failures[first_cause([(end.asked, end.ended) for _, end in failures])]

@@ -42,3 +42,4 @@ def test_a_malformed_variable_is_refused(name: str, value: str) -> None:
 @pytest.mark.parametrize("worlds", ["-1", "many", "1" * 10, ""])
 def test_an_invalid_number_of_worlds_counts_as_not_given(worlds: str) -> None:
     assert NativeOptions.read({"MUSTER_WORLDS": worlds}).worlds is None
+    assert NativeOptions.read({"MUSTER_WORLDS": "1" * 9}).worlds == 111_111_111

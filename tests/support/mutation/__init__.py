@@ -1,0 +1,1 @@
+"""Mutation: whether the tests notice small faults in a module (``make mutants``)."""

@@ -1,0 +1,76 @@
+"""Edges of the rules of an attempt, beside those in test_attempt.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from orchestrator.domain.attempt import (
+    LOST,
+    SHORTEST_REQUEUE,
+    AwaitCause,
+    AwaitChildren,
+    Close,
+    Decide,
+    Explain,
+    Gone,
+    Keep,
+    MarkRunning,
+    Observed,
+    Phase,
+    Save,
+    State,
+    Stop,
+    Terms,
+    after,
+    step,
+)
+from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
+from orchestrator.domain.native_options import NativeOptions
+
+NATIVE = NativeOptions(is_native=True, on_child_failure="fail")
+LAUNCHING = State(Terms(1, ("h/0", "h/1"), 2, 0, NATIVE, 30.0))
+STARTING = replace(LAUNCHING, launched=True)
+RUNNING = replace(STARTING, started=True, running_since=1000)
+
+
+def test_phases_follow_one_another() -> None:
+    ending = replace(RUNNING, verdict=Verdict(Ending.FAILED, "why"))
+    phases = [each.phase for each in (LAUNCHING, STARTING, RUNNING, ending, replace(ending, closed=True))]
+    assert phases == list(Phase)
+    assert replace(ending, launched=False).phase is Phase.LAUNCHING
+
+
+def test_a_gang_that_failed_for_good_has_little_to_save() -> None:
+    seen = Observed(2000, (None, NodeEnd(1, "exit 1", 1.0)), (None, None))
+    assert step(RUNNING, seen)[1:] == (Decide(Verdict(Ending.FATAL, "node 1: exit 1", 1)), Save(), Stop(5.0))
+
+
+def test_a_look_has_a_silence_for_every_node() -> None:
+    with pytest.raises(ValueError):
+        step(RUNNING, Observed(2000, (None, None), (None,)))
+
+
+def test_on_aws_the_silence_of_the_main_node_counts() -> None:
+    on_aws = replace(RUNNING, terms=replace(RUNNING.terms, options=NativeOptions()))
+    reason = "node 0 gives no sign of life for 21 s: frozen, or cut off"
+    seen = Observed(2000, (None, None), (LOST + 1, None))
+    assert Decide(Verdict(Ending.FAILED, reason)) in step(on_aws, seen)
+
+
+def test_who_leaves_on_request_after_a_while_starts_again_though_no_attempt_is_left() -> None:
+    left = replace(RUNNING, terms=replace(RUNNING.terms, spent=1), verdict=Verdict(Ending.REQUEUE, "why"))
+    [close] = step(left, Gone(1000 + SHORTEST_REQUEUE, (), ""))
+    assert isinstance(close, Close) and (close.status, close.spent) == (Status.RUNNABLE, False)
+
+
+def test_what_is_known_after_each_instruction() -> None:
+    verdict = Verdict(Ending.FAILED, "why")
+    assert after(LAUNCHING, Keep("handle")) == STARTING
+    assert after(STARTING, MarkRunning("runs", 1000)) == RUNNING
+    assert after(RUNNING, AwaitCause(5)) == replace(RUNNING, cause_since=5)
+    assert after(RUNNING, AwaitChildren(6)) == replace(RUNNING, done_since=6)
+    assert after(RUNNING, Decide(verdict)) == replace(RUNNING, verdict=verdict)
+    assert after(RUNNING, Close(9, True, Status.FAILED, "why")) == replace(RUNNING, closed=True)
+    assert after(RUNNING, Explain("why")) == RUNNING
