@@ -132,7 +132,7 @@ class Serving:
         self.process.kill()
         self.process.wait()
 
-    def muster(self, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
+    def muster(self, *arguments: str, **env: Any) -> subprocess.CompletedProcess[str]:
         return call_muster(*arguments, home=self.home, **env)
 
     def muster_process(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:

@@ -11,4 +11,5 @@ import warp as wp
 def numbers(array: wp.array[Any] | None) -> np.ndarray:
     """The content of an array that Newton declares as optional and every finished model has."""
     assert array is not None
-    return array.numpy()
+    content: np.ndarray = array.numpy()
+    return content

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
-class TaskVecEnv(VecEnv):  # type: ignore[misc]  # rsl_rl has no types
+class TaskVecEnv(VecEnv):
     """A task as rsl_rl's ``VecEnv``; its control step stays a CUDA graph.
 
     Args:

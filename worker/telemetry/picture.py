@@ -127,8 +127,8 @@ class Camera:
     def _extent(self, poses: np.ndarray) -> tuple[np.ndarray, float]:
         """Middle and radius of what is seen of the first world [m]."""
         model = self.stage.model
-        owners, bodies, flags = map(numbers, (model.shape_world, model.shape_body, model.shape_flags))
-        radii, places = map(numbers, (model.shape_collision_radius, model.shape_transform))
+        owners, bodies, flags = numbers(model.shape_world), numbers(model.shape_body), numbers(model.shape_flags)
+        radii, places = numbers(model.shape_collision_radius), numbers(model.shape_transform)
         scales = numbers(model.shape_scale)
         links = len(self.stage.links)
         least, most = np.full(3, np.inf), np.full(3, -np.inf)

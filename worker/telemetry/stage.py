@@ -116,8 +116,8 @@ class Stage:
 
         model = self.model
         names = self.links
-        bodies, owners, flags = map(numbers, (model.shape_body, model.shape_world, model.shape_flags))
-        kinds, sizes, places = map(numbers, (model.shape_type, model.shape_scale, model.shape_transform))
+        bodies, owners, flags = numbers(model.shape_body), numbers(model.shape_world), numbers(model.shape_flags)
+        kinds, sizes, places = numbers(model.shape_type), numbers(model.shape_scale), numbers(model.shape_transform)
         colors = numbers(model.shape_color)
         scenes: dict[str, Any] = {}
         for shape in range(model.shape_count):

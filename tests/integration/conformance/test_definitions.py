@@ -262,13 +262,13 @@ def test_overrides_are_what_the_job_shows_and_the_definition_stays_as_it_is(batc
 def test_the_aws_command_registers_describes_and_reads_errors(batch: Batch, parked: str, tmp_path: Path) -> None:
     url = batch.server.url
     request = {"jobDefinitionName": "def-typed", "type": "multinode"}
-    request["nodeProperties"] = properties(2, node_range("0:1"))  # type: ignore[assignment]
+    request["nodeProperties"] = properties(2, node_range("0:1"))
     (tmp_path / "definition.json").write_text(json.dumps(request))
     registered = aws(url, "batch", "register-job-definition", "--cli-input-json", f"file://{tmp_path}/definition.json")
     assert registered["revision"] == 1
     shown = aws(*(url, "batch", "describe-job-definitions", "--job-definition-name", "def-typed", "--status", "ACTIVE"))
     [entry] = shown["jobDefinitions"][0]["nodeProperties"]["nodeRangeProperties"]
-    given = request["nodeProperties"]["nodeRangeProperties"][0]["container"]  # type: ignore[index]
+    given = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
     assert {key: entry["container"][key] for key in given} == given
     submit = ("submit-job", "--job-name", "def-typed", "--job-queue", parked, "--job-definition", "def-typed:2")
     said = aws(url, "batch", *submit, fails=True)

@@ -229,7 +229,7 @@ def test_every_operation_is_allowed_or_refused_as_the_table_says(world: World, p
 
 
 def test_every_operation_of_the_product_stands_in_the_table() -> None:
-    app = create_app(None)  # type: ignore[arg-type]
+    app = create_app(None)
     routes = {f"{method.upper()} {path}" for path, methods in app.openapi()["paths"].items() for method in methods}
     for route in [*app.routes, *native.router.routes]:
         if isinstance(route, APIRoute) and not route.path.startswith("/v1/") and route.name != "cloudwatch_logs":

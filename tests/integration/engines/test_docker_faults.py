@@ -94,7 +94,7 @@ def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monke
     try:
         first, second = (plain(served, PLAIN, POLITE, **host_files()) for _ in range(2))
         for job in (first, second):
-            wait_for(lambda job=job: says(job, "RUNNING", "attempt 1 runs on 1 node"), 30, "its start")  # type: ignore[misc]
+            wait_for(lambda job=job: says(job, "RUNNING", "attempt 1 runs on 1 node"), 30, "its start")
         relay.cut()
         third = plain(served, PLAIN, "echo here", **host_files())
         wait_for(lambda: says(first, "RUNNING", away) and says(third, "STARTING", away), 20, "the reason")

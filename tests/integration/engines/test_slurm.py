@@ -171,7 +171,7 @@ def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(benc
 def look(handle: Handle) -> list[NodeStatus]:
     """The status that a new engine, without a memory, gets from Slurm."""
     engine = SlurmEngine()
-    return wait_for(  # type: ignore[no-any-return]
+    return wait_for(
         lambda: status if not (status := list(engine.observe(handle)))[0].running else None, 10, "an answer"
     )
 

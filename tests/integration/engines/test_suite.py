@@ -37,7 +37,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the engine of the page and its test, and with what pip would write of its entry point."""
     folder = tmp_path_factory.mktemp("plain")
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL):
-        (folder / re.match(r'"""(\w+\.py): ', block)[1]).write_text(block)  # type: ignore[index]
+        (folder / re.match(r'"""(\w+\.py): ', block)[1]).write_text(block)
     [project] = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
     found = folder / "muster_plain-1.dist-info"
     found.mkdir()

@@ -115,4 +115,4 @@ def after(server: Serving, job: str, env: dict[str, str]) -> str:
             more = {"dependsOn": [{"jobId": job}]} if operation == "SubmitJob" else {}
             return server.client.batch(operation, **request, **more)
 
-    return submit_gang(Waiting(), WAIT, env=env)  # type: ignore[arg-type]
+    return submit_gang(Waiting(), WAIT, env=env)

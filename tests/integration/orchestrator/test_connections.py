@@ -75,7 +75,7 @@ def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp
             follower.join(180)
         assert all({"first", "last"} <= set(lines) for lines in seen), "a follower was cut"
         assert server.wait(followed)["status"] == "SUCCEEDED"
-        log = server.errors.read_text()  # type: ignore[union-attr]
+        log = server.errors.read_text()
         assert "have waited longest for their client are closed" in log
         assert len(log.splitlines()) < 10 and "Traceback" not in log, log[:2000]
 
@@ -186,7 +186,7 @@ def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(
 def test_clients_that_take_no_answer_give_way_or_a_new_one_is_told(
     inside: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held: connections.Connections = inside._uvicorn.config.http.args[0]  # type: ignore[union-attr]
+    held: connections.Connections = inside._uvicorn.config.http.args[0]
     request = b"GET /api/openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     stalled = [half_open(inside.url, request * 200) for _ in range(3)]
     try:

@@ -164,7 +164,7 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
         ):
             fake.error = error
             [node] = wait_for(
-                lambda said=said: (s := several.observe(handle)) and said in s[0].words and s,  # type: ignore[misc]
+                lambda said=said: (s := several.observe(handle)) and said in s[0].words and s,
                 20,
                 said,
             )

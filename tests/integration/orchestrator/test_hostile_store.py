@@ -113,7 +113,7 @@ def test_no_change_of_a_run_and_no_spec_makes_an_answer_long(inside: Server, htt
     bomb = ", ".join(["a0: &a0 [x, x, x, x, x, x, x, x]", *levels])
     said = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
     assert "anchors and aliases (&a0) are not accepted here" in said and len(said) < 400
-    train = {**SPEC["train"], "task": "my:Task", "config": {"text": "x" * 100_000}}  # type: ignore[dict-item]
+    train = {**SPEC["train"], "task": "my:Task", "config": {"text": "x" * 100_000}}
     spec = {**SPEC, "train": train}
     write_json(runs / "crafted" / "run.json", {"run": "crafted", "spec": spec})
     said = refused(http.post("/api/runs/crafted/resume", json={"set": ["train.config={text: y}"]}))

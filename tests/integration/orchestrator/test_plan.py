@@ -160,7 +160,7 @@ def test_an_option_of_an_engine_that_is_misspelt_is_refused_when_the_tag_is_made
         tagged = refused("TagResource", resourceArn=f"{arn}compute-environment/cluster", tags={"muster:nice": "low"})
         assert "tag muster:nice is 'low', not a whole number" in tagged
         night = {"jobQueueName": "night", "priority": 1}
-        night["computeEnvironmentOrder"] = [{"order": 1, "computeEnvironment": "cluster"}]  # type: ignore[assignment]
+        night["computeEnvironmentOrder"] = [{"order": 1, "computeEnvironment": "cluster"}]
         assert "did you mean qos?" in refused("CreateJobQueue", **night, tags={"muster:qs": "low"})
         assert "no such option" in refused("CreateJobQueue", **night, tags={"muster:hosts": "a"})
         client.batch("CreateJobQueue", **night, tags={"muster:qos": "low", "muster:images": "refuse", "owner": "me"})

@@ -97,7 +97,7 @@ def test_a_bug_of_an_engine_holds_up_one_job_logged_once(
     tracebacks = [record for record in caplog.records if record.exc_info]
     assert len(tracebacks) == 1 and GOES_WRONG[call] in tracebacks[0].getMessage(), caplog.text
     assert bench.job("bad").status in (Status.STARTING, Status.RUNNING)
-    assert bench.job("bad").status_reason.endswith("trying again")  # type: ignore[union-attr]
+    assert bench.job("bad").status_reason.endswith("trying again")
     bench.engine.raises.clear()
     if call == "stop":
         assert bench.wait("bad", Status.FAILED).status_reason == "enough"

@@ -153,7 +153,7 @@ def test_when_one_rank_fails_the_others_are_ended_and_the_first_failure_is_the_r
     assert n.shell("if [ $RANK = 1 ]; then sleep 0.3; echo broken >&2; exit 3; fi; exec sleep 600") == 3
     outcome = n.ended()
     assert outcome.reason == "rank 1 exited with code 3: broken"
-    assert outcome.error.rank == 1  # type: ignore[union-attr]
+    assert outcome.error.rank == 1
 
 
 def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node: Nodes) -> None:

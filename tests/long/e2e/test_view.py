@@ -194,7 +194,7 @@ def test_the_view_goes_on_with_the_next_attempt_and_says_where_its_server_is_gon
     rerun.kill()
     line = view.until("muster: the viewer's server ended (signal 9)")
     assert "start the view again" in line
-    assert view.process.wait() == 1 and not view.process.stdout.read()  # type: ignore[union-attr]
+    assert view.process.wait() == 1 and not view.process.stdout.read()
     assert not (run_of(server, job).telemetry / "request.json").exists()
 
 

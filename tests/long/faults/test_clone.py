@@ -234,7 +234,7 @@ def test_an_algorithm_of_ones_own_may_read_another_s_weights(store: Path) -> Non
     settings = {"hidden_sizes": [16, 16], "steps": 8}
     begun = begin(store, algorithm=f"{__name__}:Reader", settings=settings)
     weights = learnt(last(store, "ppo"))["policy"]["mlp.0.weight"]
-    assert torch.equal(begun.algorithm.actor.layers[0].weight, weights)  # type: ignore[attr-defined]
+    assert torch.equal(begun.algorithm.actor.layers[0].weight, weights)
     assert "reader" not in installed()
 
 

@@ -57,7 +57,7 @@ def test_its_settings_are_checked(mine: type) -> None:
         ({"gamma": 2.0}, "train.settings.gamma: expected a value less than or equal to 1, found 2.0"),
     ):
         with pytest.raises(UserError) as caught:
-            settings(mine, OWN, PointConfig(), {"settings": given})  # type: ignore[arg-type]
+            settings(mine, OWN, PointConfig(), {"settings": given})
         assert str(caught.value) == said
 
 

@@ -239,7 +239,7 @@ def test_a_setting_of_rsl_rl_that_its_state_holds_is_refused(store: Path, run: s
 @pytest.mark.parametrize("key", RND_APPLIED)
 def test_a_setting_of_curiosity_that_is_accepted_is_what_it_uses(store: Path, key: str) -> None:
     settings = with_value(RND_RUN, f"algorithm.rnd_cfg.{key}", RND_APPLIED[key])
-    curiosity = go_on(store, "rnd", settings).algorithm.algorithm.rnd  # type: ignore[attr-defined]
+    curiosity = go_on(store, "rnd", settings).algorithm.algorithm.rnd
     if key == "weight":
         assert curiosity.initial_weight == pytest.approx(0.5 * 0.1), "rsl_rl scales it by the length of a step"
     else:
@@ -263,7 +263,7 @@ def go_on_with_own(store: Path, **settings: Any) -> Loop:
 
 
 def test_settings_of_an_algorithm_of_ones_own_are_applied_or_refused_as_its_class_says(store: Path) -> None:
-    assert go_on_with_own(store, gamma=0.5).algorithm.config.gamma == 0.5  # type: ignore[attr-defined]
+    assert go_on_with_own(store, gamma=0.5).algorithm.config.gamma == 0.5
     with pytest.raises(UserError, match=r": settings\.hidden_sizes is \[8\] there and \[9\] here; start a new run"):
         go_on_with_own(store, hidden_sizes=[9])
 
@@ -271,7 +271,7 @@ def test_settings_of_an_algorithm_of_ones_own_are_applied_or_refused_as_its_clas
 def test_a_pupil_that_goes_on_needs_its_teacher_s_run_no_more(store: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(store, tmp_path / "store"))
     shutil.rmtree(copy / "runs" / "rsl")
-    assert go_on(copy, "pupil", PUPIL_RUN).algorithm.algorithm.teacher_loaded  # type: ignore[attr-defined]
+    assert go_on(copy, "pupil", PUPIL_RUN).algorithm.algorithm.teacher_loaded
 
 
 def test_a_pupil_begins_with_the_copy_of_its_teacher_that_its_run_holds(store: Path, tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_ppo_learns_to_choose_is_killed_and_exports_what_it_learnt(directory: Pa
     done = run_muster("verify-resume", "job.yaml", *options, home=home, cwd=directory, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^equal: \d+ tensors, 80 iterations$", done.stdout, re.M), done.stdout
-    run = Store(home / "store").run(re.search(r"^killed: +(\S+),", done.stdout, re.M)[1])  # type: ignore[index]
+    run = Store(home / "store").run(re.search(r"^killed: +(\S+),", done.stdout, re.M)[1])
     records = read_metrics(run)
     assert records[0]["reward"] < 8.0 and records[-1]["reward"] > 18.0, "30 is the greatest that there could be"
     assert 0.0 < records[-1]["entropy"] < np.log(3.0)
@@ -85,7 +85,7 @@ def test_who_can_not_choose_says_so_in_one_line(directory: Path, algorithm: str,
 
 def test_gymnasium_sees_choices(directory: Path) -> None:
     environment = TaskVectorEnv("pushed:Pushed", 4)
-    assert environment.single_action_space.n == 3  # type: ignore[attr-defined]
+    assert environment.single_action_space.n == 3
     velocities = []
     for choice in range(3):
         environment.reset(seed=1)

@@ -300,7 +300,7 @@ def test_actions_and_tables_and_the_contract_name_the_columns() -> None:
     )
     assert "the site tip in the root's frame by x, y" in first.rule and "damping = 0.05" in first.rule
     assert grip.rule == ""
-    fewer = type("Fewer", (Planar,), {"actions": {"tip": Action(terms.move_frame, size=1)}}).sketch(ArmConfig())  # type: ignore[attr-defined]
+    fewer = type("Fewer", (Planar,), {"actions": {"tip": Action(terms.move_frame, size=1)}}).sketch(ArmConfig())
     assert fewer.action_names == ("tip_x",)
 
 
@@ -322,7 +322,7 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
 
 def refusal(**changed: Any) -> str:
     with pytest.raises(ValueError) as caught:
-        type("Wrong", (Planar,), changed).sketch(ArmConfig())  # type: ignore[attr-defined]
+        type("Wrong", (Planar,), changed).sketch(ArmConfig())
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

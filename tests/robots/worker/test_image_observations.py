@@ -173,7 +173,7 @@ def test_ppo_takes_the_numbers_and_refuses_images_that_the_policy_does_not_see(t
             Training.of(Job.from_env(env, "train"), Seeing), Gang(Placement(), "cpu", None, ["here"]), StopRequest()
         )
 
-    assert loop().algorithm.rollout.actor.observations.shape[2:] == (1,)  # type: ignore[attr-defined]
+    assert loop().algorithm.rollout.actor.observations.shape[2:] == (1,)
     with pytest.raises(UserError, match="critic_observations: expected 'policy' or 'critic', found 'camera'"):
         loop(critic_observations="camera")
     assert algorithms.settings(PPO, "ppo", SeeingConfig(), {}) == PPOConfig(

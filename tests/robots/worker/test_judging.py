@@ -74,9 +74,9 @@ def test_an_episode_that_a_fall_ends_is_shorter(task: Velocity) -> None:
         state["joint_q"][0, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
         task.load_state_dict(state)
 
-    task.reset = on_its_back  # type: ignore[method-assign]
+    task.reset = on_its_back
     found = judge(task, rest)
-    task.reset = start  # type: ignore[method-assign]
+    task.reset = start
     assert found.length_share == pytest.approx(((WORLDS - 1) * STEPS + 1) / (WORLDS * STEPS))
     assert found.full_length == pytest.approx((WORLDS - 1) / WORLDS)
 

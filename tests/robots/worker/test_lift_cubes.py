@@ -165,7 +165,7 @@ def test_a_selection_of_missing_or_fixed_parts_is_refused_in_one_line() -> None:
             found = dict(super().objects(config))
             return {**found, "shelf": Box("shelf", size=(0.1, 0.1, 0.1), position=(0.0, 0.5, 0.05), fixed=True)}
 
-        def declare(self, config: LiftCubesConfig):  # type: ignore[no-untyped-def]
+        def declare(self, config: LiftCubesConfig):
             declared = super().declare(config)
             return replace(declared, sensors={**declared.sensors, "cubes": ObjectSelection(self.selected)})
 

@@ -87,8 +87,8 @@ def test_the_tutorials_jobs_fit_the_example() -> None:
 def test_the_page_s_error_for_a_wrong_parameter_is_the_real_one(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
 
-    class Pendulum(page.Pendulum):  # type: ignore[name-defined,misc]
-        def declare(self, config):  # type: ignore[no-untyped-def]
+    class Pendulum(page.Pendulum):
+        def declare(self, config):
             return page.dataclasses.replace(
                 super().declare(config),
                 rewards={**super().declare(config).rewards, "upright": page.Reward(page.pointing, targt=1.0)},
@@ -164,8 +164,8 @@ def test_the_entries_of_the_page_on_randomisation_fit_an_ant(tmp_path: Path) -> 
     page = module("tasks/sensors.md", tmp_path)
     entries = module("tasks/randomization.md", tmp_path).randomize
 
-    class Varied(page.FeelingAnt):  # type: ignore[name-defined,misc]
-        def declare(self, config):  # type: ignore[no-untyped-def]
+    class Varied(page.FeelingAnt):
+        def declare(self, config):
             return replace(super().declare(config), randomize=entries)
 
     task = Varied(page.FeelingAntConfig(), 4, seed=1)

@@ -33,7 +33,7 @@ def told(name: str) -> dict[str, Any]:
 @functools.cache
 def plan_of(name: str) -> Any:
     kind = find_task(name)
-    return kind.sketch(kind.config_type()).plan  # type: ignore[attr-defined]
+    return kind.sketch(kind.config_type()).plan
 
 
 @pytest.mark.parametrize("name", DECLARED)

@@ -182,7 +182,7 @@ def test_the_default_is_the_rough_terrain_of_others() -> None:
     [
         (lambda: Terrain(kinds={}), ["Terrain.kinds is empty"]),
         (lambda: Terrain(kinds={Flat(): 0.0}), ["share of Flat is 0.0", "> 0"]),
-        (lambda: Terrain(kinds={"flat": 1.0}), ["'flat' is not a patch", "Flat()"]),  # type: ignore[dict-item]
+        (lambda: Terrain(kinds={"flat": 1.0}), ["'flat' is not a patch", "Flat()"]),
         (lambda: Terrain(levels=0), ["Terrain.levels is 0", ">= 1"]),
         (lambda: Terrain(columns=3), ["Terrain.columns is 3", "at least 7"]),
         (lambda: Terrain(resolution=0.0), ["Terrain.resolution is 0.0"]),

@@ -195,7 +195,7 @@ def test_a_scan_measures_what_rays_of_mujoco_do(alignment: str, balls: SensorCon
     worlds = balls.worlds
     positions, rotations = turned(worlds)
     offset = np.array((0.3, -0.1, 0.05))
-    declared = HeightScan(bodies="thing", alignment=alignment, offset=tuple(offset), max_distance=50.0)  # type: ignore[arg-type]
+    declared = HeightScan(bodies="thing", alignment=alignment, offset=tuple(offset), max_distance=50.0)
     sensor = declared.build(balls)
     sensor.advance()
     pattern = np.array([(x, y, 0.0) for y in np.arange(-0.5, 0.51, 0.1) for x in np.arange(-0.8, 0.81, 0.1)])
@@ -283,7 +283,7 @@ def test_launches_of_a_step_on_a_terrain_can_be_captured(balls: SensorContext) -
         (HeightScan(bodies="thin"), ["thin", "did you mean thing?"]),
         (HeightScan(), ["HeightScan", "either bodies or sites"]),
         (HeightScan(bodies="thing", robot="robo"), ["HeightScan.robot", "'robo'", "robot"]),
-        (HeightScan(bodies="thing", alignment="pitch"), ["'pitch'", "yaw, base, world"]),  # type: ignore[arg-type]
+        (HeightScan(bodies="thing", alignment="pitch"), ["'pitch'", "yaw, base, world"]),
         (HeightScan(bodies="thing", max_distance=0.0), ["HeightScan.max_distance is 0.0"]),
         (HeightScan(bodies="thing", pattern=GridPattern(resolution=0.0)), ["GridPattern.resolution is 0.0"]),
         (HeightScan(bodies="thing", pattern=GridPattern(resolution=0.001)), ["1,602,601 points", "coarser than 0.001"]),

@@ -51,7 +51,7 @@ JOINT = {
 def tasks() -> dict[str, Velocity]:
     """The robots on a plane, made when they are first asked for."""
 
-    class Made(dict):  # type: ignore[type-arg]
+    class Made(dict):
         def __missing__(self, name: str) -> Velocity:
             self[name] = plain(name, WORLDS)
             return self[name]
@@ -274,7 +274,7 @@ def test_a_number_that_the_stages_of_a_command_set_is_refused(place: str, field:
 def test_the_end_of_the_ground_is_that_of_the_terrain_that_the_task_has() -> None:
     rough = find_task("Go1Rough")
 
-    class Wide(rough):  # type: ignore[misc, valid-type]
+    class Wide(rough):
         def terrain(self, config: Any) -> Terrain:
             return dataclasses.replace(super().terrain(config), border=7.0)
 

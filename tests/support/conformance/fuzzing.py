@@ -200,7 +200,7 @@ class Call:
         return Call(self.method, target, body, self.headers)
 
 
-_CONTENT_TYPES = ("application/json", "application/x-amz-json-1.1", "text/plain", "")
+_CONTENT_TYPES: tuple[str, ...] = ("application/json", "application/x-amz-json-1.1", "text/plain", "")
 _CONTENT_TYPES += ("application/json; charset=utf-7", "é")
 _ODD_HEADERS: tuple[dict[str, str], ...] = (
     {"X-Muster-Idempotency-Key": "again"},
@@ -301,7 +301,7 @@ _SAFE = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789/%?&=.#:;
 def stray_calls(draw: st.DrawFn) -> Call:
     """Paths that lead nowhere, or somewhere in an odd way."""
     method = draw(st.sampled_from(("GET", "POST", "PUT", "DELETE", "PATCH", "HEAD", "OPTIONS", "TRACE", "BREW")))
-    known = ("/", "/v1/", "/v1", "/v1/tags/", "/v1//submitjob", "/v1/tags", "/v1/..", "/%2e%2e/")
+    known: tuple[str, ...] = ("/", "/v1/", "/v1", "/v1/tags/", "/v1//submitjob", "/v1/tags", "/v1/..", "/%2e%2e/")
     known += ("//", "/api", "/api/", "*", "/healthz/")
     more = ("/api/jobs/%00", "/api/jobs/%ff", "/api/jobs/..%2f..", "/api/runs/%2e%2e", "/api/jobs/<gang>%23")
     native = ("/api/jobs/<gang>/logs?node=-1", "/api/jobs/<gang>/logs?attempt=99999999999999999999", "/api/runs/<run>")
@@ -324,7 +324,14 @@ def resume_calls(draw: st.DrawFn) -> Call:
     """POST …/resume of a run that exists: what goes on behind it is compiled, registered and submitted."""
     changes = draw(st.lists(st.one_of(st.sampled_from(CHANGES), st.sampled_from(ODD_TEXTS)), max_size=2))
     request: dict[str, Any] = {"set": changes}
-    changed = ({}, {}, {"nodes": 2}, {"nodes": 10**30}, {"checkpoint": 3}, {"checkpoint": -(10**30)})
+    changed: tuple[dict[str, int], ...] = (
+        {},
+        {},
+        {"nodes": 2},
+        {"nodes": 10**30},
+        {"checkpoint": 3},
+        {"checkpoint": -(10**30)},
+    )
     request |= draw(st.sampled_from(changed))
     if draw(st.booleans()):
         request["directory"] = draw(st.sampled_from(ODD_TEXTS))

@@ -60,8 +60,10 @@ class Visitor:
 
     def __init__(self, url: str, key: str = "") -> None:
         """``key``: ``ACCESS_KEY_ID:SECRET`` or the server's token, to log in with; none where the server asks for none."""
-        options = {"headers": {"Accept": "text/html"}, "follow_redirects": True, "trust_env": False}
-        self.http = httpx.Client(base_url=url, timeout=30 * PATIENCE, **options)
+        headers = {"Accept": "text/html"}
+        self.http = httpx.Client(
+            base_url=url, timeout=30 * PATIENCE, headers=headers, follow_redirects=True, trust_env=False
+        )
         if key:
             answer = self.http.post("/login", data={"key": key, "next": "/"})
             assert answer.status_code == 200, answer.text

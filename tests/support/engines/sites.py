@@ -87,7 +87,12 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             patch.setenv(name, "any")
         with Serving(home / "aws", "--cpus", "8") as aws:
-            told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url}
+            told: dict[str, Any] = {
+                "region": "us-east-1",
+                "job_queue": "default",
+                "image": "muster",
+                "endpoint_url": aws.url,
+            }
             config = AwsConfig(**told, store=str(home / "volume"), store_is_shared=False, poll=0.1, quiet=1.0)
             (home / "home").mkdir()
             save_config(home / "home", config)

@@ -128,8 +128,9 @@ class SlurmCluster:
             program = "slurmctld" if name == "slurmctld" else "slurmd"
             command = [program, "-D", "-f", str(self.conf)] + (["-N", name] if program == "slurmd" else [])
             with open(self.home / f"{name}.out", "ab") as output:
-                pipes = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
-                self.daemons[name] = subprocess.Popen(command, env=self.environment(), **pipes)
+                self.daemons[name] = subprocess.Popen(
+                    command, env=self.environment(), stdin=subprocess.DEVNULL, stdout=output, stderr=output
+                )
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> None:
         """End one daemon as a crash would."""

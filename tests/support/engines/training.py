@@ -9,8 +9,9 @@ from pathlib import Path
 
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
-from tests.conftest import PATIENCE, REPOSITORY, Serving
+from tests.conftest import REPOSITORY, Serving
 from tests.support.engines.images import PATH, SUPERVISED, host_files
+from tests.support.waiting import PATIENCE
 
 SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
 

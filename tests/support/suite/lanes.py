@@ -28,7 +28,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: TIERS.index(tier) if (tier := tiers[item]) else len(TIERS))
 
 
-class _Lanes(LoadScopeScheduling):
+class _Lanes(LoadScopeScheduling):  # type: ignore[misc]  # xdist has no types
     """Files, in the order of their collection; the folders in :data:`ALONE` together are as one file."""
 
     def _split_scope(self, nodeid: str) -> str:

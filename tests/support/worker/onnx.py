@@ -25,7 +25,7 @@ def onnx_of(exported: ExportedPolicy) -> ReferenceEvaluator:
         torch.onnx.export(
             exported.network,
             tuple(exported.inputs.values()),
-            buffer,
+            buffer,  # type: ignore[arg-type]  # torch writes to a buffer, too
             dynamo=False,
             opset_version=18,
             input_names=list(exported.inputs),

@@ -106,7 +106,7 @@ def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Servin
     assert any("rank 1 was killed by SIGKILL" in reason for reason in reasons) and first["spent"]
     assert second["number"] == 2 and second["epoch"] == first["epoch"] + 1
     log = "\n".join(server.log(job["id"], attempt=2))
-    start = int(re.search(r"resumed from checkpoint (\d{8})-e\d+", log)[1])  # type: ignore[index]
+    start = int(re.search(r"resumed from checkpoint (\d{8})-e\d+", log)[1])
     assert start >= 5 and start % 5 == 0
     records = server.client.get(f"/api/runs/{job['run']}/metrics")
     assert [record["iteration"] for record in records] == list(range(1, len(records) + 1))

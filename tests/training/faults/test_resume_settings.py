@@ -42,7 +42,7 @@ def unchanged(store: Path) -> Loop:
 
 
 def objective(index: int) -> Callable[[PPO], float]:
-    return lambda ppo: ppo._head._objective._numbers[index]  # type: ignore[attr-defined]
+    return lambda ppo: ppo._head._objective._numbers[index]
 
 
 APPLIED: dict[str, tuple[Any, Callable[[PPO], Any]]] = {
@@ -141,12 +141,12 @@ def test_a_task_whose_own_configuration_is_wrong_is_refused_in_one_line() -> Non
         schedule: str = "linear"
 
     @dataclasses.dataclass(frozen=True)
-    class Config(Point.config_type):  # type: ignore[name-defined, misc]
+    class Config(Point.config_type):
         ppo: PPOConfig = dataclasses.field(default_factory=Careless)
 
     class Task(Point):
         config_type = Config
 
     with pytest.raises(UserError) as error:
-        algorithms.settings(PPO, "ppo", configure(Task, {}), {})  # type: ignore[arg-type]
+        algorithms.settings(PPO, "ppo", configure(Task, {}), {})
     assert str(error.value) == "train.ppo.schedule: expected 'adaptive' or 'fixed', found 'linear'"

@@ -43,9 +43,9 @@ def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
     task = Point(PointConfig(ppo=config), share.count, seed=2, first_world=share.first)
     task.set_random_episode_length()
     torch.manual_seed(7)
-    ppo = PPO(config, Setting(spaces_of(task), share, gang, 4))  # type: ignore[arg-type]
-    observations = observed(task)  # type: ignore[arg-type]
-    step = transition(task, observations)  # type: ignore[arg-type]
+    ppo = PPO(config, Setting(spaces_of(task), share, gang, 4))
+    observations = observed(task)
+    step = transition(task, observations)
     found = []
     for iteration in range(3):
         ppo.begin(iteration)

@@ -38,7 +38,7 @@ def start(
     }
     command = [sys.executable, "-m", f"worker.{kind}"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, env={**os.environ, **given}, cwd=ROOT, **pipes)  # type: ignore[call-overload]
+    return subprocess.Popen(command, env={**os.environ, **given}, cwd=ROOT, **pipes)
 
 
 def ended(process: Any) -> tuple[int, str]:

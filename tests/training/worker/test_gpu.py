@@ -52,7 +52,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def runner(store: Path, case: str, worlds: int = 256):  # type: ignore[no-untyped-def]
+def runner(store: Path, case: str, worlds: int = 256):
     from benchmarks.training import build
 
     task, train = CASES[case]

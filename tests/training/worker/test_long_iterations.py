@@ -27,9 +27,9 @@ def train_slowly_from_the_third() -> int:
         import time
 
         time.sleep(30.0 if int(self._steps[0]) >= 16 else 0.15)
-        step(self, actions)  # type: ignore[arg-type]
+        step(self, actions)
 
-    Point.step = slow  # type: ignore[method-assign, assignment]
+    Point.step = slow
     return ranks.train()
 
 

@@ -79,7 +79,7 @@ def test_an_observation_is_the_present_image_and_the_one_before(pixels: Cartpole
 
 def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> None:
     def build(count: int, first: int = 0, **scene: object) -> torch.Tensor:
-        config = CartpolePixelsConfig(start_position=0.0, start_angle=0.0, randomize=Randomization(**scene))  # type: ignore[arg-type]
+        config = CartpolePixelsConfig(start_position=0.0, start_angle=0.0, randomize=Randomization(**scene))
         return CartpolePixels(config, count, seed=3, first_world=first).observations.clone()
 
     plain = build(3)

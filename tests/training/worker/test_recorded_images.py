@@ -121,7 +121,7 @@ def test_the_live_view_of_a_training_shows_them_beside_each_other(running: Runni
 
     stop: list[int] = []
     view = Training(running.run, "job", 2, stop, Activity())
-    view.show(lambda: File(tmp_path / "view.rrd", stop))  # type: ignore[arg-type,return-value]
+    view.show(lambda: File(tmp_path / "view.rrd", stop))
     assert view.frames > 3
     shown: list[np.ndarray] = []
     for chunk in RrdReader(tmp_path / "view.rrd").stream().to_chunks():

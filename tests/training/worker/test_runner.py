@@ -292,7 +292,7 @@ def test_wrong_overrides_are_refused(section: dict, message: str) -> None:
 
 def configured(section: dict[str, Any]) -> tuple[Any, Any]:
     """The task's configuration and the algorithm's settings of a job."""
-    config, name = configure(Point, section), section.get("algorithm", "ppo")  # type: ignore[arg-type]
+    config, name = configure(Point, section), section.get("algorithm", "ppo")
     return config, algorithms.settings(algorithms.find_algorithm(name), name, config, section)
 
 
@@ -364,7 +364,7 @@ def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytes
     session = onnxruntime.InferenceSession(target / "policy.onnx", providers=["CPUExecutionProvider"])
     (actions,) = session.run(None, {"obs": told["obs"][0]})
     np.testing.assert_allclose(actions, told["actions"][0], atol=1e-5)
-    ours = started.algorithm.policy().act({"policy": torch.from_numpy(told["obs"][0])}).numpy()  # type: ignore[arg-type]
+    ours = started.algorithm.policy().act({"policy": torch.from_numpy(told["obs"][0])}).numpy()
     np.testing.assert_allclose(actions, ours, atol=1e-5)
     facts = json.loads((target / "manifest.json").read_text())
     assert (facts["checkpoint"], facts["iteration"]) == (checkpoint.name, 2)

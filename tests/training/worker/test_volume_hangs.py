@@ -106,7 +106,7 @@ def test_a_commit_follows_the_records_before_it(tmp_path: Path, monkeypatch: pyt
                 )
             time.sleep(0.001)
 
-    def late(function, *arguments) -> None:  # type: ignore[no-untyped-def]
+    def late(function, *arguments) -> None:
         slow(time.sleep, 0.3)
         slow(function, *arguments)
 

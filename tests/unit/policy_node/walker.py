@@ -24,7 +24,7 @@ def term(name: str, first: int, size: int, **options: object) -> Term:
         "library": True,
         **options,
     }
-    return Term(name=name, first=first, **given)  # type: ignore[arg-type]
+    return Term(name=name, first=first, **given)
 
 
 KNEE = Action(
@@ -76,4 +76,4 @@ def contract(*terms: Term, recurrent: bool = False, **changes: object) -> Contra
         "states": (State("total", "total_out", (size,)),) if recurrent else (),
         **changes,
     }
-    return Contract(**fields)  # type: ignore[arg-type]
+    return Contract(**fields)

@@ -177,7 +177,7 @@ def test_a_choice_counts_before_the_job_s_own_checkpoints_alone_and_a_newer_one_
         run, chosen="00000001-e1", chosen_since=3, damaged=lambda each, error: seen.append(each.name)
     )
     assert found is not None and found.name == "00000001-e1" and seen == ["00000002-e3"]
-    assert newest_checkpoint(run).iteration == 1  # type: ignore[union-attr]
+    assert newest_checkpoint(run).iteration == 1
     (run.checkpoints / "00000001-e1" / "rank-0.pt").unlink()
     assert newest_checkpoint(run) is None
     assert newest_checkpoint(Run(run.path / "none")) is None
@@ -192,10 +192,10 @@ def test_the_best_has_the_greatest_score_that_is_a_number_and_of_equals_it_is_th
     assert best_checkpoint(run) is None
     for iteration, score in ((2, -5.0), (3, 1), (4, 1.0), (5, 0.5), (6, None)):
         commit(run, iteration, score=score)
-    assert best_checkpoint(run).iteration == 4  # type: ignore[union-attr]
+    assert best_checkpoint(run).iteration == 4
     for name, text in (("2", '{"files": {}, "format": 1, "score": Infinity}'), ("4", "{")):
         (run.checkpoints / f"0000000{name}-e1" / "manifest.json").write_text(text)
-    assert best_checkpoint(run).iteration == 3  # type: ignore[union-attr]
+    assert best_checkpoint(run).iteration == 3
 
 
 def test_checkpoints_that_were_saved_only_for_long_iterations_and_those_with_exports_are_kept_apart(run: Run) -> None:

@@ -151,7 +151,7 @@ def test_each_change_of_meaning_is_a_line() -> None:
 
 def test_the_frame_of_a_quantity_is_compared_if_both_contracts_have_it() -> None:
     def placed(*position: float) -> Contract:
-        frame = Frame("imu", "trunk", position, (0.0, 0.0, 0.0, 1.0), True)  # type: ignore[arg-type]
+        frame = Frame("imu", "trunk", position, (0.0, 0.0, 0.0, 1.0), True)
         group = dataclasses.replace(CONTRACT.groups[0], terms=(ANGLES, dataclasses.replace(SPEED, frame=frame)))
         return dataclasses.replace(CONTRACT, groups=(group, CONTRACT.groups[1]))
 

@@ -76,9 +76,9 @@ class WithoutPolicy(OnlyLearns):
 
 def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
     with pytest.raises(UserError, match=r'^train\.algorithm: own:A: state_dict\(\) must hold "policy"'):
-        check_state(WithoutPolicy(), "own:A")  # type: ignore[arg-type]
+        check_state(WithoutPolicy(), "own:A")
     with pytest.raises(UserError, match=r"own:A: its config_type must be a dataclass, not dict$"):
-        settings(WithoutPolicy, "own:A", PointConfig(), {})  # type: ignore[arg-type]
+        settings(WithoutPolicy, "own:A", PointConfig(), {})
     with pytest.raises(
         UserError, match=r"act\(\) must give a tensor of shape \(4, 2\) \(worlds, actions\); it gave \(4,\)$"
     ):
@@ -98,7 +98,7 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
 def test_attributes_set_in_the_constructor_are_checked_before_the_first_iteration() -> None:
     chosen = find_algorithm(f"{HERE}:Forgetful")
     with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is no algorithm: it lacks steps \("):
-        build_algorithm(chosen, None, Point(PointConfig(), 2), Share(0, 2, 2), alone(), 0)  # type: ignore[arg-type]
+        build_algorithm(chosen, None, Point(PointConfig(), 2), Share(0, 2, 2), alone(), 0)
 
 
 class InTurn(Gang):

@@ -289,7 +289,7 @@ def test_other_refusals() -> None:
     with pytest.raises(ValueError, match=r"rewards.Place: a term's name has small letters, digits and underscores"):
         Declaration(actions={}, observations={}, rewards={"Place": Reward(terms.alive)})
     with pytest.raises(ValueError, match=r"observations.policy.place: expected an Observation, found a Reward"):
-        Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})  # type: ignore[dict-item]
+        Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})
 
     class Bare(Sliders):
         def robot(self, config: SlidersConfig) -> Robot:

@@ -130,7 +130,7 @@ def test_mistakes_are_named(env: VectorEnv) -> None:
 
 def test_an_environment_hands_out_copies_in_floats() -> None:
     task = Seen(seed=3)
-    env = TaskVecEnv(task)  # type: ignore[arg-type]
+    env = TaskVecEnv(task)
     first = env.get_observations()
     image = first["image"].clone()
     assert list(first.keys()) == ["policy", "critic", "place", "image"] and image.dtype == torch.float32
@@ -144,7 +144,7 @@ def test_an_environment_hands_out_copies_in_floats() -> None:
 
 def test_an_environment_logs_what_the_terms_of_the_reward_came_to_and_its_clock_is_that_of_the_task() -> None:
     task = Seen(seed=3)
-    env = TaskVecEnv(task)  # type: ignore[arg-type]
+    env = TaskVecEnv(task)
     returns = torch.zeros(8)
     for _ in range(5):
         *_, dones, extras = env.step(torch.zeros(8, 1))

@@ -28,7 +28,7 @@ def said(
     """The lines without an iteration's figures, of three iterations of 1,000 that take so long each."""
     run = run_of(tmp_path)
     job = SimpleNamespace(run=run, epoch=1, section={"task": "G1Rough"})
-    report = Report(SimpleNamespace(job=job, iterations=1000), resumed, device)  # type: ignore[arg-type]
+    report = Report(SimpleNamespace(job=job, iterations=1000), resumed, device)
     for iteration in range(resumed + 1, resumed + 4):
         figures = {"reward": None, "episode_length": None, "steps_per_second": 98304.0 / seconds}
         report.iteration({"iteration": iteration, "iteration_seconds": seconds, **figures})
@@ -65,7 +65,7 @@ def test_metrics_shown_by_a_task_are_in_the_line_the_record_and_the_plot(
 ) -> None:
     run = run_of(tmp_path)
     job = SimpleNamespace(run=run, epoch=1, section={})
-    report = Report(SimpleNamespace(job=job, iterations=2), 0, "cuda:0")  # type: ignore[arg-type]
+    report = Report(SimpleNamespace(job=job, iterations=2), 0, "cuda:0")
     usual = {"episode_length": 33.0, "steps_per_second": 100.0, "iteration_seconds": 1.0}
     for iteration, progress in ((1, None), (2, 42.0)):
         shown = {"progress": "- %" if progress is None else "42.0 %"}

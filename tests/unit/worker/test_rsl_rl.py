@@ -208,7 +208,7 @@ def test_the_weights_are_those_of_rsl_rls_own_runner_and_a_resumed_run_ends_with
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         stock |= {"num_steps_per_env": 8, "save_interval": 100, "obs_groups": copy.deepcopy(config.obs_groups)}
-        runner = (DistillationRunner if distils else OnPolicyRunner)(TaskVecEnv(own), stock, None, "cpu")  # type: ignore[arg-type]
+        runner = (DistillationRunner if distils else OnPolicyRunner)(TaskVecEnv(own), stock, None, "cpu")
         if distils:
             runner.alg.teacher_loaded = True
         runner.learn(4)
@@ -275,7 +275,7 @@ def test_counts_of_steps_come_to_the_host() -> None:
 class Elsewhere(torch.Tensor):
     """Stands for a tensor on a GPU."""
 
-    def cpu(self) -> torch.Tensor:  # type: ignore[override]
+    def cpu(self) -> torch.Tensor:
         return self.as_subclass(torch.Tensor).clone()
 
 

@@ -53,7 +53,7 @@ def test_settings_that_can_not_be_are_refused_by_name(settings: dict[str, Any], 
 
 
 def test_settings_as_yaml_gives_them() -> None:
-    config = SACConfig(actor_sizes=[64, 32], gamma=1)  # type: ignore[arg-type]
+    config = SACConfig(actor_sizes=[64, 32], gamma=1)
     assert config.actor_sizes == (64, 32) and isinstance(config.gamma, float)
     assert SACConfig(**dataclasses.asdict(config)) == config
     assert SACConfig(atoms=1, v_min=0.0, v_max=0.0).atoms == 1, "the range is not used with one atom"

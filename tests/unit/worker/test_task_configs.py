@@ -54,7 +54,7 @@ def test_rewards_and_curricula_can_not_be_changed_afterwards() -> None:
     assert config.curriculum == {"up": [[0, 1]]}
     for mapping in (config.rewards, config.curriculum, AntConfig().curriculum):
         with pytest.raises(TypeError):
-            mapping["up"] = 3.0  # type: ignore[index]
+            mapping["up"] = 3.0
 
 
 def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
@@ -71,7 +71,7 @@ def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
 
 
 def test_a_plain_dataclass_that_python_makes_is_checked_in_what_every_task_has() -> None:
-    assert PendulumConfig(randomize={"mass": [1, 2]}).randomize == Randomization(mass=(1.0, 2.0))  # type: ignore[arg-type]
+    assert PendulumConfig(randomize={"mass": [1, 2]}).randomize == Randomization(mass=(1.0, 2.0))
     for wrong in (
         {"substeps": 0},
         {"rewards": {"sped": 1.0}},
@@ -79,7 +79,7 @@ def test_a_plain_dataclass_that_python_makes_is_checked_in_what_every_task_has()
         {"curriculum": {"level": [[0, 2]]}},
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            PendulumConfig(**wrong)  # type: ignore[arg-type]
+            PendulumConfig(**wrong)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +148,7 @@ def test_a_yaml_changes_the_weights_that_it_names() -> None:
     assert tuple(config.rewards) == Ant.reward_terms, "the order is the kernel's, whatever the YAML's"
     assert configure(Ant, {}).rewards == AntConfig().rewards
     with pytest.raises(TypeError):
-        config.rewards["forward"] = 3.0  # type: ignore[index]
+        config.rewards["forward"] = 3.0
 
 
 @pytest.mark.parametrize(

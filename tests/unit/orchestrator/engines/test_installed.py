@@ -31,7 +31,7 @@ def test_muster_s_own_engines_are_entry_points_and_any_other_is_refused_with_tho
 )
 def test_an_entry_point_that_leads_to_no_engine_is_named(value: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     point = installed.EntryPoint("odd", value, installed.GROUP)
-    monkeypatch.setitem(installed._POINTS, "odd", point)  # type: ignore[arg-type]
+    monkeypatch.setitem(installed._POINTS, "odd", point)
     with pytest.raises(EngineError, match=why):
         engine_type("odd")
 

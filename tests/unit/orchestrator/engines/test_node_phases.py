@@ -26,7 +26,7 @@ def test_a_node_that_does_not_run_says_why_and_one_that_runs_has_no_end() -> Non
             NodeStatus(phase)
     for fields in ({"cause": Cause.EXIT}, {"exit_code": 0}):
         with pytest.raises(ValueError, match="a node that is running has no cause and no exit code"):
-            NodeStatus(RUNNING, **fields)  # type: ignore[arg-type]
+            NodeStatus(RUNNING, **fields)
 
 
 def check_end(node: NodeStatus, cause: Cause | None, code: int | None, words: str) -> None:

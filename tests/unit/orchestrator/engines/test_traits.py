@@ -72,7 +72,7 @@ def test_an_engine_has_the_traits_of_its_type() -> None:
         from orchestrator.engines.docker.engine import DockerEngine
 
         made += [AwsBatchEngine, DockerEngine]
-    assert {each.name: each.traits for each in made} == {name: engine_type(name).traits for name in ENGINES}  # type: ignore[attr-defined]
+    assert {each.name: each.traits for each in made} == {name: engine_type(name).traits for name in ENGINES}
 
 
 def test_an_engine_that_is_not_installed_counts_as_one_that_can_do_nothing() -> None:
@@ -118,5 +118,5 @@ def test_a_user_is_refused_by_an_engine_that_can_t_take_one_on() -> None:
         (Traits(users=True), nullcontext()),
         (Traits(images=True), nullcontext()),
     ):
-        with served(traits) as several, outcome:  # type: ignore[attr-defined]
+        with served(traits) as several, outcome:
             several.plan(gang)

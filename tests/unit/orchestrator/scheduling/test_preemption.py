@@ -32,7 +32,7 @@ HIGH = [queue("high", 9), queue("mid", 5), queue("low", 1)]
 
 def cart(cpus: float = 4, queue: str = "low", name: str = "cart", host: str = "a", **facts: object) -> Running:
     """A gang that may be preempted."""
-    return running(name, on(host, cpus), queue=queue, **{"preemptible": True, **facts})  # type: ignore[arg-type]
+    return running(name, on(host, cpus), queue=queue, **{"preemptible": True, **facts})
 
 
 def test_a_job_of_a_higher_queue_preempts_also_for_the_cpus_that_may_be_used_and_keeps_what_comes_free() -> None:

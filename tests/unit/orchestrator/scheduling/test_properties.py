@@ -34,7 +34,7 @@ def shapes(draw: st.DrawFn) -> Shape:
 
 def begun(job: Waiting, compute_environment: str, placements: object, now: int, preemptible: bool = False) -> Running:
     return Running(
-        job.job, job.name, job.queue, job.share, job.priority, compute_environment, placements, now, job.timeout, preemptible, False  # type: ignore[arg-type]
+        job.job, job.name, job.queue, job.share, job.priority, compute_environment, placements, now, job.timeout, preemptible, False
     )  # fmt: skip
 
 
@@ -148,7 +148,7 @@ def test_jobs_that_pass_the_head_do_not_delay_it(
     running = [
         begun(by_id[start.job], start.compute_environment, start.placements, NOW - 1000 * age)
         for start, age in zip(first.starts, ages, strict=False)
-        if by_id[start.job].timeout is None or by_id[start.job].timeout > age  # type: ignore[operator]
+        if by_id[start.job].timeout is None or by_id[start.job].timeout > age
     ]
     snapshot = snapshot_of(hosts, waiting, running, NOW)
     decisions = decide(snapshot)

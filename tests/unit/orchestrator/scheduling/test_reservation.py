@@ -30,7 +30,7 @@ LARGE = job("large", 4)
 
 
 def cart(cpus: float = 1, **facts: object) -> Running:
-    return running("cart", on("a", cpus), **facts)  # type: ignore[arg-type]
+    return running("cart", on("a", cpus), **facts)
 
 
 def test_small_jobs_do_not_overtake_a_large_one_that_waits_for_room() -> None:
@@ -220,7 +220,7 @@ def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_a
         ({("default", "t"): 100.0}, [running("cart", queue="elsewhere", share="u")], 6),
     ],
 )
-def test_more_active_shares_reduce_the_reservation(usage, extra, free) -> None:  # type: ignore[no-untyped-def]
+def test_more_active_shares_reduce_the_reservation(usage, extra, free) -> None:
     waiting = line(*[job(f"j{i}", gang(node(0.1, 1)), share="s") for i in range(9)])
     assert len(Pass([host(cpus=8, gpus=8)], waiting, extra, [queue(policy=HALF)], usage=usage).starts) == free
 

@@ -251,7 +251,7 @@ def test_a_number_of_nodes_is_a_range_of_one_and_a_node_has_one_rank_a_gpu_and_a
 
 def test_the_known_tasks_are_the_installed_ones_and_a_user_s_is_named_by_module_and_class() -> None:
     document = {"name": "a", "train": {"task": "my_robot.tasks:Walker", "worlds": 1, "iterations": 1}}
-    assert validate(document, "s").train.task == "my_robot.tasks:Walker"  # type: ignore[union-attr]
+    assert validate(document, "s").train.task == "my_robot.tasks:Walker"
     assert known_tasks() == TASKS.split(", ")
 
 

@@ -93,7 +93,7 @@ def test_a_waypoint_that_the_car_has_reached_counts_as_the_one_behind() -> None:
 
 @pytest.mark.parametrize("direction", [COUNTER_CLOCKWISE, CLOCKWISE])
 def test_a_track_that_is_turned_round_is_the_track_driven_backwards(direction: str) -> None:
-    track = make_preset("chicane", direction=direction)  # type: ignore[arg-type]
+    track = make_preset("chicane", direction=direction)
     turned = track.turned_round()
     assert {track.direction, turned.direction} == {COUNTER_CLOCKWISE, CLOCKWISE}
     draws = np.random.default_rng(3)

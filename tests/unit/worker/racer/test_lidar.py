@@ -21,7 +21,7 @@ FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 0, -30)]
 
 def seen(task: Racer) -> np.ndarray:
     columns = [number for number, name in enumerate(task.observation_names) if name.startswith("lidar")]
-    assert columns == list(range(columns[0], columns[0] + task.lidar.size))  # type: ignore[union-attr]
+    assert columns == list(range(columns[0], columns[0] + task.lidar.size))
     return task.observations[:, columns].numpy()
 
 

@@ -46,7 +46,7 @@ class Driver:
 def drive(gain: float = 1.0, learns: bool = False, **section: Any) -> tuple[Racer, Episodes, Race]:
     """The race that a job with this ``race`` section is, of a driver that goes as told."""
     changes = race_changes({"track": "oval", **section})
-    task = Racer(configured(RacerConfig, {"track": "chicane", **changes}), section.get("trials", 3), seed=5)  # type: ignore[arg-type]
+    task = Racer(configured(RacerConfig, {"track": "chicane", **changes}), section.get("trials", 3), seed=5)
     laps = Laps(task)
     played = play([task], Driver(task, gain, learns), alone(), look=laps.note)
     return task, played, laps.race(played, rules_of(section), 5)
@@ -149,10 +149,10 @@ def test_a_choice_is_identified_by_its_number(tmp_path: Path) -> None:
     choices = [{"steering_angle": 0, "speed": 0.6}, {"steering_angle": 0, "speed": 1.0}]
     space = {"action_space": choices, "action_space_type": "discrete"}
     config = configured(RacerConfig, {"action_space": space, **race_changes({"seconds": 1.0})})
-    task = Racer(config, 1, seed=5)  # type: ignore[arg-type]
+    task = Racer(config, 1, seed=5)
     laps = Laps(task)
     driver = Driver(task)
-    driver.act = lambda observations: torch.ones(1, 1)  # type: ignore[method-assign]
+    driver.act = lambda observations: torch.ones(1, 1)
     race = laps.race(play([task], driver, alone(), look=laps.note), rules_of({}), 5)
     first = dict(zip(SIM_TRACE_COLUMNS, list(race.trials[0].sim_trace(0))[2].split(","), strict=True))
     last = list(race.trials[0].sim_trace(0))[-1].split(",")

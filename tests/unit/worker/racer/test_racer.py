@@ -259,7 +259,7 @@ def test_a_camera_sees_grass_asphalt_border_and_boxes_and_every_world_its_own() 
     assert (images[0] != images[3]).any()  # 5 % of the track farther each
 
     different = {"light": (0.5, 1.0), "colors": 0.2, "camera_angle": 0.05}
-    drawn = RacerPixels(RacerPixelsConfig(**fields, start="line", randomize=different), 4, seed=1)  # type: ignore[arg-type]
+    drawn = RacerPixels(RacerPixelsConfig(**fields, start="line", randomize=different), 4, seed=1)
     assert len({bytes(image.numpy()) for image in drawn.observations}) == 4
     plain.step(straight(plain))
     assert (plain.observations.permute(0, 2, 3, 1).int() != images).any()

@@ -175,7 +175,7 @@ def test_without_resets_a_mishap_ends_the_episode_and_is_counted_once() -> None:
 def test_the_camera_of_a_car_that_was_put_back_sees_from_there() -> None:
     front = FrontCameraConfig(width=32, height=24)
     fields = {"track": "oval", "start": "line", "start_turned": (0.5, 0.5), "speed_factor": (1e-4, 1e-4)}
-    task = RacerPixels(RacerPixelsConfig(continuous=True, front=front, **fields), 1, seed=3)  # type: ignore[arg-type]
+    task = RacerPixels(RacerPixelsConfig(continuous=True, front=front, **fields), 1, seed=3)
     images = []
     for _ in range(16):  # it stands, and turned to the left, until it is put back in the 15th step
         task.step(straight(task))

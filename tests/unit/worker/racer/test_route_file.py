@@ -56,7 +56,7 @@ def test_a_repeated_waypoint_is_left_out_and_reported() -> None:
 
 @pytest.mark.parametrize("direction", ["clockwise", "counter-clockwise"])
 def test_swapped_borders_are_taken_the_right_way_whatever_the_direction(direction: str) -> None:
-    track = make_preset("oval", direction=direction)  # type: ignore[arg-type]
+    track = make_preset("oval", direction=direction)
     found = from_bytes(saved(track.rows()[:, [0, 1, 4, 5, 2, 3]]), "oval")
     assert found.track.digest == track.digest
     assert found.notes == (
