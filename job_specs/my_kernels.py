@@ -55,7 +55,7 @@ def observe(mode: int, max_age: int, parameters: Parameters, worlds: WorldArrays
 
 
 @wp.func
-def write(observations: wp.array2d(dtype=wp.float32), worlds: WorldArrays, world: int):
+def write(observations: wp.array2d[wp.float32], worlds: WorldArrays, world: int):
     observations[world, 0] = wp.cos(worlds.joint_q[world, 0])
     observations[world, 1] = wp.sin(worlds.joint_q[world, 0])
     observations[world, 2] = 0.1 * worlds.joint_qd[world, 0]

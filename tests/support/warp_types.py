@@ -16,13 +16,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 from mypy import nodes, types
-from mypy.plugin import AnalyzeTypeContext, AttributeContext, FunctionContext, Plugin
+from mypy.plugin import AnalyzeTypeContext, AttributeContext, FunctionContext, Plugin, ReportConfigContext
 from mypy.types_utils import remove_optional
 
 MADE = {"func": "Function", "func_native": "Function", "kernel": "Kernel"}
 """Class of what each decorator makes."""
+KERNEL = re.compile(rb"@\w+\.(func|func_native|kernel)\b")
 ARRAY = "warp._src.types.array"
 COPIED = re.compile(r"warp\.((vec[234]|mat(22|33|44)|quat|transform)f)")
 FILLED = ("newton._src.sim.model.Model.", "newton._src.sim.state.State.")
@@ -34,6 +36,11 @@ class WarpTypes(Plugin):
         if not file.fullname.startswith("warp."):
             _declare(file.defs)
         return []
+
+    def report_config_data(self, ctx: ReportConfigContext) -> bool | None:
+        """Never the same for a module with kernels: mypy may parse a cached module again without the method above."""
+        own = ctx.path.endswith(".py") and "site-packages" not in ctx.path
+        return ctx.is_check if own and KERNEL.search(Path(ctx.path).read_bytes()) else None
 
     def get_type_analyze_hook(self, fullname: str) -> Callable[[AnalyzeTypeContext], types.Type] | None:
         if copied := COPIED.fullmatch(fullname):

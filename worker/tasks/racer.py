@@ -308,10 +308,13 @@ def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
         return Choice(racing.choose, names=space.names, targets=targets)
     low, high = (math.radians(end) for end in space.steering)
     slow, fast = space.speed
-    turning, driving = ((high - low) / 2, (high + low) / 2), ((fast - slow) / 2, (fast + slow) / 2)
     return {
-        "steering": Action(terms.position_target, joints="steering", scale=turning[0], offset=turning[1], unit="rad"),
-        "speed": Action(terms.velocity_target, joints="speed", scale=driving[0], offset=driving[1], unit="m/s"),
+        "steering": Action(
+            terms.position_target, joints="steering", scale=(high - low) / 2, offset=(high + low) / 2, unit="rad"
+        ),
+        "speed": Action(
+            terms.velocity_target, joints="speed", scale=(fast - slow) / 2, offset=(fast + slow) / 2, unit="m/s"
+        ),
     }
 
 

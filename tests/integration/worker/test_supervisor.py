@@ -101,6 +101,7 @@ def test_the_exit_code_is_the_ranks_even_if_nothing_can_be_written(node: Nodes) 
     assert n.stderr.read_text() == "outcome of node 0 can't be written: Not a directory\n"
     n.stderr.unlink()
     n.stderr.symlink_to("/dev/full")
+    shutil.rmtree(n.run.log("job", 1, 0).parent)
     with full_volume(n.run.log("job", 1, 0).parent):
         assert n.python("print('x')\nraise SystemExit(5)") == 5
 

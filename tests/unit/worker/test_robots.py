@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import UserDict
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ import warp as wp
 from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from worker.errors import UserError
 from worker.learning.job import user_errors
+from worker.simulation.patterns import resolve
 
 MJCF = """<mujoco><worldbody><body pos="0 0 1">
   <joint name="hinge" type="hinge" axis="0 1 0"/>
@@ -84,3 +86,8 @@ def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[s
     with pytest.raises(ValueError, match=r"task Robot: solver_options: ") as error:
         robot(mjcf('<motor joint="hinge"/>'), **options)(PendulumConfig(), 2)
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_values_by_pattern_may_come_in_any_mapping() -> None:
+    values = UserDict({"left_*": 1.0, "*": 2.0})
+    assert resolve(["left_knee", "right_knee"], values, "joint") == [1.0, 2.0]
