@@ -50,7 +50,7 @@ def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where it is ignored, the exit codes of processes are lost
     log_visibly()
     try:
-        sys.exit(app(standalone_mode=False) or 0)
+        sys.exit(app(prog_name="muster", standalone_mode=False) or 0)
     except Misuse as error:
         if words := told(error, [entry.name for entry in ENTRIES]):
             echo(f"muster: {one_line(words)}", err=True)

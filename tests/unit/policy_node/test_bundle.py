@@ -180,7 +180,9 @@ def test_wrong_use_is_one_line(bundle: Path, tmp_path: Path, said: str, capsys: 
 
 UNFIT = {
     "": "BUNDLE is missing; see: muster-policy --help",
-    "x --strct-limits": "--strct-limits: there is no such option; did you mean --strict-limits? see: muster-policy --help",
+    "x --strct-limits": (
+        "--strct-limits: there is no such option; did you mean --strict-limits? see: muster-policy --help"
+    ),
     "x y": "y: more arguments than the command takes; see: muster-policy --help",
     "x --domain ten": "--domain: expected a whole number, found ten; see: muster-policy --help",
     "x --rate": "--rate: expected one argument; see: muster-policy --help",

@@ -116,7 +116,7 @@ def test_draining_one_rank_finds_its_lines_behind_any_amount_of_another_rank_s(r
 
 @settings(max_examples=40)
 @given(
-    st.lists(st.tuples(st.integers(0, 2), st.text(max_size=20)), max_size=12), st.lists(st.integers(1, 60), min_size=1)
+    st.lists(st.tuples(st.integers(0, 2), st.text(max_size=20)), max_size=8), st.lists(st.integers(1, 60), min_size=1)
 )
 def test_however_the_writes_are_cut_every_line_is_read_once_and_in_order(
     written: list[tuple[int, str]], cuts: list[int]

@@ -15,7 +15,9 @@ MISUSE = {
     "evalute": "evalute: there is no such command; did you mean evaluate?",
     "zzz": "zzz: there is no such command; see: muster --help",
     "--verison": "--verison: there is no such option; did you mean --version? see: muster --help",
-    "evaluate x --episods 5": "--episods: there is no such option; did you mean --episodes? see: muster evaluate --help",
+    "evaluate x --episods 5": (
+        "--episods: there is no such option; did you mean --episodes? see: muster evaluate --help"
+    ),
     "list -z": "-z: there is no such option; see: muster list --help",
     "models lst": "lst: there is no such command; did you mean list?",
     "models qqq": "qqq: there is no such command; see: muster models --help",
@@ -26,7 +28,9 @@ MISUSE = {
     "queues a b": "b: more arguments than the command takes; see: muster queues --help",
     "evaluate x --episodes ten": "--episodes: expected a whole number, found ten; see: muster evaluate --help",
     "run x --cpus many": "--cpus: expected a number, found many; see: muster run --help",
-    "serve --port 70000": "--port: expected a value less than or equal to 65535, found '70000'; see: muster serve --help",
+    "serve --port 70000": (
+        "--port: expected a value less than or equal to 65535, found '70000'; see: muster serve --help"
+    ),
     "serve --port": "--port needs a value; see: muster serve --help",
     "list --json=5": "--json takes no value; see: muster list --help",
 }

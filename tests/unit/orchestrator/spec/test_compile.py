@@ -137,6 +137,7 @@ def test_of_nested_ranges_the_inner_one_counts_of_equal_ones_the_later_and_each_
         assert commands == [("outer",), ("inner",), ("x",), ("outer",)]
     ranges = [("0:", container(command=["first"])), ("0:3", container(command=["second"]))]
     assert {node.command for node in gang_needs(properties(*ranges)).nodes} == {("second",)}
+    assert len(gang_needs(properties(("0:9", container()), count=2)).nodes) == 2, "a range may exceed the nodes"
     with pytest.raises(ValueError, match="cover no node 2; every node from 0 to 3 needs a range"):
         gang_needs(properties(("0:1", container()), ("3", container())))
 

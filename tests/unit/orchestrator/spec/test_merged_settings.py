@@ -15,14 +15,18 @@ from orchestrator.spec.file import load
 WRONG = {
     "Ant ppo learning_rate_limits: [0.1, 0.001]": "learning_rate_limits: expected the least, then the greatest",
     "Ant ppo weight_decay: 0.1": "weight_decay: adam has none; set optimizer: adamw",
-    "CartpolePixels ppo channels: [8, 8]": "channels, kernel_sizes and strides: give one number of each for every convolution",
+    "CartpolePixels ppo channels: [8, 8]": (
+        "channels, kernel_sizes and strides: give one number of each for every convolution"
+    ),
     "Ant sac updates: 3": "updates: expected a multiple of policy_delay (2), got 3",
     # the task's own 8 updates
     "Cartpole sac policy_delay: 3": "updates: expected a multiple of policy_delay (3), got 8",
     "Cartpole sac v_min: 9.0": "v_min: expected less than v_max (5), got 9",
     "CartpolePixels sac updates: 8": "it can't learn from images, and observation group 'policy' is one; use ppo",
     "Ant sac critic_group: critics": "critic_group: there is no observation group 'critics'; there are policy, critic",
-    "Ant rsl_rl obs_groups: {critic: [critics]}": "obs_groups: critic: there is no observation group 'critics'; there are policy, critic",
+    "Ant rsl_rl obs_groups: {critic: [critics]}": (
+        "obs_groups: critic: there is no observation group 'critics'; there are policy, critic"
+    ),
     "Ant rsl_rl algorithm: {class_name: Distillation}": "teacher_checkpoint: name the run that trained the teacher",
     "Ant rsl_rl teacher_checkpoint: taught@3": "teacher_checkpoint: PPO has no teacher; leave it out",
 }

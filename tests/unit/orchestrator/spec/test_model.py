@@ -79,8 +79,12 @@ LINES = {
     "on_child_failure: resart": "on_child_failure: expected 'restart', 'fail' or 'ignore', found 'resart'",
     "checkpoint: {keep: 1}": "checkpoint.keep: expected a value greater than or equal to 2, found 1",
     "environment: [a]": "environment: expected a mapping, found a list",
-    "environment: {MUSTER_X: a}": "environment: MUSTER_X is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster",
-    "environment: {a=b: a}": "environment: 'a=b' can't be set: a name has no '=', and neither name nor value a zero byte",
+    "environment: {MUSTER_X: a}": (
+        "environment: MUSTER_X is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
+    ),
+    "environment: {a=b: a}": (
+        "environment: 'a=b' can't be set: a name has no '=', and neither name nor value a zero byte"
+    ),
 }
 """Of a third line: what is said of it."""
 PPO = {
@@ -99,7 +103,9 @@ FILES: dict[str, str] = {
     f"name: a\n{TRAIN}\nxyzzyq: 2\n": f":3: xyzzyq: unknown key; valid here: {TOP}",
     "nme: a\ncommand: [x]\n": ":1: nme: unknown key; did you mean name? (and 1 more)",
     f"name: a\n{TRAIN}\nnodez: 2\nretyr: 2\n": ":3: nodez: unknown key; did you mean nodes? (and 1 more)",
-    "name: a\ntrain:\n  task: Cartpole\n  worlds: 4\n  iteration: 2\n": ":5: train.iteration: unknown key; did you mean iterations? (and 1 more)",
+    "name: a\ntrain:\n  task: Cartpole\n  worlds: 4\n  iteration: 2\n": (
+        ":5: train.iteration: unknown key; did you mean iterations? (and 1 more)"
+    ),
     "name: a\ncommand: [x]\nresources:\n  gpu: 1\n": ":4: resources.gpu: unknown key; did you mean gpus?",
     "name: a\nevaluate: {run: x, checkpont: 3}\n": ":2: evaluate.checkpont: unknown key; did you mean checkpoint?",
     "": f": {MAPPING} nothing",
@@ -111,10 +117,15 @@ FILES: dict[str, str] = {
     "name: a\ncommand: [x]\ntrain: {task: Ant}\n": f": {ONE_OF} train and command",
     "name: a\ntrain: {worlds: 4, iterations: 2}\n": ":2: train.task: is required",
     "name: a\nevaluate: {}\n": ":2: evaluate.run: is required",
-    "name: a\nrace: {laps: 3}\n": ":2: race.laps: unknown key; valid here: run, checkpoint, trials, continuous, off_track_penalty, crash_penalty, max_resets, seconds, track, seed, config, keep (and 1 more)",
+    "name: a\nrace: {laps: 3}\n": (
+        ":2: race.laps: unknown key; valid here: run, checkpoint, trials, continuous, off_track_penalty, "
+        "crash_penalty, max_resets, seconds, track, seed, config, keep (and 1 more)"
+    ),
     "name: a\nrace: {run: x, trials: 101}\n": ":2: race.trials: expected a value less than or equal to 100, found 101",
     "name: a\nnodes: 2\nrace: {run: x}\n": ": race: it runs on one node with at most one GPU",
-    "name: a\ncommand: [x]\nresources:\n  gpus: 1\n  memory: 4 gigs\n": ":5: resources.memory: expected an amount of memory such as 512MiB or 4GiB, found '4 gigs'",
+    "name: a\ncommand: [x]\nresources:\n  gpus: 1\n  memory: 4 gigs\n": (
+        ":5: resources.memory: expected an amount of memory such as 512MiB or 4GiB, found '4 gigs'"
+    ),
     "name: a b\ncommand: [x]\n": f":1: name: {LETTERS}, found 'a b'",
     f"name: {'a' * 101}\ncommand: [x]\n": f":1: name: {LETTERS}, found '{'a' * 56}…",
     "name: 7\ncommand: [x]\n": ":1: name: expected a text, found a whole number (7)",
@@ -124,21 +135,32 @@ FILES: dict[str, str] = {
     'name: a\ncommand: [x, "a\\0b"]\n': ":2: command.1: expected a text without a zero byte, found 'a\\x00b'",
     "name: a\ncommand: [x]\nenvironment:\n  A: 1\n": ":4: environment.A: expected a text, found a whole number (1)",
     "name: a\ntrain: Cartpole\n": ":2: train: expected a mapping, found a text ('Cartpole')",
-    "name: a\ntrain: {task: Cartpoel, worlds: 4, iterations: 2}\n": ":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class)",
-    "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": f":2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class)",
+    "name: a\ntrain: {task: Cartpoel, worlds: 4, iterations: 2}\n": (
+        ":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class)"
+    ),
+    "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": (
+        f":2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class)"
+    ),
     "name: a\nevaluate: {run: ../x}\n": f":2: evaluate.run: {RUN_LETTERS}, found '../x'",
-    "name: a\nexport: {run: x, checkpoint: new}\n": ":2: export.checkpoint: expected an iteration, best or latest, found 'new'",
+    "name: a\nexport: {run: x, checkpoint: new}\n": (
+        ":2: export.checkpoint: expected an iteration, best or latest, found 'new'"
+    ),
 }
 """Of whole files."""
 NOT_YAML: dict[str | bytes, str] = {
     "name: a\nname: b\n": ":2: name: given twice, first on line 1",
-    f"name: a\n{TRAIN}\nresources:\n  memory: 4GiB\n  memory: 5GiB\n": ":5: resources.memory: given twice, first on line 4",
+    f"name: a\n{TRAIN}\nresources:\n  memory: 4GiB\n  memory: 5GiB\n": (
+        ":5: resources.memory: given twice, first on line 4"
+    ),
     "name: [a\n": ":2: not valid YAML: expected ',' or ']', but got '<stream end>'",
     "name: a\n\tb: c\n": ":2: not valid YAML: found character '\\t' that cannot start any token",
     "name: *x\n": ":1: not valid YAML: found undefined alias 'x'",
     "? [a]\n: b\n": ":1: not valid YAML: found unhashable key",
     "name: a\n---\nname: b\n": ":2: not valid YAML: but found another document",
-    "name: !!python/object/apply:os.getcwd []\n": ":1: not valid YAML: could not determine a constructor for the tag 'tag:yaml.org,2002:python/object/apply:os.getcwd'",
+    "name: !!python/object/apply:os.getcwd []\n": (
+        ":1: not valid YAML: could not determine a constructor for the tag "
+        "'tag:yaml.org,2002:python/object/apply:os.getcwd'"
+    ),
     "name: \x01\n": ": not valid YAML: unacceptable character #x0001: special characters are not allowed",
     "a: &x {b: *x}\n": ":1: not valid YAML: an alias stands inside of what it stands for",
     b"name: \xff\n": ": not a text file (UTF-8)",

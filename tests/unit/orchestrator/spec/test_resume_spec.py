@@ -90,9 +90,10 @@ record: {run: ant, checkpoint: 3, worlds: 3, episodes: 3, seed: 3}
 render: {run: ant, checkpoint: 3, format: png, worlds: 3, seconds: 2.5, width: 128, height: 128}
 checkpoint: {every: auto, keep: 3}
 evaluation:
-  {every: 3, episodes: 7, worlds: 7, queue: idle, share: mine, resources: {cpus: 2.5, gpus: 1, memory: 2048}, retry: {attempts: 2}}
+  {every: 3, episodes: 7, worlds: 7, queue: idle, share: mine, resources: {cpus: 2.5, gpus: 1, memory: 2048},
+   retry: {attempts: 2}}
 """)
-"""Other values of keys that the rank reads in the spec as they are given; tests of the worker show what it does with them."""
+"""Other values of keys that the rank reads in the spec; tests of the worker show what it does with them."""
 REFUSED = {
     "train.task": "Cartpole",
     "train.seed": "7",

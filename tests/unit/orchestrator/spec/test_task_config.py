@@ -55,12 +55,18 @@ WRONG = {
     "Ant curriculum: {forward: 3}": "curriculum.forward: expected points [iteration, value], found 3",
     "Ant curriculum: {forward: []}": "curriculum.forward: expected points [iteration, value], found []",
     "Ant curriculum: {level: [[0, 2]]}": "curriculum.level: expected levels from 0 to 1, found [[0, 2]]",
-    "Ant curriculum: {up: [[5, 1], [2, 1]]}": "curriculum.up: the iterations of its points must grow, found [[5, 1], [2, 1]]",
+    "Ant curriculum: {up: [[5, 1], [2, 1]]}": (
+        "curriculum.up: the iterations of its points must grow, found [[5, 1], [2, 1]]"
+    ),
     # several fields together
     "Ant randomize: {push_interval: 2}": "randomize: push_interval and push_velocity: give both, or none",
     "Ant randomize: {colors: 0.1}": "randomize.colors: AntConfig has no camera that would see it",
-    "CartpolePixels randomize: {observation_noise: 0.1}": "randomize.observation_noise: it is for numbers, not for images; use light and colors",
-    "CartpolePixels camera: {target: [0, -3.2, 1.4]}": "camera.target: the camera stands there, at [0.0, -3.2, 1.4]; choose another point",
+    "CartpolePixels randomize: {observation_noise: 0.1}": (
+        "randomize.observation_noise: it is for numbers, not for images; use light and colors"
+    ),
+    "CartpolePixels camera: {target: [0, -3.2, 1.4]}": (
+        "camera.target: the camera stands there, at [0.0, -3.2, 1.4]; choose another point"
+    ),
     # how it is trained
     "Ant ppo: {steps: 8}": "ppo: not a key of AntConfig; settings of ppo stand under train.ppo",
     "Ant sac: {steps: 8}": "sac: not a key of AntConfig; settings of sac stand under train.sac",

@@ -42,7 +42,8 @@ def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, k
     assert again == found  # as a run that is resumed reads it
 
 
-URI = "track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD as secrets"
+URI = "track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and "
+URI += "MLFLOW_TRACKING_PASSWORD as secrets"
 STORED = "the key would be stored in the run; remove it, and give it as a secret: secrets"
 WRONG = {
     "track: wandv": "track: no service is called 'wandv'; did you mean wandb?",
@@ -56,8 +57,12 @@ WRONG = {
         f"environment.MLFLOW_TRACKING_URI: {STORED}: {{MLFLOW_TRACKING_URI: NAME}}"
     ),
     "{track: wandb, environment: {WANDB_API_KEY: x}}": f"environment.WANDB_API_KEY: {STORED}: {{WANDB_API_KEY: NAME}}",
-    "{track: wandb, train: null, evaluate: {run: x}}": "track: only a training has metrics to track; this job has evaluate",
-    "secrets: {MUSTER_TOKEN: x}": "secrets: MUSTER_TOKEN is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster",
+    "{track: wandb, train: null, evaluate: {run: x}}": (
+        "track: only a training has metrics to track; this job has evaluate"
+    ),
+    "secrets: {MUSTER_TOKEN: x}": (
+        "secrets: MUSTER_TOKEN is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
+    ),
     "secrets: {KEY: ''}": "secrets: 'KEY': expected the name under which the controller has the value",
     "{secrets: {KEY: x}, environment: {KEY: y}}": "secrets: KEY is in environment, too; give it once",
     "secrets: {KEY: 3}": "secrets.KEY: expected a text, found a whole number (3)",
