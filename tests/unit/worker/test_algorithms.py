@@ -79,9 +79,8 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
         check_state(WithoutPolicy(), "own:A")
     with pytest.raises(UserError, match=r"own:A: its config_type must be a dataclass, not dict$"):
         settings(WithoutPolicy, "own:A", PointConfig(), {})
-    with pytest.raises(
-        UserError, match=r"act\(\) must give a tensor of shape \(4, 2\) \(worlds, actions\); it gave \(4,\)$"
-    ):
+    shape = r"act\(\) must give a tensor of shape \(4, 2\) \(worlds, actions\); it gave \(4,\)$"
+    with pytest.raises(UserError, match=shape):
         check_actions(torch.zeros(4), torch.Size((4, 2)), "own:A")
     check_actions(torch.zeros(4, 2), torch.Size((4, 2)), "own:A")
     for metrics, said in (

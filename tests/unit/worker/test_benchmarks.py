@@ -78,13 +78,8 @@ def test_the_racers_table_tells_when_a_car_first_drove_a_lap_and_how_fast_it_is_
     last = {**at, "seconds": 7.0, "share": 0.75, "lap_times": {"oval": [9.0, 10.0], "chicane": [20.0]}}
     row = {
         **{"task": "Racer", "cuda": False, "cores": 2, "worlds": 128, "wanted": 0.5, "judged_worlds": 4},
-        **{
-            "training_rate": 1000.0,
-            "simulation_rate": 150_000.0,
-            "curve": curve,
-            "judged": [early, last],
-            "done": early,
-        },
+        **{"training_rate": 1000.0, "simulation_rate": 150_000.0, "curve": curve, "judged": [early, last]},
+        "done": early,
     }
     said = racer.table([row])
     assert "| 128 | 2.0 s (3 s of processors), 0.40 M steps | 2.0 s (3 s" in said

@@ -62,9 +62,7 @@ def test_one_bit_of_one_element_is_found(store: Path, name: str, capsys: pytest.
     path = list_checkpoints(run(store, "twin"))[-1].path / name
     content = torch.load(path, weights_only=True)
     tensors = {key: value for key, value in bitwise_diff._flatten(content) if isinstance(value, torch.Tensor)}
-    key, victim = next(
-        (key, tensor) for key, tensor in tensors.items() if tensor.dtype == torch.float32 and tensor.dim()
-    )
+    key, victim = next(pair for pair in tensors.items() if pair[1].dtype == torch.float32 and pair[1].dim())
     victim.view(torch.int32).view(-1)[-1] ^= 1
     torch.save(content, path)
     with pytest.MonkeyPatch.context() as patch:

@@ -117,9 +117,8 @@ def test_a_terrain_that_no_machine_can_hold() -> None:
         def terrain(self, config: SlidersConfig) -> Terrain:
             return Terrain(resolution=self.resolution)
 
-    with pytest.raises(
-        ValueError, match=r"^task Fine: the terrain's 10 x 7 patches at 0.0005 m have .* use a resolution"
-    ):
+    there = r"^task Fine: the terrain's 10 x 7 patches at 0.0005 m have .* use a resolution"
+    with pytest.raises(ValueError, match=there):
         Fine.sketch(SlidersConfig())
     Fine.resolution = 0.1
     assert isinstance(Fine.sketch(SlidersConfig()).ground_terrain, Terrain)
@@ -184,7 +183,7 @@ def test_the_points_of_a_scan_are_the_declarations_alone() -> None:
     ],
 )
 def test_robots_that_can_not_be_placed_or_called(make: Callable[[], Robot], message: str) -> None:
-    assert refused(make) == message
+    assert refusal(make) == message
 
 
 @pytest.mark.parametrize("name", ["bytes.xml", "bytes.urdf"])
@@ -201,5 +200,7 @@ def test_a_robots_file_that_is_not_text_is_named(tmp_path: Path, name: str) -> N
 
 def test_a_task_of_kernels_has_no_numbers_for_a_curriculum() -> None:
     config = PendulumConfig(curriculum={"events.push.speed": ((0, 1.0),)})
-    with pytest.raises(ValueError, match=r"^task PendulumByHand: curriculum: it has no number events.push.speed; decl"):
+    with pytest.raises(
+        ValueError, match=r"^task PendulumByHand: curriculum: it has no number events.push.speed; declared"
+    ):
         PendulumByHand(config, 1)

@@ -82,9 +82,8 @@ def test_each_episode_has_its_return_length_terms_cause_and_success(task: Cartpo
     assert set(played.ends) == {"time_out", "dropped_pole"}, "the starts are chosen so that both happen"
     assert played.successes is not None and played.successes.tolist() == [row["time_out"] for row in expected]
     # 0.1 for each step that did not end by a termination; -2 for one that did
-    assert played.term("reward_alive").tolist() == pytest.approx(
-        [0.1 * (row["length"] - (not row["time_out"])) for row in expected], abs=1e-5
-    )
+    alive = [0.1 * (row["length"] - (not row["time_out"])) for row in expected]
+    assert played.term("reward_alive").tolist() == pytest.approx(alive, abs=1e-5)
     assert played.term("reward_fall").tolist() == [0.0 if row["time_out"] else -2.0 for row in expected]
     terms = sum(played.term(name) for name in played.terms)
     assert torch.allclose(terms, played.returns, atol=1e-5), "the weighted terms of a return make it"

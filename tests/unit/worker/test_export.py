@@ -173,9 +173,8 @@ def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
             return torch.sign(observations["policy"][:, :1])
 
     monkeypatch.setattr(bundle, "OnnxPolicy", Away)
-    with pytest.raises(
-        TrainingError, match=r"^the bundle does not do what the trained policy does: its mean return over 128"
-    ):
+    there = "^the bundle does not do what the trained policy does: its mean return over 128"
+    with pytest.raises(TrainingError, match=there):
         exported(run, recurrent, GroupedPoint(world_count=128))
     assert {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()} == stands
     assert [path.name for path in run.exports.iterdir()] == ["00000004-e1"]

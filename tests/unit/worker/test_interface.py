@@ -116,9 +116,8 @@ def test_an_interface_of_other_numbers_than_the_task_s_is_refused() -> None:
             own = super().interface()
             return Interface(own.observations[::-1], own.actions)
 
-    with pytest.raises(
-        ValueError, match=r"task Careless: interface\(\) has other observations than the task, or in an"
-    ):
+    there = r"task Careless: interface\(\) has other observations than the task, or in an"
+    with pytest.raises(ValueError, match=there):
         Careless(CartpoleConfig(), 1)
 
 

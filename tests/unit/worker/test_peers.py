@@ -179,7 +179,7 @@ def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
         (CONTRACT, interface(scale=0.4), r"joint knee: its scale is 0\.5 in mjlab and 0\.4 in task Own"),
         (CONTRACT, interface(offset=0.0), r"joint knee: its offset is -0\.2 in mjlab and 0 in task Own"),
         (wider, interface(), "mjlab's policy sees 13 values, task Own has 12"),
-        (CONTRACT | {"observations": turned}, interface(), "mjlab sees joint_pos at 0 to 1, where task Own has veloc"),
+        (CONTRACT | {"observations": turned}, interface(), "sees joint_pos at 0 to 1, where task Own has velocity_x"),
     ):
         with pytest.raises(ValueError, match=words):
             conversion.check_contract(contract, own, "Own")

@@ -251,7 +251,6 @@ def test_the_kind_of_an_action_is_what_its_function_writes() -> None:
 
 
 def test_an_action_of_ones_own_for_actuators_that_take_different_things_is_refused() -> None:
-    with pytest.raises(
-        ValueError, match="the actuators of its joints take a position and a velocity; declare an action for each"
-    ):
+    there = "the actuators of its joints take a position and a velocity; declare an action for each"
+    with pytest.raises(ValueError, match=there):
         driven_by(press, PositionActuator("first", 20.0, 0.5), VelocityActuator("second", 0.5))

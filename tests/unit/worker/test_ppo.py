@@ -71,9 +71,8 @@ def test_gae_by_hand() -> None:
     assert ppo.rollout.returns.flatten().tolist() == pytest.approx([1.9, 0.0, 5.6])
     # mean 0.5, squares of the offsets 0.16 + 6.25 + 4.41, over n − 1 = 2: deviation √5.41
     ppo._normalize()
-    assert ppo.rollout.advantages.flatten().tolist() == pytest.approx(
-        [0.4 / 5.41**0.5, -2.5 / 5.41**0.5, 2.1 / 5.41**0.5]
-    )
+    expected = [0.4 / 5.41**0.5, -2.5 / 5.41**0.5, 2.1 / 5.41**0.5]
+    assert ppo.rollout.advantages.flatten().tolist() == pytest.approx(expected)
 
 
 def test_a_time_out_bootstraps_from_the_observation_after_the_step() -> None:

@@ -51,9 +51,8 @@ def test_projection_against_a_loop(least: float, greatest: float, atoms: int) ->
     returns[:20] = least + span / (atoms - 1) * torch.randint(0, atoms, (20,))  # on an atom
     returns[60:80] = 0.0
     bonuses = 0.2 * torch.randn(samples)
-    found = kernels.project(
-        probabilities, returns, discounts, bonuses, least, greatest, torch.full((samples, atoms), float("nan"))
-    )
+    nothing = torch.full((samples, atoms), float("nan"))
+    found = kernels.project(probabilities, returns, discounts, bonuses, least, greatest, nothing)
     numbers = zip(probabilities, returns.tolist(), discounts.tolist(), bonuses.tolist(), strict=True)
     expected = torch.tensor([projection_by_loop(*each, least, greatest) for each in numbers])
     torch.testing.assert_close(found, expected, atol=2e-5, rtol=1e-4)
@@ -75,9 +74,8 @@ def test_projection_keeps_the_mean_and_passes_on_what_is_not_finite() -> None:
 def test_how_critics_are_combined(combine: Any) -> None:
     config = SACConfig(atoms=3, v_min=0.0, v_max=2.0, critics=2, combine=combine, critic_sizes=(4,))
     critics = Critics(config, 2, 1)
-    given = torch.tensor(
-        [[[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]], [[0.25, 0.25, 0.5], [0.0, 0.5, 0.5]]]
-    )  # means ¾ 2, 1¼ 1½
+    # means ¾ 2, 1¼ 1½
+    given = torch.tensor([[[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]], [[0.25, 0.25, 0.5], [0.0, 0.5, 0.5]]])
     outputs = given.clamp(min=1e-30).log()
     together = {"mean": [1.0, 1.75], "min": [0.75, 1.5]}[combine]
     torch.testing.assert_close(critics.combined_mean(outputs), torch.tensor(together))
@@ -159,13 +157,8 @@ def test_the_gradients_of_an_update_are_those_of_its_losses(atoms: int) -> None:
         target = batch.returns + batch.discounts * (after[..., 0].mean(0) - 0.3 * log_prob)
         critic_loss = sum((each[:, 0] - target.detach()).square().mean() for each in outputs)
     else:
-        rows = zip(
-            after.softmax(-1).mean(0).detach(),
-            batch.returns.tolist(),
-            batch.discounts.tolist(),
-            (-0.3 * log_prob).tolist(),
-            strict=True,
-        )
+        numbers = (batch.returns.tolist(), batch.discounts.tolist(), (-0.3 * log_prob).tolist())
+        rows = zip(after.softmax(-1).mean(0).detach(), *numbers, strict=True)
         target = torch.tensor([projection_by_loop(*row, -5.0, 15.0) for row in rows])
         critic_loss = sum(torch.nn.functional.cross_entropy(each, target) for each in outputs)
     expected = torch.autograd.grad(critic_loss, [*critics.parameters()])
@@ -174,9 +167,8 @@ def test_the_gradients_of_an_update_are_those_of_its_losses(atoms: int) -> None:
     chosen, log_prob = actor.sample(batch.before[:, :2], noise[1])
     value = critics.mean(critics(batch.before[:, :2], chosen)).mean(0)
     policy_loss = (0.3 * log_prob - value).mean()
-    torch.testing.assert_close(
-        found[1], [*torch.autograd.grad(policy_loss, [*actor.parameters()])], atol=1e-5, rtol=1e-3
-    )
+    expected = torch.autograd.grad(policy_loss, [*actor.parameters()])
+    torch.testing.assert_close(found[1], [*expected], atol=1e-5, rtol=1e-3)
     torch.testing.assert_close(temperature_gradient, (0.3 * (-log_prob + 0.5)).mean().detach())
     q_mean = critics.mean(outputs).mean()
     torch.testing.assert_close(losses, torch.stack((policy_loss, -log_prob.mean(), critic_loss, q_mean)).detach())
@@ -203,9 +195,8 @@ def test_only_critics_learn_between_the_updates_of_the_policy() -> None:
     learner.compute(batch_of(sac, 24), torch.randn(2, 24, 1), False)
     learner.apply(False)
     assert same(policy, learner.actor.state_dict())
-    assert learner.losses[:2].tolist() == [0.0, 0.0] and float(learner.temperature) == pytest.approx(
-        SMALL.init_temperature
-    )
+    assert learner.losses[:2].tolist() == [0.0, 0.0]
+    assert float(learner.temperature) == pytest.approx(SMALL.init_temperature)
     for name, now in learner.critics.state_dict().items():
         assert not torch.equal(now, critics[name])
         torch.testing.assert_close(learner.targets.state_dict()[name], targets[name] + 0.25 * (now - targets[name]))

@@ -35,9 +35,8 @@ def test_whole_numbers_and_lists_of_a_yaml_give_the_same_bits_as_floats_and_tupl
     written = configured(CartpolePixelsConfig, {"episode_seconds": 4, "camera": {"position": [0, -2, 1]}})
     camera = dataclasses.replace(CartpolePixelsConfig().camera, position=(0.0, -2.0, 1.0))
     assert bits(written) == bits(CartpolePixelsConfig(episode_seconds=4.0, camera=camera))
-    written = configured(
-        AntConfig, {"randomize": {"mass": [1, 2], "observation_noise": {"a": 1}}, "rewards": {"up": 2}}
-    )
+    changes = {"randomize": {"mass": [1, 2], "observation_noise": {"a": 1}}, "rewards": {"up": 2}}
+    written = configured(AntConfig, changes)
     randomize = Randomization(mass=(1.0, 2.0), observation_noise={"a": 1.0})
     assert bits(written) == bits(AntConfig(randomize=randomize, rewards={"up": 2.0}))
     assert configured(AntConfig, {}) == AntConfig()
@@ -72,12 +71,8 @@ def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
 
 def test_a_plain_dataclass_that_python_makes_is_checked_in_what_every_task_has() -> None:
     assert PendulumConfig(randomize={"mass": [1, 2]}).randomize == Randomization(mass=(1.0, 2.0))
-    for wrong in (
-        {"substeps": 0},
-        {"rewards": {"sped": 1.0}},
-        {"control_hz": "60"},
-        {"curriculum": {"level": [[0, 2]]}},
-    ):
+    curriculum = {"level": [[0, 2]]}
+    for wrong in ({"substeps": 0}, {"rewards": {"sped": 1.0}}, {"control_hz": "60"}, {"curriculum": curriculum}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             PendulumConfig(**wrong)
 

@@ -70,9 +70,8 @@ def test_a_smoothed_target_has_two_numbers_for_each_joint() -> None:
 
 def test_a_command_has_hidden_numbers_of_its_function() -> None:
     command = Command(terms.heading_velocity_command, **VELOCITIES, heading=(-3.0, 3.0))
-    plan = sliders(
-        commands={"v": command}, curricula={}, events={}, observations={"v": Observation(terms.command_number)}
-    ).sketch(SlidersConfig())
+    seen = {"v": Observation(terms.command_number)}
+    plan = sliders(commands={"v": command}, curricula={}, events={}, observations=seen).sketch(SlidersConfig())
     # three numbers, six hidden ones, the countdown; no term has further ones
     assert plan.memory_size == 3 + 6 + 1 and plan.plan.commands[0].countdown == 9
     assert plan.observation_names == ("v_0", "v_1", "v_2"), "all numbers of the command"
@@ -102,16 +101,14 @@ def test_a_term_is_called_for_each_column_of_its_sensors(tmp_path: Path) -> None
     assert task.declaration.sensors["stiff"].rows(task.views) == ["first"]
 
 
+KEPT = "swing_height_error keeps 2 numbers, and memory is 1; leave memory= out"
 SENSED = "points is 4, and the scan scan has 10 columns; give the number of its points for each frame"
 
 
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        (
-            Observation(terms.swing_height_error, height=0.1, memory=1),
-            "swing_height_error keeps 2 numbers, and memory is 1; leave memory= out",
-        ),
+        (Observation(terms.swing_height_error, height=0.1, memory=1), KEPT),
         (Observation(terms.frame_clearance, points=4), SENSED),
         (
             Observation(terms.frame_clearance, points=5, size=3),

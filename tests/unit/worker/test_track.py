@@ -120,13 +120,8 @@ def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(
         "import sys; from pathlib import Path; from shared_store.layout import Run; from worker.track import Turn; "
         "turn = Turn(Run(Path(sys.argv[1])), 'mlflow'); print(turn.take(), flush=True); sys.stdin.read()"
     )
-    other = subprocess.Popen(
-        [sys.executable, "-c", code, str(run.path)],
-        cwd=REPOSITORY,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    other = subprocess.Popen([sys.executable, "-c", code, str(run.path)], cwd=REPOSITORY, **pipes)
     try:
         assert other.stdout is not None and other.stdout.readline() == "None\n"
         holder = f"process {other.pid} on {socket.gethostname()}"
@@ -160,10 +155,8 @@ def test_an_unreachable_service_is_reported_in_one_line_and_everything_is_sent_l
     monkeypatch.setattr(track, "time", Later())
     assert sending.step(0, 1)
     assert [step for step, _ in service.sent["ant"]] == list(range(1, 701))
-    assert said[1:] == [
-        "warning: nothing can be sent now (no route to http://host/)",
-        "it answers again; everything is sent",
-    ]
+    warning = "warning: nothing can be sent now (no route to http://host/)"
+    assert said[1:] == [warning, "it answers again; everything is sent"]
 
 
 class Later:

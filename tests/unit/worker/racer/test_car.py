@@ -127,9 +127,8 @@ def test_places_and_distances_agree_with_the_tracks_geometry() -> None:
     other = along + random.uniform(-3, 3, count)
     places, moved = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=wp.float32)
     inputs = [wp.array(which, dtype=wp.int32), *(wp.array(each, dtype=wp.float32) for each in (along, other))]
-    wp.launch(
-        _place, dim=count, inputs=[arrays(), *inputs, wp.array(backwards, dtype=wp.bool)], outputs=[places, moved]
-    )
+    inputs = [arrays(), *inputs, wp.array(backwards, dtype=wp.bool)]
+    wp.launch(_place, dim=count, inputs=inputs, outputs=[places, moved])
     for number, track in enumerate(TRACKS):
         mine = which == number
         points, headings = place_at(track, along[mine], backwards[mine])
@@ -194,9 +193,8 @@ def test_rectangles_touch_exactly_where_they_overlap() -> None:
     # beside it by a hair; a hair too far; corner to corner, turned; a turned corner that reaches; far
     second = np.array([[0.339, 0, 0], [0.341, 0, 0], [0.33, 0.24, 0], [0.3, 0, 0], [3, 0, 1]], np.float32)
     found = wp.zeros(5, dtype=wp.bool)
-    wp.launch(
-        _overlap, dim=5, inputs=[wp.array(first, dtype=wp.vec3), wp.array(second, dtype=wp.vec3)], outputs=[found]
-    )
+    inputs = [wp.array(each, dtype=wp.vec3) for each in (first, second)]
+    wp.launch(_overlap, dim=5, inputs=inputs, outputs=[found])
     assert list(found.numpy()) == [True, False, False, True, False]
 
 

@@ -17,9 +17,8 @@ def square(side: float = 4.0, width: float = 1.0) -> Track:
     """A square with its start line at the origin: along the x axis, up, back and down, a waypoint every 0.5 m, counter-clockwise."""
     edge = np.arange(0, side, 0.5)
     none, whole = np.zeros_like(edge), np.full_like(edge, side)
-    center = np.vstack(
-        [np.stack(each, -1) for each in ((edge, none), (whole, edge), (side - edge, whole), (none, side - edge))]
-    )
+    edges = (edge, none), (whole, edge), (side - edge, whole), (none, side - edge)
+    center = np.vstack([np.stack(each, -1) for each in edges])
     middle = np.array([side / 2, side / 2])
     share = width / side
     return Track("square", center, middle + (center - middle) * (1 - share), middle + (center - middle) * (1 + share))

@@ -82,6 +82,9 @@ def test_a_stack_is_the_frames_of_the_camera() -> None:
     assert spec.train is not None and spec.train.config == {"front": {"width": 64, "frames": 3}}
 
 
+DRAWS = ".exploration_type: ppo and sac draw actions from the policy itself; use categorical"
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -95,7 +98,7 @@ def test_a_stack_is_the_frames_of_the_camera() -> None:
         ({"num_epochs": 5.5}, ".num_epochs: expected a whole number from 3 to 10, found 5.5"),
         ({"discount_factor": True}, ".discount_factor: expected a number from 0 to 1, found True"),
         ({"loss_type": "mse"}, ".loss_type: expected one of huber, mean squared error, found 'mse'"),
-        ({"exploration_type": "e-greedy"}, ".exploration_type: ppo and sac draw actions from the policy itself; use "),
+        ({"exploration_type": "e-greedy"}, DRAWS),
         ({"stack_size": 2}, ".stack_size: it stacks images, and the task sees none; use task RacerPixels, or 1"),
         ([1], ": "),
         ("hyperparameters.json", ": a file is read for a job YAML alone; write its settings out"),

@@ -175,15 +175,14 @@ def space(actions: Any, **more: Any) -> dict[str, Any]:
 
 
 STILL, SPEEDS, LOW = {"steering_angle": 0, "speed": 1}, {"low": 1, "high": 2}, "config.action_space.action_space"
+LEFT, TURNING = {"distance": 1.0, "lane": "left"}, {"steering_angle": {"low": 9, "high": 9}}
 REFUSED: dict[str, dict[str, Any]] = {
     f"{LOW}.1.speed: expected a number from 0.1 to 4 [m/s], found 5": space([STILL, {**STILL, "speed": 5}]),
     f"{LOW}: expected a list of 2 to 30 actions, found 1": space([STILL]),
     f"{LOW}.steering_angle.low: expected a number from -30 to 30 [degrees], found -45": space(
         {"steering_angle": {"low": -45, "high": 30}, "speed": SPEEDS}
     ),
-    f"{LOW}.steering_angle: low is 9 and high is 9; low must be less": space(
-        {"steering_angle": {"low": 9, "high": 9}, "speed": SPEEDS}
-    ),
+    f"{LOW}.steering_angle: low is 9 and high is 9; low must be less": space({**TURNING, "speed": SPEEDS}),
     f"{LOW}_type: there is no type 'discreet'; did you mean discrete?": space(FIVE, action_space_type="discreet"),
     f"{LOW}_type: it is continuous, and action_space is a list of actions; they must fit": space(
         FIVE, action_space_type="continuous"
@@ -191,9 +190,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA, LIDAR, "
     "SECTOR_LIDAR, DISCRETIZED_SECTOR_LIDAR": space(FIVE, sensor=["STEREO_CAMERAS"]),
     f"{LOW}.0: there is no key 'steering'; did you mean steering_angle?": space([{"steering": 0, "speed": 1}] * 2),
-    "config.obstacles.0.lane: expected 'inner', 'center' or 'outer', found 'left'": {
-        "obstacles": [{"distance": 1.0, "lane": "left"}]
-    },
+    "config.obstacles.0.lane: expected 'inner', 'center' or 'outer', found 'left'": {"obstacles": [LEFT]},
     "config.randomize.mass: the car moves as a kinematic bicycle, without an engine's contacts; use "
     "train.config.speed_factor, steering_factor and steering_offset": {"randomize": {"mass": [0.5, 2]}},
     "config.randomize.push_interval: nothing can push a car that moves as a kinematic bicycle": {

@@ -114,10 +114,10 @@ def test_a_flood_of_text_and_an_error_of_the_module_are_refused_with_their_line(
     assert told(source) == f"r.py:{message.format('TEST_FAILURE')}"
 
 
-@pytest.mark.parametrize(
-    "body",
-    ["while True:\n        pass", "while True:\n        try:\n            while True: pass\n        except: pass"],
-)
+CATCHING = "while True:\n        try:\n            while True: pass\n        except: pass"
+
+
+@pytest.mark.parametrize("body", ["while True:\n        pass", CATCHING])
 def test_a_function_that_loops_for_ever_is_refused_with_its_line(body: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard, "SECONDS", 0.5)
     problem = check_source(f"{HEAD}{body}", "r.py")

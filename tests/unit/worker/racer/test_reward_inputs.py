@@ -148,9 +148,8 @@ def test_a_compiled_function_earns_the_same_as_a_called_one(driven: Racer) -> No
     assert driven.notes() == ["reward.py: compiled to the device"] and not driven.waits_for_host
     grows = STEER.replace("    total =", "    kept = []\n    kept.append(1)\n    total =")
     called = Racer(dataclasses.replace(config, reward_function=RewardFile("reward.py", grows)), 24, seed=3)
-    assert called.waits_for_host and called.notes() == [
-        "reward.py: line 5: a list that grows: such functions run in Python workers"
-    ]
+    grows = "reward.py: line 5: a list that grows: such functions run in Python workers"
+    assert called.waits_for_host and called.notes() == [grows]
     driven.restart(3, 0)
     called.restart(3, 0)
     random = torch.Generator().manual_seed(8)
@@ -223,7 +222,8 @@ def test_a_path_is_read_where_the_worlds_are_built(tmp_path: Path) -> None:
         Racer(missing, 1)
     file = tmp_path / "mine.py"
     file.write_text("def reward_function(params):\n    return None\n")
-    with pytest.raises(ValueError, match=r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: .* returned None"):
+    there = r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: the sample 'start': it returned None"
+    with pytest.raises(ValueError, match=there):
         Racer(RacerConfig(reward_function=str(file)), 1)
-    with pytest.raises(ValueError, match="obstacles: a reward function is told of at most 10 objects, and there are"):
+    with pytest.raises(ValueError, match="a reward function is told of at most 10 objects, and there are 11"):
         RacerConfig(reward_function=str(file), obstacles=(ObstacleConfig(1.0),) * 11)

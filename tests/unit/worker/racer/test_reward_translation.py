@@ -153,9 +153,8 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
     rewards = wp.empty(len(VALUES), dtype=wp.float32, device="cpu")
     for _ in range(3):
         wp.launch(compiled["x / y"], dim=len(VALUES), inputs=[race, rewards], device="cpu")
-    assert told_errors(race.errors.numpy()) == {
-        "line 10: ZeroDivisionError: division by zero": Failure(3, car=VALUES[::-1].index(0.0))
-    }
+    failure = Failure(3, car=VALUES[::-1].index(0.0))
+    assert told_errors(race.errors.numpy()) == {"line 10: ZeroDivisionError: division by zero": failure}
 
 
 @pytest.mark.parametrize(
@@ -191,9 +190,8 @@ def test_code_outside_the_subset_is_refused_with_line_and_reason(body: str, reas
 
 
 def test_a_function_that_would_be_enormous_is_outside() -> None:
-    calls = "".join(
-        f"def f{n}(a):\n    return {' + '.join(f'f{n - 1}(lambda: {k})' for k in range(9))}\n" for n in range(1, 9)
-    )
+    sums = (" + ".join(f"f{n}(lambda: {k})" for k in range(9)) for n in range(8))
+    calls = "".join(f"def f{n}(a):\n    return {sum}\n" for n, sum in enumerate(sums, 1))
     with pytest.raises(Outside):
         translate(f"def f0(a):\n    return 1\n{calls}def reward_function(params):\n    return f8(1)\n")
 

@@ -59,9 +59,8 @@ def test_swapped_borders_are_taken_the_right_way_whatever_the_direction(directio
     track = make_preset("oval", direction=direction)
     found = from_bytes(saved(track.rows()[:, [0, 1, 4, 5, 2, 3]]), "oval")
     assert found.track.digest == track.digest
-    assert found.notes == (
-        "the borders were swapped (columns 2 and 3 lie outside the centre line): taken the right way",
-    )
+    said = "the borders were swapped (columns 2 and 3 lie outside the centre line): taken the right way"
+    assert found.notes == (said,)
 
 
 def test_borders_that_are_swapped_only_here_and_there_are_refused() -> None:
