@@ -66,7 +66,7 @@ GROUPS = (
     ),
     Group(
         ["worker/learning/ppo/*.py"],
-        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "export", "peers")],
+        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "algorithms", "memory")],
         sample=200,
         bounds_memory=False,
     ),
