@@ -141,3 +141,14 @@ def test_a_gang_ends_at_its_timeout_and_one_that_starts_counts_from_now() -> Non
     assert end_of(5000, 1000, 9) == 10_000 and end_of(5000, None, 9) == 14_000 and end_of(5000, 1000, 2) == 5000
     assert end_of(5000, 1000, None) == end_of(0, 0, 4_000_000_000) == float("inf")
     assert end_of(0, 0, 3_999_999_999) == 3_999_999_999_000
+
+
+def test_what_is_reserved_on_other_hosts_is_nothing_to_a_queue() -> None:
+    queues, environments = (
+        [queue("p", 2, ("p",)), queue("q", 1, ("q",))],
+        [environment("p", ("a",)), environment("q", ("b",))],
+    )
+    held = [running("x", on("a", 2), for_seconds=0, timeout=100), running("y", on("b", 2), for_seconds=0, timeout=600)]
+    waiting = line(job("head-p", 4, queue="p"), job("head-q", 4, queue="q"), job("small", queue="q"))
+    decided = Pass([host("a"), host("b")], waiting, held, queues, environments)
+    assert decided.reason("small").endswith("with a timeout of at most 600 s it could start")
