@@ -7,7 +7,17 @@ from dataclasses import replace
 from orchestrator.scheduling.fit import Fit, fit
 from orchestrator.scheduling.free_resources import Allocation
 from orchestrator.scheduling.order import decayed, score, share_score, weight
-from orchestrator.scheduling.placement import affordable, amounts, count_of, less, limit_of, needs
+from orchestrator.scheduling.placement import (
+    affordable,
+    amounts,
+    count_of,
+    less,
+    limit_of,
+    needs,
+    never_fits,
+    place,
+    together,
+)
 from orchestrator.scheduling.quota import Quota, quota_of
 from orchestrator.scheduling.reservation import end_of
 from orchestrator.scheduling.snapshot import FairShare, TimeLimit
@@ -152,3 +162,35 @@ def test_what_is_reserved_on_other_hosts_is_nothing_to_a_queue() -> None:
     waiting = line(job("head-p", 4, queue="p"), job("head-q", 4, queue="q"), job("small", queue="q"))
     decided = Pass([host("a"), host("b")], waiting, held, queues, environments)
     assert decided.reason("small").endswith("with a timeout of at most 600 s it could start")
+
+
+def test_hosts_that_are_away_are_taken_for_the_smallest_gang_alone() -> None:
+    away, there = replace(host("a", 1), away=True), host("b", 1)
+
+    def where(most: int | None, minimum: int = 2, count: int = 3) -> str | None:
+        found = place(gang(*[node()] * count, minimum=minimum), [away, there, replace(host("c", 1), away=True)], most)
+        return found and " ".join(each.host for each in found)
+
+    assert [where(most) for most in (None, 3, 2, 1)] == ["b a", "b a", "b a", None]
+    assert where(1, minimum=1) == "b" and where(None, minimum=3) == "b a c" and where(None, minimum=4, count=4) is None
+
+
+def test_the_host_that_lacks_least_is_called_the_largest() -> None:
+    def largest(asked: tuple[float, int, int], *known: tuple[float, int, int]) -> str:
+        hosts = [host(str(index), *each) for index, each in enumerate(known)]
+        said = never_fits(gang(node(*asked)), hosts)
+        assert said is not None
+        return said.partition("the largest host has ")[2]
+
+    assert largest((2, 1, 50), (9, 0, 90), (1, 1, 10)) == "1 CPU, 1 GPU, 10 MiB"
+    assert largest((2, 0, 99), (1, 0, 90), (2, 0, 10)) == "2 CPUs, 0 GPUs, 10 MiB"
+    assert largest((2, 0, 99), (2, 0, 90), (9, 0, 10)) == "2 CPUs, 0 GPUs, 90 MiB"
+    assert largest((2, 1, 99), (1, 1, 9), (1, 5, 8)) == "1 CPU, 1 GPU, 9 MiB"
+    assert together([host("a", 1, 1, 10), host("b", 2, 1, 20)]) == "3 CPUs, 2 GPUs, 30 MiB"
+
+
+def test_a_host_for_one_node_has_no_room_beside_it_not_even_for_nothing() -> None:
+    one = replace(host("a"), single=True)
+    nothing = gang(node(1), node(0, 0, 0))
+    assert place(nothing, [one]) is None and place(nothing, [host()]) is not None
+    assert never_fits(nothing, [one]) == "needs 2 hosts, one for each node; there is 1"
