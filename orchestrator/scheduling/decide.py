@@ -88,7 +88,7 @@ class _Pass:
         queues = self.snapshot.queues
         for name in sorted(jobs.keys() & queues.keys(), key=lambda name: (-queues[name].priority, name)):
             self._serve(queues[name], jobs[name])
-        for name in sorted(jobs.keys() - queues.keys()):
+        for name in jobs.keys() - queues.keys():
             self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}), None)
         report = WaitReport(self.now, self.orders, self.reservations, self.free, self.preempts, self.snapshot.drift)
         return Decisions(tuple(self.starts), tuple(self.preempts), tuple(self.cancels), report, self.leading)

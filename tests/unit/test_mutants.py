@@ -8,6 +8,8 @@ import contextlib
 import pytest
 
 from tests.support.mutation.mutants import mutants, mutated, noting
+from tests.support.mutation.run import equivalent
+from tests.support.mutation.trial import REPOSITORY
 
 
 @pytest.mark.parametrize(
@@ -101,3 +103,9 @@ def test_a_fault_keeps_its_key_when_its_line_moves_and_equal_faults_are_numbered
     assert keys == ["f | a.go() | a.go() → pass", "f | a.go() | a.go() → pass #2"]
     assert [each.key for each in mutants("\n\n" + source)] == keys
     assert ast.unparse(mutated(source, 1)) == "def f(a):\n    a.go()\n    pass"
+
+
+def test_every_fault_in_the_reviewed_list_exists() -> None:
+    for module, known in equivalent().items():
+        keys = {each.key for each in mutants((REPOSITORY / module).read_text())}
+        assert not known.keys() - keys, module

@@ -66,7 +66,7 @@ GROUPS = (
     ),
     Group(
         ["worker/learning/ppo/*.py"],
-        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "export", "peers")],
+        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "algorithms", "memory")],
         sample=200,
         bounds_memory=False,
     ),
@@ -185,7 +185,13 @@ def write(results: Results, seed: int, label: str) -> None:
             lines += [_row(f"`{module}`", counts) for module, counts in found.items()]
             lines += [_row(f"**{title}**", _sum(found.values()))] if found else []
         seconds = sum(counts["seconds"] for counts in rows["modules"].values())
-        lines += ["", f"{seconds / 60:.0f} minutes of one processor.", ""]
+        left = _sum(rows["modules"].values())["not tried"]
+        lines += [
+            "",
+            f"{seconds / 60:.0f} minutes of one processor.",
+            *([f"{left} mutants were not tried."] if left else []),
+            "",
+        ]
     lines += [
         "## Survivors",
         "",

@@ -18,6 +18,7 @@ import linecache
 import os
 import pickle
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -104,6 +105,8 @@ class _Run:
         ]
 
     def run(self) -> None:
+        if any(mutant.in_kernel for _, mutant in self.mutants):
+            self._set_kernels_apart()
         kept = self.scratch / "reach"
         self.plugin = _Collected(lambda session: self._in_functions(session, kept))
         self._need(_in_child(lambda: self._pytest(self.plugin)))
@@ -118,6 +121,14 @@ class _Run:
         for module, mutant in later:
             tests = self.reach.tests(module, None)
             self._try(module, mutant, tests, partial(self._anew, module, mutant.number, tests))
+
+    def _set_kernels_apart(self) -> None:
+        """Let Warp find the kernels that are compiled, and keep the faulty ones elsewhere."""
+        compiled = Path(os.environ.get("WARP_CACHE_PATH") or REPOSITORY / ".pytest_cache" / "kernels")
+        apart = self.scratch / "kernels"
+        if compiled.is_dir():
+            shutil.copytree(compiled.resolve(), apart, copy_function=os.symlink)
+        os.environ["WARP_CACHE_PATH"] = str(apart)
 
     def _need(self, status: int) -> None:
         if status != 0:
