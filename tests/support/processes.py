@@ -52,6 +52,13 @@ def session_of(pid: int) -> int:
         return 0
 
 
+def has_signal(pid: int, mask: str, number: int) -> bool:
+    """Whether a signal is in a mask of the process: ``SigCgt`` of those that it catches, ``ShdPnd`` of those that it has yet to see."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    found = next(line.split()[1] for line in lines if line.startswith(mask))
+    return bool(int(found, 16) >> (number - 1) & 1)
+
+
 def _stat(pid: int) -> list[str]:
     """State, parent and so on: what follows the name in ``/proc/PID/stat``."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

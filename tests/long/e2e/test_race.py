@@ -74,10 +74,3 @@ def test_a_race_is_printed_as_a_table_and_does_not_choose_the_best_checkpoint(ra
     after = server.client.get(f"/api/runs/{run}/checkpoints")
     chosen = [[(each["name"], each["best"], each["evaluated"]) for each in listed] for listed in (before, after)]
     assert chosen[0] == chosen[1]
-
-
-def test_of_an_unknown_track_the_nearest_name_is_told(raced: tuple[Serving, str]) -> None:
-    server, run = raced
-    done = server.muster_process("evaluate", run, "--race", "--track", "chicaine", timeout=300)
-    said = done.stdout + done.stderr
-    assert (done.returncode, said) == (2, "muster: race.track: track chicaine does not exist; did you mean chicane?\n")

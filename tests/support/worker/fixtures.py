@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.support.processes import end_all
+from tests.support.worker import trained
 from tests.support.worker.node import Node
 
 
@@ -27,3 +28,9 @@ def node(tmp_path: Path) -> Iterator[Callable[..., Node]]:
             each.process.kill()
             each.process.wait()
     end_all(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def trained_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The home of a controller with a run that was trained (:mod:`tests.support.worker.trained`). To be copied, not written to."""
+    return trained.make_once(tmp_path_factory)

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tests.support.waiting import PATIENCE
+
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -21,23 +23,21 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def placement(rank: int = 0, ranks: int = 1, port: int = 0) -> dict[str, str]:
+    """What the supervisor tells a rank of its gang, all of which is on this machine's processor."""
+    return {
+        **{"RANK": str(rank), "WORLD_SIZE": str(ranks), "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1"},
+        **{"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port or free_port()), "OMP_NUM_THREADS": "1"},
+        **{"GLOO_SOCKET_IFNAME": "lo", "CUDA_VISIBLE_DEVICES": ""},
+    }
+
+
 def start_rank(body: str, rank: int, ranks: int, port: int, env: dict[str, str]) -> subprocess.Popen[str]:
     """One process with the environment that the supervisor gives a rank; ``module:function`` in ``tests`` is its body."""
-    given = {
-        "RANK": str(rank),
-        "WORLD_SIZE": str(ranks),
-        "LOCAL_RANK": "0",
-        "LOCAL_WORLD_SIZE": "1",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-        "OMP_NUM_THREADS": "1",
-        "GLOO_SOCKET_IFNAME": "lo",
-        "CUDA_VISIBLE_DEVICES": "",
-        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
-    }
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
         [sys.executable, "-m", "tests.support.worker.ranks", body],
-        env={**os.environ, **given, **env},
+        env={**os.environ, **placement(rank, ranks, port), "PYTHONPATH": path, **env},
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -52,7 +52,7 @@ def run_ranks(
     port = free_port()
     processes = [start_rank(body, rank, ranks, port, env or {}) for rank in range(ranks)]
     try:
-        outputs = [process.communicate(timeout=timeout) for process in processes]
+        outputs = [process.communicate(timeout=timeout * PATIENCE) for process in processes]
     finally:
         for process in processes:
             process.kill()

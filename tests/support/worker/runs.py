@@ -1,4 +1,4 @@
-"""Trainings of :class:`tests.support.worker.point_task.Point` in the test's own process, and the bits that they end with."""
+"""Trainings, of :class:`tests.support.worker.point_task.Point` unless said otherwise, in the test's own process, and the bits that they end with."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from worker.learning.loop import Loop
 from worker.learning.training import Training
 
 
-def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Loop:
+def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None, task: Any = TASK) -> Loop:
     """One attempt, to which the run is given first, as a controller does."""
     job = Job.from_env(env, "train")
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
-    return Loop(Training.of(job, TASK), gang or alone(), stop or StopRequest())
+    return Loop(Training.of(job, task), gang or alone(), stop or StopRequest())
 
 
-def train(env: dict[str, str], gang: Gang | None = None) -> Loop:
+def train(env: dict[str, str], gang: Gang | None = None, task: Any = TASK) -> Loop:
     """Train to the end, as one attempt."""
-    started = runner(env, gang)
+    started = runner(env, gang, task=task)
     assert started.train() == 0
     return started
 

@@ -120,11 +120,3 @@ def test_ant_trains_on_two_nodes(server: Serving) -> None:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "SUCCEEDED" in done.stdout
-
-
-def test_what_only_the_rank_can_refuse_it_refuses_in_one_line(server: Serving) -> None:
-    unknown = "train.rsl_rl.actor={class_name: NoSuchModel}"
-    job = submit(server, "train.iterations=2", "train.algorithm=rsl_rl", unknown, "retry.attempts=1")
-    detail = server.wait(job["id"], timeout=120)
-    assert detail["status"] == "FAILED" and "rsl_rl.actor.class_name: " in detail["statusReason"]
-    assert "NoSuchModel" in detail["statusReason"] and "\n" not in detail["statusReason"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from shared_store.checkpoints import CheckpointWriter, list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.conftest import Serving, wait_for
+from tests.support.worker.trained import run_in
 
 
 def test_a_commit_removes_what_a_killed_writer_left_but_not_what_comes_next(tmp_path: Path) -> None:
@@ -50,21 +52,20 @@ def test_a_node_that_an_earlier_controller_met_is_missed_by_the_next_one(tmp_pat
         second.close()
 
 
-def test_a_job_that_was_struck_after_its_last_save_may_be_resumed_for_its_evaluation(server: Serving) -> None:
-    changes = ["train.worlds=8", "train.iterations=3", "nodes=1"]
-    options = [part for change in changes for part in ("--set", change)]
-    submitted = server.muster("submit", "job_specs/cartpole.yaml", "--json", *options)
-    done = server.wait(json.loads(submitted.stdout)["jobId"], timeout=120)
-    run = Store(server.home / "store").run(done["run"])
-    (evaluation,) = run.evaluations.glob("*.json")
-    before = json.loads(evaluation.read_text())
-    refused = server.muster("resume", run.name)
-    assert refused.returncode == 1 and "complete at iteration 3 of 3" in refused.stderr
-    evaluation.unlink()
-    with sqlite3.connect(server.home / "muster.db") as database:  # as if the last attempt had been struck just then
-        database.execute("UPDATE jobs SET status = 'FAILED'")
-    resumed = json.loads(server.muster("resume", run.name, "--json").stdout)
-    assert server.wait(resumed["jobId"], timeout=120)["status"] == "SUCCEEDED"
+def test_a_job_that_was_struck_after_its_last_save_may_be_resumed_for_its_evaluation(
+    trained_home: Path, tmp_path: Path
+) -> None:
+    with Serving(shutil.copytree(trained_home, tmp_path / "home"), "--cpus", "4") as server:
+        run = run_in(server.home)
+        (evaluation,) = run.evaluations.glob("*.json")
+        before = json.loads(evaluation.read_text())
+        refused = server.muster("resume", run.name)
+        assert refused.returncode == 1 and "complete at iteration 2 of 2" in refused.stderr
+        evaluation.unlink()
+        with sqlite3.connect(server.home / "muster.db") as database:  # as if the last attempt had been struck just then
+            database.execute("UPDATE jobs SET status = 'FAILED'")
+        resumed = json.loads(server.muster("resume", run.name, "--json").stdout)
+        assert server.wait(resumed["jobId"], timeout=120)["status"] == "SUCCEEDED"
     after, timings = json.loads(evaluation.read_text()), {"time": 0, "seconds": 0}
     assert {**after, **timings} == {**before, **timings}
-    assert [checkpoint.iteration for checkpoint in list_checkpoints(run)] == [3]
+    assert [checkpoint.iteration for checkpoint in list_checkpoints(run)] == [1, 2]

@@ -18,6 +18,7 @@ from shared_store.layout import Store
 from tests.conftest import Serving
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
+from tests.support.worker.trained import run_in
 from worker.errors import UserError
 from worker.learning.loop import Loop
 from worker.learning.trained import load_learner
@@ -58,16 +59,10 @@ def test_the_payload_works_where_nothing_protects(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Serving, str]]:
+def served(trained_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Serving, str]]:
     """A server and a finished run of two iterations of eight worlds, with a checkpoint of each."""
-    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "4")
-    small = ["nodes=1", "train.worlds=8", "train.iterations=2", "train.ppo.learning_rate=0.001", "checkpoint.every=1"]
-    options = [part for change in small for part in ("--set", change)]
-    submitted = json.loads(server.muster("submit", "job_specs/cartpole.yaml", "--json", *options).stdout)
-    detail = server.wait(submitted["jobId"], timeout=240)
-    assert detail["status"] == "SUCCEEDED", detail["statusReason"]
-    yield server, detail["run"]
-    server.close()
+    with Serving(shutil.copytree(trained_home, tmp_path_factory.mktemp("copy") / "home"), "--cpus", "4") as server:
+        yield server, run_in(server.home).name
 
 
 def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:

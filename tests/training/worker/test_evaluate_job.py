@@ -4,41 +4,49 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet
 import pytest
 
-from shared_store.epoch import raise_epoch
+import worker.evaluate
 from shared_store.evaluations import list_evaluations
-from shared_store.layout import Run, Store
-from tests.conftest import PATIENCE
-from tests.support.worker.ranks import ROOT, free_port
+from shared_store.layout import Run
+from tests.conftest import PATIENCE, wait_for
+from tests.support.processes import has_signal
+from tests.support.worker.in_process import call_worker
+from tests.support.worker.ranks import ROOT, free_port, placement
+from tests.support.worker.trained import run_in
 from worker.learning.randomness import held_out_seed
 
-TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 2, "seed": 5, "config": {"episode_seconds": 1.0}}
+SHORT = {"config": {"episode_seconds": 1.0}}
 
 
-def start(
-    store: Path, kind: str, section: dict[str, Any], job: str, rank: int = 0, ranks: int = 1, port: int = 0
-) -> Any:
-    """One rank of a job, as the supervisor starts it."""
-    spec = {"name": kind, kind: section, "checkpoint": {"every": 1, "keep": 5}}
-    given = {
-        **{"MUSTER_STORE": str(store), "MUSTER_RUN": "taught" if kind == "train" else "job", "MUSTER_EPOCH": "1"},
+def environment(
+    run: Run, section: dict[str, Any], job: str, rank: int = 0, ranks: int = 1, port: int = 0
+) -> dict[str, str]:
+    """What the supervisor tells one rank of a job."""
+    spec = {"name": "evaluate", "evaluate": {"run": run.name, **section}}
+    return {
+        **{"MUSTER_STORE": str(run.path.parent.parent), "MUSTER_RUN": "job", "MUSTER_EPOCH": "1"},
         **{"MUSTER_JOB_EPOCH": "1", "MUSTER_JOB_ID": job, "MUSTER_SPEC": json.dumps(spec)},
-        **{"RANK": str(rank), "WORLD_SIZE": str(ranks), "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1"},
-        **{"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port or free_port()), "OMP_NUM_THREADS": str(1 + rank)},
-        **{"GLOO_SOCKET_IFNAME": "lo", "CUDA_VISIBLE_DEVICES": ""},
+        **placement(rank, ranks, port),
+        "OMP_NUM_THREADS": str(1 + rank),
     }
-    command = [sys.executable, "-m", f"worker.{kind}"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, env={**os.environ, **given}, cwd=ROOT, **pipes)
+
+
+def start(run: Run, section: dict[str, Any], job: str, rank: int = 0, ranks: int = 1, port: int = 0) -> Any:
+    """One rank as a process, as the supervisor starts it."""
+    given = environment(run, section, job, rank, ranks, port)
+    command = [sys.executable, "-m", "worker.evaluate"]
+    return subprocess.Popen(
+        command, env={**os.environ, **given}, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def ended(process: Any) -> tuple[int, str]:
@@ -48,34 +56,33 @@ def ended(process: Any) -> tuple[int, str]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(trained_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run of two checkpoints."""
-    store = Store(tmp_path_factory.mktemp("store")).open()
-    made = store.run("taught")
-    made.create({"run": "taught", "spec": {"train": TRAIN}})
-    raise_epoch(made, 1)
-    code, output = ended(start(store.path, "train", TRAIN, "trained"))
-    assert code == 0, output
-    yield made
+    return run_in(shutil.copytree(trained_home, tmp_path_factory.mktemp("copy") / "home"))
 
 
-def evaluate(run: Run, job: str, ranks: int = 1, **section: Any) -> tuple[int, str]:
-    """Exit code of the main rank, and its output."""
-    port, store = free_port(), run.path.parent.parent
-    section = {"run": "taught", "episodes": 40, **section}
-    processes = [start(store, "evaluate", section, job, rank, ranks, port) for rank in range(ranks)]
-    main, *_ = [ended(process) for process in processes]
+def evaluate(run: Run, job: str, **section: Any) -> tuple[int, str]:
+    """Exit code and output of a job of one rank."""
+    done = call_worker(worker.evaluate.main, environment(run, {"episodes": 40, **section}, job))
+    return done.returncode, done.stdout + done.stderr
+
+
+def evaluate_on_two(run: Run, job: str, **section: Any) -> tuple[int, str]:
+    """Exit code and output of the main rank of a job of two."""
+    port = free_port()
+    processes = [start(run, {"episodes": 40, **section}, job, rank, 2, port) for rank in (0, 1)]
+    main, _ = [ended(process) for process in processes]
     return main
 
 
 def test_the_same_episodes_are_the_same_bytes_on_one_rank_in_two_rounds_and_on_two_ranks_in_one(run: Run) -> None:
-    drawn = {"config": {"randomize": {"mass": [0.5, 2.0]}}, "worlds": 1}  # each world when it is built
-    outputs = [evaluate(run, "one", **drawn), evaluate(run, "two", ranks=2, **drawn)]
+    config = {**SHORT["config"], "randomize": {"mass": [0.5, 2.0]}}  # each world when it is built
+    outputs = [each(run, job, worlds=1, config=config) for job, each in (("one", evaluate), ("two", evaluate_on_two))]
     assert [code for code, _ in outputs] == [0, 0], outputs
     one, two = (run.evaluations / f"00000002-e1-{job}.parquet" for job in ("one", "two"))
     assert one.read_bytes() == two.read_bytes()
     table = pyarrow.parquet.read_table(one).to_pydict()
-    assert len(table["episode"]) == 40 and set(table["seed"]) == {held_out_seed(5)}
+    assert len(table["episode"]) == 40 and set(table["seed"]) == {held_out_seed(1)}
     assert "40 episodes of Cartpole, checkpoint 00000002-e1" in outputs[0][1]
     assert "compared with the evaluation" in outputs[1][1] and "paired over 40 episodes): within noise" in outputs[1][1]
 
@@ -93,24 +100,15 @@ def test_an_evaluation_that_is_asked_to_stop_leaves_with_75_and_records_nothing(
     before = sorted(path.name for path in run.evaluations.iterdir())
     # 100 s of simulated time: it would take long
     section = {
-        "run": "taught",
         "episodes": 1000,
         "config": {"episode_seconds": 100.0, "angle_limit": 3.0, "cart_limit": 1e3},
     }
-    process = start(run.path.parent.parent, "evaluate", section, "stopped")
-    while not _listens(process):
-        assert process.poll() is None
+    process = start(run, section, "stopped")
+    wait_for(lambda: has_signal(process.pid, "SigCgt", signal.SIGTERM), 60, "that it listens")
     process.terminate()
     code, output = ended(process)
     assert code == 75 and "nothing was recorded" in output, output
     assert sorted(path.name for path in run.evaluations.iterdir()) == before
-
-
-def _listens(process: Any) -> bool:
-    """Whether it catches SIGTERM already."""
-    status = Path(f"/proc/{process.pid}/status").read_text()
-    caught = int(next(line for line in status.splitlines() if line.startswith("SigCgt")).split()[1], 16)
-    return bool(caught >> (signal.SIGTERM - 1) & 1)
 
 
 @pytest.mark.parametrize(

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.support.worker.broken_task import Rooted
-from tests.support.worker.ranks import ROOT, training
+from tests.support.worker.in_process import call_worker
+from tests.support.worker.ranks import training
+from tests.support.worker.runs import runner
 from tests.support.worker.tasks import put, statistics
-from worker.distributed import Gang, Placement
+from worker import repeat_incident
 from worker.errors import TrainingError
-from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
-from worker.learning.training import Training
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 
 STILL = torch.zeros(4, 1)
@@ -64,17 +61,13 @@ def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None
     assert task.dones.tolist() == [False, False, True, False] and task.rewards[2] == 0, "finite, but past belief"
 
 
-def runner(path: Path, limit: float) -> Loop:
-    env = training(
-        path, iterations=3, worlds=16, config={"nan_limit": limit}, task="tests.support.worker.broken_task:Rooted"
-    )
-    job = Job.from_env(env, "train")
-    raise_epoch(job.run, job.epoch)
-    return Loop(Training.of(job, Rooted), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
+def rooted(path: Path, limit: float) -> Loop:
+    name = "tests.support.worker.broken_task:Rooted"
+    return runner(training(path, iterations=3, worlds=16, config={"nan_limit": limit}, task=name), task=Rooted)
 
 
 def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert runner(tmp_path, 10.0).train() == 0
+    assert rooted(tmp_path, 10.0).train() == 0
     output = capsys.readouterr().out
     assert re.search(
         r"warning: iteration \d: \d+ resets? of worlds, among them world \d+: its observation slider_velocity was not finite",
@@ -85,7 +78,7 @@ def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pyte
 
 def test_past_the_limit_it_stops_with_the_state_and_it_happens_again(tmp_path: Path) -> None:
     with pytest.raises(TrainingError) as stop:
-        runner(tmp_path, 0.0).train()
+        rooted(tmp_path, 0.0).train()
     found = re.fullmatch(
         r"iteration (\d): (\d+) resets? of worlds, among them (world \d+: its observation slider_velocity was not finite); that is more "
         r"than nan_limit, 0 times 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.repeat_incident (\S+)",
@@ -93,13 +86,7 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again(tmp_path: P
     )
     assert found, stop.value
     assert [str(path) for path in Store(tmp_path).run("run").incidents.iterdir()] == [found[4]]
-    again = subprocess.run(
-        [sys.executable, "-m", "worker.repeat_incident", found[4]],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    again = call_worker(repeat_incident.main, {}, found[4])
     assert again.returncode == 0, again.stderr
     assert again.stdout.startswith(
         f"iteration {found[1]} of tests.support.worker.broken_task:Rooted: 16 steps of 16 worlds\nstep "
@@ -113,11 +100,6 @@ def test_a_file_that_is_no_incident_is_refused_in_one_line(tmp_path: Path) -> No
     (tmp_path / "nonsense").write_text("x")
     (tmp_path / "empty").touch()
     for name, says in {"nonsense": "holds no", "missing": "can't be read (", "empty": "holds no"}.items():
-        refused = subprocess.run(
-            [sys.executable, "-m", "worker.repeat_incident", str(tmp_path / name)],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-        )
+        refused = call_worker(repeat_incident.main, {}, str(tmp_path / name))
         assert refused.returncode == 2 and refused.stderr.count("\n") == 1, refused.stderr
         assert refused.stderr.startswith(f"error: {tmp_path / name} {says}")
