@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,13 @@ from orchestrator.spec.values import known_tasks
 SHIPPED = sorted((Path(__file__).parents[4] / "job_specs").glob("*.yaml"))
 
 
+@cache
+def validator() -> jsonschema.Draft202012Validator:
+    return jsonschema.Draft202012Validator(schema())
+
+
 def accepts(document: Any) -> bool:
-    return bool(jsonschema.Draft202012Validator(schema()).is_valid(document))
+    return bool(validator().is_valid(document))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)

@@ -11,6 +11,7 @@ import pytest
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.file import load
+from tests.support.waiting import PATIENCE
 
 WRONG = {
     "Ant ppo learning_rate_limits: [0.1, 0.001]": "learning_rate_limits: expected the least, then the greatest",
@@ -156,7 +157,7 @@ def test_an_algorithm_of_an_installed_package_is_known_to_the_submission_and_to_
         (tmp_path / name).write_text(text)
     env = {**os.environ, "PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-c", CONTROLLER + RANK]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300 * PATIENCE)
     assert done.stdout.splitlines() == [
         "{'hops': 4}",
         "job.yaml: train.hop.hopps: unknown key; did you mean hops?",

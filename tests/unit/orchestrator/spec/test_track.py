@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from typing import Any
 
 import jsonschema
@@ -15,6 +16,11 @@ from orchestrator.spec.json_schema import schema
 from orchestrator.spec.model import validate
 
 TRAIN = {"task": "Cartpole", "worlds": 4, "iterations": 2}
+
+
+@cache
+def validator() -> jsonschema.Draft202012Validator:
+    return jsonschema.Draft202012Validator(schema())
 
 
 def spec(**changes: Any) -> dict[str, Any]:
@@ -37,7 +43,7 @@ def spec(**changes: Any) -> dict[str, Any]:
 def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, kept: Any) -> None:
     found = validate(spec(track=given), "job.yaml")
     assert found.track is not None and found.track.model_dump(mode="json", exclude_none=True) == kept
-    assert jsonschema.Draft202012Validator(schema()).is_valid(spec(track=given))
+    assert validator().is_valid(spec(track=given))
     again = validate(found.model_dump(mode="json", exclude_none=True), "run.json")
     assert again == found  # as a run that is resumed reads it
 
@@ -89,7 +95,7 @@ def test_a_checkpoint_is_named_in_the_same_ways_by_every_kind_of_job(kind: str) 
     for wanted in (3, "best", "latest"):
         job = {"name": "a", kind: {"run": "x", "checkpoint": wanted}}
         assert getattr(validate(job, "job.yaml"), kind).checkpoint == wanted
-        assert jsonschema.Draft202012Validator(schema()).is_valid(job)
+        assert validator().is_valid(job)
     for wrong in (-1, "newest", True, 1.5):
         with pytest.raises(SpecError) as refused:
             validate({"name": "a", kind: {"run": "x", "checkpoint": wrong}}, "job.yaml")
