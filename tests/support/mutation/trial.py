@@ -34,6 +34,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.mutation.mutants import Mutant, mutants, mutated, noting
+from tests.support.suite.caches import kernel_cache
 
 REPOSITORY = Path(__file__).parents[3]
 KILLED, SURVIVED, TIMED_OUT = "killed", "survived", "timed out"
@@ -48,7 +49,7 @@ _MEMORY = 4 << 30
 """Bytes that a child may take beyond what its parent has."""
 _LIBC, _DEATH_SIGNAL = ctypes.CDLL(None), 1
 """So that no child outlives its parent: prctl(PR_SET_PDEATHSIG)."""
-_OPTIONS = ("-qq", "--tb=no", *(f"-pno:{name}" for name in ("cacheprovider", "timeout", "xdist", "faulthandler")))
+_OPTIONS = ("-qq", "--tb=no", *(f"-pno:{name}" for name in ("cacheprovider", "timeout", "faulthandler")))
 
 
 _Functions = defaultdict[tuple[str, str, int], list[types.FunctionType]]
@@ -124,7 +125,7 @@ class _Run:
 
     def _set_kernels_apart(self) -> None:
         """Let Warp find the kernels that are compiled, and keep the faulty ones elsewhere."""
-        compiled = Path(os.environ.get("WARP_CACHE_PATH") or REPOSITORY / ".pytest_cache" / "kernels")
+        compiled = Path(os.environ.get("WARP_CACHE_PATH") or kernel_cache())
         apart = self.scratch / "kernels"
         if compiled.is_dir():
             shutil.copytree(compiled.resolve(), apart, copy_function=os.symlink)
