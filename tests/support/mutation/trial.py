@@ -42,7 +42,8 @@ _OURS = ("orchestrator", "shared_store", "worker", "tests", "muster_policy")
 _EXAMPLES = 10
 """Examples that Hypothesis tries in each test at most."""
 _TIMES, _MORE = 10, 5.0
-"""A test may take so many times its usual time, and so many seconds more, of the processor; ten times that on the clock."""
+"""A test may take so many times its usual time, and so many seconds more, of the processor; on the clock ten times that, and a
+minute."""
 _COLLECTION = 120.0
 """Seconds of the processor for imports and the collection of tests."""
 _MEMORY = 4 << 30
@@ -312,6 +313,9 @@ class _Ordered(_Plugin):
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         _limit(self._seconds[nodeid])
 
+    def pytest_runtest_logfinish(self) -> None:
+        _limit(_COLLECTION)  # what follows the last test
+
 
 def _name(module: str) -> str:
     return module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
@@ -345,7 +349,7 @@ def _limit(usual: float) -> None:
     """End this process if its next step takes far longer than usual [s]."""
     seconds = usual * _TIMES + _MORE
     signal.setitimer(signal.ITIMER_PROF, seconds)
-    signal.setitimer(signal.ITIMER_REAL, seconds * 10)
+    signal.setitimer(signal.ITIMER_REAL, seconds * 10 + 60)
 
 
 def _in_child(act: Callable[[], int], memory: int | None = None) -> int:
