@@ -34,6 +34,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.mutation.mutants import Mutant, mutants, mutated, noting
+from tests.support.suite.caches import kernel_cache
 
 REPOSITORY = Path(__file__).parents[3]
 KILLED, SURVIVED, TIMED_OUT = "killed", "survived", "timed out"
@@ -41,14 +42,15 @@ _OURS = ("orchestrator", "shared_store", "worker", "tests", "muster_policy")
 _EXAMPLES = 10
 """Examples that Hypothesis tries in each test at most."""
 _TIMES, _MORE = 10, 5.0
-"""A test may take so many times its usual time, and so many seconds more, of the processor; ten times that on the clock."""
+"""A test may take so many times its usual time, and so many seconds more, of the processor; on the clock ten times that, and a
+minute."""
 _COLLECTION = 120.0
 """Seconds of the processor for imports and the collection of tests."""
 _MEMORY = 4 << 30
 """Bytes that a child may take beyond what its parent has."""
 _LIBC, _DEATH_SIGNAL = ctypes.CDLL(None), 1
 """So that no child outlives its parent: prctl(PR_SET_PDEATHSIG)."""
-_OPTIONS = ("-qq", "--tb=no", *(f"-pno:{name}" for name in ("cacheprovider", "timeout", "xdist", "faulthandler")))
+_OPTIONS = ("-qq", "--tb=no", *(f"-pno:{name}" for name in ("cacheprovider", "timeout", "faulthandler")))
 
 
 _Functions = defaultdict[tuple[str, str, int], list[types.FunctionType]]
@@ -124,7 +126,7 @@ class _Run:
 
     def _set_kernels_apart(self) -> None:
         """Let Warp find the kernels that are compiled, and keep the faulty ones elsewhere."""
-        compiled = Path(os.environ.get("WARP_CACHE_PATH") or REPOSITORY / ".pytest_cache" / "kernels")
+        compiled = Path(os.environ.get("WARP_CACHE_PATH") or kernel_cache())
         apart = self.scratch / "kernels"
         if compiled.is_dir():
             shutil.copytree(compiled.resolve(), apart, copy_function=os.symlink)
@@ -311,6 +313,9 @@ class _Ordered(_Plugin):
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         _limit(self._seconds[nodeid])
 
+    def pytest_runtest_logfinish(self) -> None:
+        _limit(_COLLECTION)  # what follows the last test
+
 
 def _name(module: str) -> str:
     return module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
@@ -344,7 +349,7 @@ def _limit(usual: float) -> None:
     """End this process if its next step takes far longer than usual [s]."""
     seconds = usual * _TIMES + _MORE
     signal.setitimer(signal.ITIMER_PROF, seconds)
-    signal.setitimer(signal.ITIMER_REAL, seconds * 10)
+    signal.setitimer(signal.ITIMER_REAL, seconds * 10 + 60)
 
 
 def _in_child(act: Callable[[], int], memory: int | None = None) -> int:
