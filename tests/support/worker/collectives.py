@@ -62,10 +62,10 @@ class _Module(ast.NodeVisitor):
         for node in tree.body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 self._names[node.name] = f"{self.file}:{node.name}"
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("worker."):
-                file = f"{str(node.module).removeprefix('worker.').replace('.', '/')}.py"
-                self._names |= {each.asname or each.name: f"{file}:{each.name}" for each in node.names}
+        for found in ast.walk(tree):
+            if isinstance(found, ast.ImportFrom) and (found.module or "").startswith("worker."):
+                file = f"{str(found.module).removeprefix('worker.').replace('.', '/')}.py"
+                self._names |= {each.asname or each.name: f"{file}:{each.name}" for each in found.names}
         self.visit(tree)
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
