@@ -15,7 +15,7 @@ from shared_store.layout import Store
 from shared_store.parent import parent_checkpoint
 from tests.support.worker.clones import make_clone
 from tests.support.worker.point_task import Point
-from tests.support.worker.ranks import run_ranks, training
+from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, tensors, train
 from worker.errors import UserError
 from worker.learning import loop as loops
@@ -119,13 +119,6 @@ def test_a_clone_that_was_killed_before_its_first_checkpoint_begins_with_the_sam
     assert not torch.equal(
         learnt(last(store, "straight"))["policy"]["mlp.0.weight"], learnt(last(store, "ppo"))["policy"]["mlp.0.weight"]
     )
-
-
-def test_two_ranks_begin_with_the_same_weights(store: Path) -> None:
-    make_clone(store, "clone", "ppo")
-    ended = run_ranks("train", 2, training(store, run="clone", iterations=1, worlds=4))
-    assert [code for code, _, _ in ended] == [0, 0], ended
-    assert "starting from the weights of ppo@4 (checkpoint 00000004-e1): 8 worlds on 2 ranks" in ended[0][1]
 
 
 # -- what does not fit -----------------------------------------------------------------------------------------------

@@ -1,30 +1,21 @@
-"""rsl_rl's algorithms learn on real worlds: networks with memory, symmetry, curiosity, a student from its teacher; and two ranks as one."""
+"""rsl_rl's algorithms learn on real worlds: networks with memory, symmetry, curiosity, a student from its teacher."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
-import json
-import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import warp
-from rsl_rl.models import MLPModel
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
-from torch import nn
 
 from tests.support.worker.loop import groups
-from tests.support.worker.point_task import PointConfig
-from tests.support.worker.ranks import run_ranks
-from tests.support.worker.rsl_loop import GroupedPoint, Recall, build, evaluate, train
-from worker.distributed import Placement, connect
-from worker.learning.algorithm import Share
-from worker.learning.randomness import seed_generators
+from tests.support.worker.rsl_loop import GAUSSIAN, Recall, build, evaluate, train
+from tests.support.worker.rsl_loop import GRU as SMALL_GRU
 from worker.learning.rsl.algorithm import RslRl
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.rsl_rl_env import TaskVecEnv, make
@@ -32,14 +23,7 @@ from worker.tasks.rsl_rl_env import TaskVecEnv, make
 torch.set_num_threads(1)
 warp.config.log_level = warp.LOG_WARNING
 
-GAUSSIAN = {"class_name": "GaussianDistribution"}
-GRU = {
-    "class_name": "RNNModel",
-    "rnn_type": "gru",
-    "rnn_hidden_dim": 32,
-    "hidden_dims": [32],
-    "obs_normalization": True,
-}
+GRU = {**SMALL_GRU, "rnn_hidden_dim": 32, "hidden_dims": [32]}
 HELD = 24.0
 """Return of a cart-pole that is held upright near the middle for all of its 300 steps, of 30 at most."""
 
@@ -185,70 +169,3 @@ def test_a_runner_of_ones_own_trains_logs_and_saves(tmp_path: Path) -> None:
     assert policy(env.get_observations()).shape == (32, 1)
     with pytest.raises(ValueError, match=r"task Cartpole has no setting wind; its settings are .*cart_limit"):
         make("Cartpole", 1, wind=3.0)
-
-
-# -- two ranks --------------------------------------------------------------------------------------------------------
-
-CURIOUS = {"num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims": [8], "weight": 1.0}
-SECTIONS: dict[str, dict[str, Any]] = {
-    "PPO with RND": {
-        "algorithm": {"rnd_cfg": {**CURIOUS, "state_normalization": True, "reward_normalization": True}},
-        "actor": {"class_name": "tests.long.learning.test_rsl_rl_learns:Batched", "distribution_cfg": GAUSSIAN},
-    },
-    "GRU": {"actor": {**GRU, "distribution_cfg": GAUSSIAN}, "algorithm": {"num_mini_batches": 2}},
-    "distillation": {
-        "algorithm": {"class_name": "Distillation", "gradient_length": 8},
-        "student": {**GRU, "distribution_cfg": GAUSSIAN},
-        "teacher_checkpoint": "taught",
-    },
-}
-ITERATIONS = 3
-
-
-class Batched(MLPModel):
-    """A network with running statistics that rsl_rl does not know of."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.mlp = nn.Sequential(nn.BatchNorm1d(self.obs_dim), self.mlp)
-
-
-def one_of_two() -> int:
-    """A rank: trains each of :data:`SECTIONS` and prints what came of it."""
-    gang = connect(Placement.from_env(os.environ))
-    found = {}
-    for name, section in SECTIONS.items():
-        share = Share.of(gang.rank, gang.size, 9)
-        task = GroupedPoint(PointConfig(), share.count, seed=3, first_world=share.first)
-        seed_generators(1, gang.rank)  # other weights on each rank, were they not shared
-        algorithm = build(task, {"num_steps_per_env": 8, **section}, gang, share)
-        if "teacher_checkpoint" in section:
-            algorithm.load_teacher({"policy": algorithm.algorithm.teacher.state_dict()})
-        records = train(algorithm, task, ITERATIONS)
-        state = algorithm.state_dict()
-        for record in records:
-            del record["reward"]  # of this rank's worlds
-        buffer = io.BytesIO()
-        torch.save({"state": state, "records": records}, buffer)
-        curious = getattr(algorithm.algorithm, "rnd", None)
-        normalizer = curious.state_normalizer if curious else algorithm.algorithm.get_policy().obs_normalizer
-        found[name] = {
-            "digest": hashlib.sha256(buffer.getvalue()).hexdigest(),
-            "records": records,
-            "count": int(normalizer.count),
-            "drawn": float(torch.rand(())),
-        }
-    print(json.dumps(found))
-    gang.close()
-    return 0
-
-
-def test_two_ranks_have_the_same_weights_normalizers_and_metrics() -> None:
-    ranks = run_ranks("long.learning.test_rsl_rl_learns:one_of_two", 2, timeout=300)
-    assert [code for code, _, _ in ranks] == [0, 0], ranks[0][2] + ranks[1][2]
-    one, other = (json.loads(output.splitlines()[-1]) for _, output, _ in ranks)
-    for name in SECTIONS:
-        assert one[name]["records"] == other[name]["records"], name
-        assert one[name]["digest"] == other[name]["digest"], name
-        assert one[name]["drawn"] != other[name]["drawn"], "each draws its own actions"
-        assert one[name]["count"] == ITERATIONS * 8 * 9, "of the worlds of both"

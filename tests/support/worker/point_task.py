@@ -59,7 +59,7 @@ class Point(Telling):
     ) -> None:
         self.config, self.world_count, self.device = config, world_count, device
         self.max_episode_length = round(config.control_hz * config.episode_seconds)
-        self._key = (torch.arange(first_world, first_world + world_count) * 7919 + seed * 104729).double()
+        self._key = (torch.arange(first_world, first_world + world_count) * 7919 + seed % 2**32 * 104729).double()
         self._draws = torch.zeros(world_count, dtype=torch.float64)
         self._steps = torch.zeros(world_count, dtype=torch.int64)
         self.place, self.velocity = torch.zeros(world_count), torch.zeros(world_count)

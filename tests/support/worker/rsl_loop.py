@@ -8,7 +8,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
 from tensordict import TensorDict
+from torch import nn
 
 from tests.support.worker.loop import groups, setting_of, transition_of
 from tests.support.worker.point_task import Point, PointConfig
@@ -20,8 +22,23 @@ from worker.learning.rsl.algorithm import RslRl
 from worker.learning.rsl.settings import RslRlConfig
 from worker.tasks.config import TaskConfig
 
+GAUSSIAN = {"class_name": "GaussianDistribution"}
 GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "hidden_dims": [8], "obs_normalization": True}
 """A small network with memory."""
+CURIOUS = {"num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims": [8], "weight": 1.0}
+SECTIONS: dict[str, dict[str, Any]] = {
+    "PPO with RND": {
+        "algorithm": {"rnd_cfg": {**CURIOUS, "state_normalization": True, "reward_normalization": True}},
+        "actor": {"class_name": f"{__name__}:Batched", "distribution_cfg": GAUSSIAN},
+    },
+    "GRU": {"actor": {**GRU, "distribution_cfg": GAUSSIAN}, "algorithm": {"num_mini_batches": 2}},
+    "distillation": {
+        "algorithm": {"class_name": "Distillation", "gradient_length": 8},
+        "student": {**GRU, "distribution_cfg": GAUSSIAN},
+        "teacher_checkpoint": "taught",
+    },
+}
+"""With what ranks have to share beside gradients: running statistics, curiosity, memory, a teacher."""
 
 
 class GroupedPoint(Point):
@@ -110,6 +127,14 @@ class Seen(GroupedPoint):
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         return {**super().state_tensors(), "image": self.groups["image"]}
+
+
+class Batched(MLPModel):
+    """A network with running statistics that rsl_rl does not know of."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.mlp = nn.Sequential(nn.BatchNorm1d(self.obs_dim), self.mlp)
 
 
 class Recall(GroupedPoint):
