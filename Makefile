@@ -7,6 +7,7 @@
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make mutants          small faults in the pure modules, and in a sample of PPO: which ones do the unit tests not notice?
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
+# make coverage TESTS=tests/unit   the branches of control, engines and learning that these tests never enter
 # make fuzz N=10000    malformed requests and hostile clients; no answer may be a 500, and others must be served meanwhile
 PYTHON ?= python3
 VENV   ?= .venv
@@ -16,7 +17,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test check unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
+.PHONY: run race test check coverage unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -65,6 +66,13 @@ console: $(READY) kernels
 # one after the other: no two clusters run at once
 engines: $(READY) kernels
 	$(PYTEST) -n 0 tests/cluster
+
+# branches that no test of TESTS enters
+coverage: $(READY) kernels
+	rm -rf build/coverage
+	$(BIN)/coverage run -m pytest -q $(or $(TESTS),tests/unit) || echo "tests failed: the figures are of what ran"
+	$(BIN)/coverage combine -q && $(BIN)/coverage json -q -o build/coverage/branches.json
+	$(BIN)/python -m tests.support.suite.branches build/coverage/branches.json
 
 # kept in the user's cache, for other clones and later runs
 kernels: $(READY)
