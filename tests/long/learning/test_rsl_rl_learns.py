@@ -14,7 +14,8 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from tests.support.worker.loop import groups
-from tests.support.worker.rsl_loop import GAUSSIAN, LARGE_GRU, Recall, build, evaluate, train
+from tests.support.worker.rsl_loop import GAUSSIAN, Recall, build, evaluate, train
+from tests.support.worker.rsl_loop import GRU as SMALL_GRU
 from worker.learning.rsl.algorithm import RslRl
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.rsl_rl_env import TaskVecEnv, make
@@ -22,6 +23,7 @@ from worker.tasks.rsl_rl_env import TaskVecEnv, make
 torch.set_num_threads(1)
 warp.config.log_level = warp.LOG_WARNING
 
+GRU = {**SMALL_GRU, "rnn_hidden_dim": 32, "hidden_dims": [32]}
 HELD = 24.0
 """Return of a cart-pole that is held upright near the middle for all of its 300 steps, of 30 at most."""
 
@@ -61,7 +63,7 @@ def test_an_empty_section_holds_the_pole(teacher: RslRl) -> None:
 
 def test_a_gru_holds_the_pole_without_seeing_velocities() -> None:
     task = without_velocities(cartpole())
-    algorithm = learner(task, {"num_steps_per_env": 16, "actor": {**LARGE_GRU, "distribution_cfg": GAUSSIAN}})
+    algorithm = learner(task, {"num_steps_per_env": 16, "actor": {**GRU, "distribution_cfg": GAUSSIAN}})
     train(algorithm, task, 50)
     mean_return, mean_length = evaluate(algorithm.policy(), task)
     assert mean_length > 295.0 and mean_return > HELD
@@ -72,7 +74,7 @@ def test_only_a_network_with_memory_learns_what_was_said_at_the_beginning(
     recurrent: bool, least: float, most: float
 ) -> None:
     task = Recall(64, seed=1)
-    network = {**LARGE_GRU, "rnn_hidden_dim": 16} if recurrent else {"class_name": "MLPModel", "hidden_dims": [32]}
+    network = {**GRU, "rnn_hidden_dim": 16} if recurrent else {"class_name": "MLPModel", "hidden_dims": [32]}
     algorithm = learner(
         task,
         {
@@ -134,7 +136,7 @@ def test_a_student_without_velocities_learns_from_a_teacher_that_sees_them(teach
             "num_steps_per_env": 15,
             "obs_groups": {"student": ["policy"], "teacher": ["critic"]},
             "algorithm": {"class_name": "Distillation", "gradient_length": 5, "learning_rate": 3.0e-3},
-            "student": {**LARGE_GRU, "distribution_cfg": {**GAUSSIAN, "init_std": 0.1}},
+            "student": {**GRU, "distribution_cfg": {**GAUSSIAN, "init_std": 0.1}},
             "teacher_checkpoint": "taught",
         },
     )

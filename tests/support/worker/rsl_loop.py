@@ -25,17 +25,16 @@ from worker.tasks.config import TaskConfig
 GAUSSIAN = {"class_name": "GaussianDistribution"}
 GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "hidden_dims": [8], "obs_normalization": True}
 """A small network with memory."""
-LARGE_GRU = {**GRU, "rnn_hidden_dim": 32, "hidden_dims": [32]}
 CURIOUS = {"num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims": [8], "weight": 1.0}
 SECTIONS: dict[str, dict[str, Any]] = {
     "PPO with RND": {
         "algorithm": {"rnd_cfg": {**CURIOUS, "state_normalization": True, "reward_normalization": True}},
         "actor": {"class_name": f"{__name__}:Batched", "distribution_cfg": GAUSSIAN},
     },
-    "GRU": {"actor": {**LARGE_GRU, "distribution_cfg": GAUSSIAN}, "algorithm": {"num_mini_batches": 2}},
+    "GRU": {"actor": {**GRU, "distribution_cfg": GAUSSIAN}, "algorithm": {"num_mini_batches": 2}},
     "distillation": {
         "algorithm": {"class_name": "Distillation", "gradient_length": 8},
-        "student": {**LARGE_GRU, "distribution_cfg": GAUSSIAN},
+        "student": {**GRU, "distribution_cfg": GAUSSIAN},
         "teacher_checkpoint": "taught",
     },
 }
