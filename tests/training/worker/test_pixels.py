@@ -1,4 +1,4 @@
-"""A camera in every world: what it sees by hand, learning from bytes, export. Stacks and scenes that differ: tests/robots."""
+"""A camera in every world: what it sees by hand, stacks, differing scenes, learning from bytes, export."""
 
 from __future__ import annotations
 
@@ -51,6 +51,40 @@ def test_the_image_shows_the_cart_where_a_pinhole_puts_it(pixels: CartpolePixels
         expected = 32.0 + 32.0 * place / half_width - 0.5
         # the face of the cart that is seen is 0.12 m nearer than its middle
         assert cart_column(pixels.observations[world, :3]) == pytest.approx(expected, abs=1.5)
+
+
+def test_an_observation_is_the_present_image_and_the_one_before(pixels: CartpolePixels) -> None:
+    put(pixels, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[1.2, 0.0]] * 4)
+    assert torch.equal(pixels.observations[:, :3], pixels.observations[:, 3:]), (
+        "an episode's first image stands for both"
+    )
+    for _ in range(6):
+        before = pixels.observations.clone()
+        pixels.step(torch.zeros(4, 1))
+        assert torch.equal(pixels.observations[:, 3:], before[:, :3])
+    assert not torch.equal(pixels.observations[:, :3], pixels.observations[:, 3:]), (
+        "the cart moved by 2 cm: half a pixel"
+    )
+    put(pixels, joint_q=[[0.0, 0.0]] * 3 + [[1.39, 0.0]], joint_qd=[[0.0, 0.0]] * 3 + [[3.0, 0.0]])
+    pixels.step(torch.zeros(4, 1))
+    assert pixels.dones.tolist() == [False, False, False, True]
+    assert torch.equal(pixels.observations[3, :3], pixels.observations[3, 3:]), "a new episode"
+    assert cart_column(pixels.observations[3, :3]) < 45, "and it is the new place that is seen"
+
+
+def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> None:
+    def build(count: int, first: int = 0, **scene: object) -> torch.Tensor:
+        config = CartpolePixelsConfig(start_position=0.0, start_angle=0.0, randomize=Randomization(**scene))
+        return CartpolePixels(config, count, seed=3, first_world=first).observations.clone()
+
+    plain = build(3)
+    assert torch.equal(plain[0], plain[1]), "the same start, the same image"
+    for scene in ({"camera_position": 0.3}, {"camera_angle": 0.1}, {"colors": 0.5}, {"light": (0.4, 0.9)}):
+        images = build(3, **scene)
+        assert not torch.equal(images[0], images[1]) and not torch.equal(images[1], images[2]), scene
+        assert torch.equal(images[2:], build(1, first=2, **scene)), scene
+    dark = build(2, light=(0.5, 0.5))
+    assert torch.equal(dark[0, :3, 0, 0], (SKY.float() * 0.5).round().to(torch.uint8))
 
 
 @pytest.mark.parametrize(
