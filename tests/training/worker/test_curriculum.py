@@ -8,14 +8,11 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.epoch import raise_epoch
 from tests.support.worker.ranks import training
+from tests.support.worker.runs import train
 from tests.support.worker.tasks import observe, put
-from worker.distributed import Gang, Placement
 from worker.errors import UserError
-from worker.learning.job import Job, StopRequest, configure
-from worker.learning.loop import Loop
-from worker.learning.training import Training
+from worker.learning.job import configure
 from worker.tasks.ant import Ant
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.config import value_at
@@ -56,23 +53,20 @@ def test_the_level_scales_the_quadrupeds_commands() -> None:
 @pytest.mark.parametrize(
     ("curriculum", "message"),
     [
-        (
-            {"forwards": [[0, 1.0]]},
-            "train.config.curriculum.forwards: there is no such term; did you mean forward?",
-        ),
+        ({"forwards": [[0, 1.0]]}, "curriculum.forwards: there is no such term; did you mean forward?"),
         ({"forward": [[-1, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up, found [[-1, 1.0]]"),
         ({"forward": [[2.5, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up"),
         ({"forward": 3}, "curriculum.forward: expected points [iteration, value], found 3"),
         ({"forward": [[0, "x"]]}, "curriculum.forward: expected points [iteration, value], found [[0, 'x']]"),
         ({"forward": [[5, 1.0], [5, 2.0]]}, "curriculum.forward: the iterations of its points must grow"),
         ({"level": [[0, 2.0]]}, "curriculum.level: expected levels from 0 to 1"),
-        ([1], "train.config.curriculum: expected a mapping, found a list"),
+        ([1], "curriculum: expected a mapping, found a list"),
     ],
 )
 def test_a_curriculum_that_cannot_be_is_refused_in_one_line(curriculum: Any, message: str) -> None:
     with pytest.raises(UserError) as refusal:
         configure(Ant, {"config": {"curriculum": curriculum}})
-    assert message in str(refusal.value) and "\n" not in str(refusal.value)
+    assert f"train.config.{message}" in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 def test_a_tasks_own_hook_is_called_before_every_iteration_and_goes_on_after_a_restart(tmp_path: Path) -> None:
@@ -84,10 +78,7 @@ def test_a_tasks_own_hook_is_called_before_every_iteration_and_goes_on_after_a_r
             calls.append((iteration, reward, episode_length))
 
     for iterations, epoch in ((2, 1), (4, 2)):
-        env = training(tmp_path, iterations=iterations, epoch=epoch, worlds=8, task="Cartpole")
-        job = Job.from_env(env, "train")
-        raise_epoch(job.run, epoch)
-        Loop(Training.of(job, Watched), Gang(Placement(), "cpu", None, ["here"]), StopRequest()).train()
+        train(training(tmp_path, iterations=iterations, epoch=epoch, worlds=8, task="Cartpole"), task=Watched)
     # before each iteration, and before the evaluation at the end, which is of the last one's task
     assert [call[0] for call in calls] == [0, 1, 1, 2, 3, 3] and calls[0][1] is None
     assert calls[-1][1] is not None and calls[-1][2] > 1

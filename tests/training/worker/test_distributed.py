@@ -141,7 +141,7 @@ def test_ranks_that_torchrun_starts_meet_at_its_store(tmp_path: Path) -> None:
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script)]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=180, env={**os.environ, "PYTHONPATH": str(ROOT)}
+        command, capture_output=True, text=True, timeout=60 * PATIENCE, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("sum 3.0 from 0") == 2
@@ -158,15 +158,17 @@ def test_the_store_listens_on_the_main_nodes_address_alone() -> None:
         os.close(held)
 
 
-def build(warm: Path | None, sites: list[str]) -> list[tuple[str, int]]:
-    """Two ranks, as threads, that each take a moment to build; the order of their starts and ends."""
+def build(warm: Path | None, sites: list[str], is_taken_in_turn: bool) -> list[tuple[str, int]]:
+    """Two ranks, as threads, that each build; the order of their starts and ends. Those that need not wait meet while they build."""
     store, events = dist.HashStore(), []
+    meeting = threading.Barrier(1 if is_taken_in_turn else 2)
 
     def rank(number: int) -> None:
         gang = Gang(Placement(rank=number, world_size=2), "cpu", store, sites)
         with gang.build_in_turn(warm):
             events.append(("start", number))
-            time.sleep(0.3)
+            time.sleep(0.1)  # in which one that does not wait would come, too
+            meeting.wait(20 * PATIENCE)
             events.append(("end", number))
 
     threads = [threading.Thread(target=rank, args=(number,)) for number in (0, 1)]
@@ -179,13 +181,15 @@ def build(warm: Path | None, sites: list[str]) -> list[tuple[str, int]]:
 
 def test_a_cold_cache_is_filled_by_one_rank_first(tmp_path: Path) -> None:
     marker = tmp_path / "built"
-    assert build(marker, ["host:cache"] * 2) == [("start", 0), ("end", 0), ("start", 1), ("end", 1)]
+    expected = [("start", 0), ("end", 0), ("start", 1), ("end", 1)]
+    assert build(marker, ["host:cache"] * 2, is_taken_in_turn=True) == expected
     assert marker.exists()
 
 
 @pytest.mark.parametrize("warm", [True, False])
 def test_no_rank_waits_for_a_warm_cache_or_for_another_hosts(tmp_path: Path, warm: bool) -> None:
-    events = build(tmp_path if warm else tmp_path / "cold", ["a:cache", "a:cache" if warm else "b:cache"])
+    sites = ["a:cache", "a:cache" if warm else "b:cache"]
+    events = build(tmp_path if warm else tmp_path / "cold", sites, is_taken_in_turn=False)
     assert [kind for kind, _ in events] == ["start", "start", "end", "end"]
 
 

@@ -6,25 +6,20 @@ import dataclasses
 import math
 from pathlib import Path
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
 
 from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.support.worker.ranks import training
-from tests.support.worker.runs import assert_same_bits, last
+from tests.support.worker.runs import assert_same_bits, last, runner, train
 from tests.support.worker.tasks import put
-from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.export import export
 from worker.learning import algorithms
-from worker.learning.job import Job, StopRequest, configure
+from worker.learning.job import configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
-from worker.learning.training import Training
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
 from worker.tasks.config import Randomization
@@ -95,26 +90,20 @@ def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> Non
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (
-            {"camera": {"samples": 0}},
-            "train.config.camera.samples: expected a value greater than or equal to 1, found 0",
-        ),
-        ({"camera": {"fov": 4.0}}, "train.config.camera.fov: expected a value less than 3.14159"),
+        ({"camera": {"samples": 0}}, "camera.samples: expected a value greater than or equal to 1, found 0"),
+        ({"camera": {"fov": 4.0}}, "camera.fov: expected a value less than 3.14159"),
         ({"camera": {"target": [0.0, -3.2, 1.4]}}, "camera.target: the camera stands there"),
         ({"camera": {"position": [0.0, 1.0]}}, "camera.position: expected [x, y, z], found [0.0, 1.0]"),
         ({"camera": {"target": [0.0, math.nan, 1.0]}}, "camera.target: expected [x, y, z], found [0.0, nan, 1.0]"),
-        ({"camera": {"witdh": 32}}, "train.config.camera.witdh: CameraConfig has no such key; did you mean width?"),
-        ({"randomize": {"light": [1.0]}}, "light: expected [least, greatest]"),
-        (
-            {"randomize": {"colors": -1.0}},
-            "train.config.randomize.colors: expected a value greater than or equal to 0, found -1.0",
-        ),
+        ({"camera": {"witdh": 32}}, "camera.witdh: CameraConfig has no such key; did you mean width?"),
+        ({"randomize": {"light": [1.0]}}, "randomize.light: expected [least, greatest]"),
+        ({"randomize": {"colors": -1.0}}, "randomize.colors: expected a value greater than or equal to 0, found -1.0"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_in_one_line(config: dict, message: str) -> None:
     with pytest.raises(UserError) as refusal:
         configure(CartpolePixels, {"config": config})
-    assert message in str(refusal.value) and "\n" not in str(refusal.value)
+    assert f"train.config.{message}" in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 def test_what_only_a_camera_sees_needs_one_and_the_other_way_round() -> None:
@@ -126,11 +115,7 @@ def test_what_only_a_camera_sees_needs_one_and_the_other_way_round() -> None:
 
 def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Loop:
     env = training(path, run=name, iterations=iterations, epoch=epoch, worlds=4, task="CartpolePixels")
-    job = Job.from_env(env, "train")
-    raise_epoch(job.run, epoch)
-    started = Loop(Training.of(job, CartpolePixels), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
-    assert started.train() == 0
-    return started
+    return train(env, task=CartpolePixels)
 
 
 def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_path: Path) -> None:
@@ -151,24 +136,6 @@ def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_pat
     assert [axis.dim_value for axis in kind.shape.dim][1:] == [6, 64, 64]
 
 
-def test_it_is_a_gymnasium_environment_of_images() -> None:
-    worlds = gymnasium.make_vec(
-        "worker.tasks.gym:Muster/CartpolePixels-v0",
-        num_envs=2,
-        episode_seconds=0.05,
-        camera={"position": (0.0, -3.2, 1.4), "target": (0.0, 0.0, 1.4)},
-    )
-    first, _ = worlds.reset(seed=1)
-    assert worlds.single_observation_space == gymnasium.spaces.Box(0, 255, (6, 64, 64), np.uint8)
-    assert worlds.observation_space.contains(first)
-    seen = first
-    for _ in range(3):
-        before = seen
-        seen, _, _, truncated, info = worlds.step(np.zeros((2, 1), np.float32))
-    assert truncated.all() and np.array_equal(info["final_obs"][0], before[0]), "the last image of the episode"
-    worlds.close()
-
-
 @pytest.mark.parametrize(
     ("ppo", "camera"), [({}, {"width": 32, "height": 32}), ({}, {"height": 16}), ({"strides": [8, 8, 8]}, {})]
 )
@@ -177,11 +144,7 @@ def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: P
     with pytest.raises(
         UserError, match=r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
     ):
-        Loop(
-            Training.of(Job.from_env(env, "train"), CartpolePixels),
-            Gang(Placement(), "cpu", None, ["here"]),
-            StopRequest(),
-        )
+        runner(env, task=CartpolePixels)
 
 
 def test_layers_of_the_network_have_to_match() -> None:

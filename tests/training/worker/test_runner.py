@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +12,16 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import worker.export
+import worker.train
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import PATIENCE
+from tests.support.worker.in_process import call_worker
 from tests.support.worker.point_task import Point
-from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
+from tests.support.worker.ranks import free_port, run_ranks, start_rank, training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.distributed import Placement
 from worker.errors import TrainingError, UserError
@@ -278,10 +279,7 @@ def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> 
             {"algorithm": "pppo"},
             "train.algorithm: no algorithm is called 'pppo'; known: ppo, rsl_rl, sac, and module:Class",
         ),
-        (
-            {"algorithm": "tests.support.worker.point_task:Point"},
-            "is no algorithm: it lacks captures_rollout, begin, act",
-        ),
+        ({"algorithm": f"{Point.__module__}:Point"}, "is no algorithm: it lacks captures_rollout, begin, act"),
     ],
 )
 def test_wrong_overrides_are_refused(section: dict, message: str) -> None:
@@ -316,15 +314,11 @@ def test_user_errors_are_one_line_and_reach_the_supervisor(
 ) -> None:
     errors = tmp_path / "error.json"
     env = {
-        **os.environ,
         **training(tmp_path),
         "TORCHELASTIC_ERROR_FILE": str(errors),
-        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+        "MUSTER_SPEC": json.dumps(spec) if spec else "",
     }
-    env["MUSTER_SPEC"] = json.dumps(spec) if spec else ""
-    done = subprocess.run(
-        [sys.executable, "-m", f"worker.{command}"], env=env, cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
+    done = call_worker({"train": worker.train.main, "export": worker.export.main}[command], env)
     assert done.returncode == code
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith("error: ") and message in line
@@ -333,11 +327,9 @@ def test_user_errors_are_one_line_and_reach_the_supervisor(
 
 def test_an_unexpected_error_shows_its_traceback(tmp_path: Path) -> None:
     errors = tmp_path / "error.json"
-    ((code, _, shown),) = run_ranks(
-        "training.worker.test_runner:break_down", 1, {"TORCHELASTIC_ERROR_FILE": str(errors)}
-    )
+    done = call_worker(break_down, {"TORCHELASTIC_ERROR_FILE": str(errors)})
     message = json.loads(errors.read_text())["message"]
-    assert code == 1 and "Traceback" in shown
+    assert done.returncode == 1 and "Traceback" in done.stderr
     assert message["message"] == "ValueError: a defect" and "break_down" in message["extraInfo"]["py_callstack"]
     assert int(message["extraInfo"]["timestamp"]) > 0
 

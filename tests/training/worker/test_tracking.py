@@ -23,7 +23,7 @@ from shared_store.epoch import raise_epoch
 from shared_store.layout import Run, Store
 from shared_store.metrics import read_metrics
 from tests.conftest import PATIENCE, wait_for
-from tests.support.worker.ranks import ROOT, free_port
+from tests.support.worker.ranks import ROOT, free_port, placement
 from tests.support.worker.wandb_files import history, records
 
 TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 40, "seed": 5, "config": {"episode_seconds": 0.5}}
@@ -42,9 +42,8 @@ def train(run: Run, epoch: int, track: dict[str, Any], **env: str) -> tuple[int,
     spec = {"name": "taught", "train": TRAIN, "track": track, "checkpoint": {"every": 10, "keep": 5}}
     given = {
         **{"MUSTER_STORE": str(run.path.parent.parent), "MUSTER_RUN": run.name, "MUSTER_EPOCH": str(epoch)},
-        **{"MUSTER_JOB_EPOCH": "1", "MUSTER_JOB_ID": "job", "MUSTER_SPEC": json.dumps(spec), "OMP_NUM_THREADS": "1"},
-        **{"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1", "CUDA_VISIBLE_DEVICES": ""},
-        **{"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "HOME": str(run.path), "NETRC": "/dev/null"},
+        **{"MUSTER_JOB_EPOCH": "1", "MUSTER_JOB_ID": "job", "MUSTER_SPEC": json.dumps(spec)},
+        **{**placement(), "HOME": str(run.path), "NETRC": "/dev/null"},
     }
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("WANDB_", "MLFLOW_"))}
     done = subprocess.run(
