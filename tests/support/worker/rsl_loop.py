@@ -134,7 +134,7 @@ class Batched(MLPModel):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.mlp: nn.Module = nn.Sequential(nn.BatchNorm1d(self.obs_dim), self.mlp)
+        self.mlp = nn.Sequential(nn.BatchNorm1d(self.obs_dim), self.mlp)  # type: ignore[assignment]  # rsl_rl wants its own MLP
 
 
 class Recall(GroupedPoint):
