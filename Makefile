@@ -83,7 +83,7 @@ robots-kernels: $(READY)
 
 # W&B, MLflow and LEAPP (130 MB); pandas for MLflow's own server, which the extra has without it
 tracking: $(READY)
-	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
+	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --no-warn-conflicts --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -14,6 +14,7 @@ muster logs stopped -f | grep -m1 checkpoint
 muster stop stopped
 run=$(muster show stopped --json | python -c 'import json, sys; print(json.load(sys.stdin)["run"])')
 muster resume $run --nodes 2 --set train.iterations=60 --follow
+muster logs stopped | grep "on 2 ranks"
 kill $!
 make race
 """

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 class Ended(NamedTuple):
     """Episodes that ended in one iteration, over all ranks."""
 
-    steps: int
+    steps: float
     """Control steps of each world."""
     episodes: float
     """Number of episodes that ended."""
@@ -100,7 +100,7 @@ class Progress:
         self.recent.append(list(Ended(steps, episodes, returns, squares)))
         span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
-            entry = Ended._make(self.recent[index])
+            entry = Ended(*self.recent[index])
             span, ended = span + entry.steps, ended + entry.episodes
             total, spread = total + entry.returns, spread + entry.squares
             if span >= longest and ended >= max(EPISODES, worlds):
