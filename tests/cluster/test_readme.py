@@ -13,8 +13,9 @@ muster submit job_specs/cartpole.yaml --set name=stopped --set train.iterations=
 muster logs stopped -f | grep -m1 checkpoint
 muster stop stopped
 run=$(muster show stopped --json | python -c 'import json, sys; print(json.load(sys.stdin)["run"])')
-muster resume $run --nodes 2 --set train.iterations=60 --follow
-muster logs stopped | grep "on 2 ranks"
+muster resume $run --nodes 2
+muster logs stopped -f | grep -m1 "on 2 ranks"
+muster stop stopped
 kill $!
 make race
 """
