@@ -137,7 +137,8 @@ def test_what_the_shim_was_started_to_ignore_is_not_ignored_below_it() -> None:
     shell = ["sh", "-c", 'trap "" HUP INT QUIT PIPE CHLD USR1 ALRM; exec "$@"', "sh"]
     shim = subprocess.run([*shell, *shimmed(["sh", "-c", script])], stderr=subprocess.PIPE, text=True)
     assert shim.returncode == 3, "known although SIGCHLD was ignored"
-    assert int(shim.stderr.split()[1], 16) == 0
+    resettable = sum(1 << number - 1 for number in signal.valid_signals())  # the C library keeps 32 and 33
+    assert int(shim.stderr.split()[1], 16) & resettable == 0
 
 
 def test_a_shim_stopped_by_a_job_still_ends(group: str, pids: Path) -> None:
