@@ -34,7 +34,7 @@ MUSTER = str(Path(sys.executable).parent / "muster")
 
 os.environ.setdefault("WARP_CACHE_PATH", str(kernel_cache()))
 
-# A loaded machine draws and runs examples slowly; that is no fault of the test.
+# A loaded machine draws and runs examples slowly; the test is not at fault.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
 
@@ -43,7 +43,7 @@ os.environ.setdefault("MUSTER_PICTURE", "0")
 
 
 def call_muster(*arguments: str, home: Path, cwd: Path = REPOSITORY, **env: str) -> subprocess.CompletedProcess[str]:
-    """The command in this process, which is a second quicker than one of its own; nobody is there to answer a question."""
+    """Run the command in this process, a second quicker than in a new one. Its standard input is empty."""
     assert threading.current_thread() is threading.main_thread(), "it replaces what all threads share"
     said, errors = io.StringIO(), io.StringIO()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
