@@ -116,7 +116,7 @@ class Gang:
         return int(tensor.item())
 
     def tell(self, text: str | None) -> str | None:
-        """The main rank's ``text``, on every rank."""
+        """The main rank's ``text``, on every rank. Raises GangError if the main rank has ended."""
         if self.store is None:
             return text
         self._messages += 1
@@ -124,7 +124,10 @@ class Gang:
         if self.is_main:
             self.store.set(key, "-" if text is None else f"+{text}")
             return text
-        answer = self.store.get(key).decode()
+        try:
+            answer = self.store.get(key).decode()
+        except dist.DistError as error:  # it holds the store
+            raise GangError("the main rank ended before it answered; its log gives the reason") from error
         return answer[1:] if answer.startswith("+") else None
 
     @contextlib.contextmanager

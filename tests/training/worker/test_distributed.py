@@ -14,8 +14,10 @@ import pytest
 import torch
 import torch.distributed as dist
 
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
 from tests.conftest import PATIENCE
-from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank
+from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
 from worker.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
 from worker.errors import GangError
 
@@ -117,6 +119,14 @@ def test_a_missing_main_rank_is_named() -> None:
         GangError, match=r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
     ):
         connect(placement, report_seconds=1.0)
+
+
+def test_ranks_whose_main_rank_ends_at_the_resume_say_so_in_one_line(tmp_path: Path) -> None:
+    raise_epoch(Store(tmp_path).run("run"), 2)
+    (main, _, reason), (other, _, errors) = run_ranks("train", 2, training(tmp_path, epoch=1))
+    assert main == other == 1 and "now belongs to epoch 2" in reason
+    assert "error: the main rank ended before it answered; its log gives the reason" in errors
+    assert "Traceback" not in reason + errors
 
 
 def test_a_port_in_use_is_named() -> None:
