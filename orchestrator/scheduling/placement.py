@@ -79,7 +79,7 @@ def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:
         if found < count:
             at_least = "at least " if shape.minimum < len(shape.nodes) else ""
             there = f"there {'is' if found == 1 else 'are'} {found}"
-            return f"needs {at_least}{count} host{'s' if count != 1 else ''}{what}, one for each node; {there}"
+            return f"needs {at_least}{count} hosts{what}, one for each node; {there}"
     return None
 
 
@@ -124,7 +124,7 @@ def amounts(resources: Resources) -> str:
 
 def count_of(number: float, what: str) -> str:
     """``1 CPU``, ``2.5 CPUs``, ``96000 CPUs``."""
-    text = f"{round(number, 2):.2f}".rstrip("0").rstrip(".")
+    text = f"{number:.2f}".rstrip("0").rstrip(".")
     return f"{text} {what}{'s' if text != '1' else ''}"
 
 

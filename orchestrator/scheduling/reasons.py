@@ -48,11 +48,11 @@ class WaitReport:
         reservations: Sequence[Reservation],
         free: FreeResources,
         preempts: Sequence[_Preemption],
-        drift: int = 0,
+        drift: int,
     ) -> None:
         """Args:
         now: Time of the pass [ms].
-        lines: By queue.
+        orders: By queue.
         reservations: In the order in which they came.
         free: The free resources after the pass.
         preempts: The preempted jobs, and the jobs for which they leave.

@@ -59,14 +59,24 @@ GROUPS = (
     Group(
         ["shared_store/epoch.py", "shared_store/checkpoints.py", "shared_store/policy_contract.py"],
         [
-            *(f"{_UNIT}/shared_store/test_{name}.py" for name in ("epoch", "checkpoints", "policy_contract")),
+            *(
+                f"{_UNIT}/shared_store/test_{name}.py"
+                for name in (
+                    "epoch",
+                    "checkpoints",
+                    "evaluations",
+                    "parent",
+                    "policy_contract",
+                    "policy_contract_edges",
+                )
+            ),
             *(f"{_UNIT}/policy_node/test_{name}.py" for name in ("choices", "observations", "runner")),
         ],
         options=["--noconftest"],
     ),
     Group(
         ["worker/learning/ppo/*.py"],
-        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "algorithms", "memory")],
+        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "algorithms")],
         sample=200,
         bounds_memory=False,
     ),

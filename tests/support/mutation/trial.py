@@ -1,8 +1,8 @@
 """Tries mutants: each in a forked child, on the tests that run its line, the quickest first.
 
 A fault in a function replaces the function's code, in a child of a process that has collected all tests. A fault in what runs at the import,
-or in a kernel, is tried in a child of a process that has only the libraries: there the module is imported with its fault, and the tests are
-collected anew. No file is written.
+or in a kernel, is tried on all tests in a child of a process that has only the libraries: there the module is imported with its fault, and
+the tests are collected anew. No file is written.
 """
 
 from __future__ import annotations
@@ -66,11 +66,9 @@ class Reach:
     libraries: tuple[str, ...] = ()
     """The modules of others that the tests import."""
 
-    def tests(self, module: str, line: int | None) -> list[str]:
-        """The tests that reach a line of the module, or any; the quickest first."""
-        found = [
-            test for (test, where), seen in self.lines.items() if where == module and (line is None or line in seen)
-        ]
+    def tests(self, module: str, line: int) -> list[str]:
+        """The tests that reach a line of the module, the quickest first."""
+        found = [test for (test, where), seen in self.lines.items() if where == module and line in seen]
         return sorted(found, key=lambda test: (self.seconds[test], test))
 
 
@@ -116,12 +114,11 @@ class _Run:
         for name in self.reach.libraries:
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
+        tests = sorted(self.reach.seconds, key=self.reach.seconds.__getitem__)
         later = [(module, mutant) for module, mutant in self.mutants if not _is_quick(mutant)]
         if later:
-            tests = self.reach.tests(later[0][0], None)
             self._need(_in_child(lambda: self._anew(later[0][0], None, tests)))
         for module, mutant in later:
-            tests = self.reach.tests(module, None)
             self._try(module, mutant, tests, partial(self._anew, module, mutant.number, tests))
 
     def _set_kernels_apart(self) -> None:

@@ -186,6 +186,18 @@ def test_a_choice_that_is_missing_or_damaged_is_never_replaced_by_a_guess(run: R
         newest_checkpoint(run, chosen="00000025-e1", chosen_since=2)
 
 
+def test_a_run_whose_folder_of_checkpoints_is_a_file_has_none(run: Run) -> None:
+    run.checkpoints.write_text("")
+    assert list_checkpoints(run) == [] and newest(run) == ""
+
+
+def test_a_checkpoint_says_whether_the_job_asked_for_it(run: Run) -> None:
+    asked, early, damaged = commit(run, 1), commit(run, 2, scheduled=False), commit(run, 3, scheduled=False)
+    delete("manifest.json")(damaged.path)
+    said = [Checkpoint(each.path, each.iteration, each.epoch).is_scheduled for each in (asked, early, damaged)]
+    assert said == [True, False, True]
+
+
 # -- damage -----------------------------------------------------------------------------------------------------------
 
 
@@ -250,7 +262,12 @@ DAMAGES = {
     "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
     "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
     "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
-    "a reward that is a list": (edit(reward=[1]), "manifest.json: reward is not a number"),
+    "no format": (edit(format=None), "manifest.json has no format"),
+    **{
+        f"a {key} that is a list": (edit(**{key: [1]}), f"manifest.json: {key} is not a number")
+        for key in ("created", "reward", "score", "score_error", "worlds", "world_size")
+    },
+    "two files that are gone": (lambda path: (delete("rank-1.pt")(path), delete("learner.pt")(path)), "learner.pt is"),
     "a newer format": (
         edit(format=FORMAT + 1),
         f"has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster",

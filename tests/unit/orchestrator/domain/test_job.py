@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 
+from orchestrator.domain.attempt import Phase
 from orchestrator.domain.job import TRANSITIONS, Ending, NodeEnd, Status, check_transition, judge
 
 S = Status
@@ -41,6 +42,11 @@ def test_an_ended_job_stays_ended_and_every_other_one_can_end() -> None:
         assert status.is_terminal == (not TRANSITIONS[status])
         assert status.is_terminal or Status.FAILED in TRANSITIONS[status]
     assert [status for status in Status if status.is_terminal] == [Status.SUCCEEDED, Status.FAILED]
+
+
+def test_databases_of_older_controllers_hold_these_words() -> None:
+    assert [each.value for each in Status] == [each.name for each in Status]
+    assert [each.value for each in (*Ending, *Phase)] == [each.name.lower() for each in (*Ending, *Phase)]
 
 
 RUNS, DONE, FAILED, LEFT = None, 0, 1, 75

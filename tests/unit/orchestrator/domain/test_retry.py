@@ -20,6 +20,7 @@ CASES = {
     "a star in front is a star": ([{**EXIT, "onReason": "*killed"}], 1, True),
     "the reason matches": ([{**EXIT, "onReason": "OutOfMemory*"}], 1, False),
     "the status reason matches": ([{**EXIT, "onStatusReason": "Host*"}], 1, False),
+    "another status reason does not": ([{**EXIT, "onStatusReason": "Network*"}], 1, True),
     "all that is named has to match": ([{**EXIT, "onExitCode": "1", "onReason": "no*"}], 1, True),
     "an empty pattern is not named": ([{**EXIT, "onExitCode": "1", "onReason": ""}], 1, False),
     "without a container there is no code": ([{**EXIT, "onExitCode": "*"}], None, False),

@@ -103,6 +103,12 @@ def test_the_use_of_a_share_is_weighted_by_its_name_or_its_longest_prefix() -> N
     assert [decayed(8.0, age, half) for age, half in ((0, 9), (-9, 9), (9, 9), (600, 0), (1, 1))] == [8, 8, 4, 4, 4]
 
 
+def test_jobs_and_gangs_without_a_share_have_one_in_common() -> None:
+    found = quota_of(queue(policy=HALF), [job("x")], [running("y", share=None), running("z", share="")], {})
+    assert found is not None and found.active == 1
+    assert found.used_of("new", False) == found.used_of("new", True) == 0
+
+
 def test_a_quota_counts_active_shares_and_the_queue_s_own_gangs() -> None:
     assert quota_of(queue(), [], [], {}) is None and quota_of(queue(policy=FairShare(600, 0, {})), [], [], {}) is None
     held = [

@@ -13,7 +13,7 @@ from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
 from orchestrator.scheduling.fit import fit
 from orchestrator.scheduling.placement import never_fits, place
-from tests.support.orchestrator.scheduling import Pass, environment, gang, host, job, node, queue, seats
+from tests.support.orchestrator.scheduling import Pass, environment, gang, host, job, node, on, queue, running, seats
 
 
 def where(shape: Shape, *hosts: Host) -> str | None:
@@ -54,6 +54,13 @@ WHERE: dict[str, tuple[Shape, list[Host], str | None]] = {
     ),
     "memory counts": (gang(HUNGRY, HUNGRY), [host("a"), host("b")], "a b"),
     "and may be too little": (gang(HUNGRY, HUNGRY, HUNGRY), [host("a"), host("b")], None),
+    "and counts to the last MiB": (gang(*[node(1, 0, 1)] * 3), [host(memory=2)], None),
+    "no GPU is given twice": (gang(*[node(1, 2)] * 2), [host(gpus=3)], None),
+    "a host is filled before a tighter one": (
+        gang(node(2), node(1)),
+        [host("large", 8), host("small", 2)],
+        "large large",
+    ),
     "nodes that take nothing fit anywhere": (gang(*[Resources(0, 0, 0)] * 3), [host(cpus=0, memory=0)], "a a a"),
 }
 
@@ -96,6 +103,7 @@ def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Hos
         ([node(0.5)] * 3, 3, "needs 3 hosts, one for each node; there are 2"),
         ([node(0.5)] * 4, 3, "needs at least 3 hosts, one for each node; there are 2"),
         ([node(1, 1)] * 2, 2, "needs 2 hosts with 1 CPU, 1 GPU, 100 MiB, one for each node; there is 1"),
+        ([node(1, 1)] * 3, 2, "needs at least 2 hosts with 1 CPU, 1 GPU, 100 MiB, one for each node; there is 1"),
     ],
 )
 def test_a_lack_of_hosts_for_one_node_each_is_counted_in_hosts(nodes: list[Resources], minimum: int, why: str) -> None:
@@ -105,9 +113,29 @@ def test_a_lack_of_hosts_for_one_node_each_is_counted_in_hosts(nodes: list[Resou
     assert never_fits(shape, hosts, elastic=True) is None, "more may come"
 
 
+def test_where_hosts_for_one_node_each_are_enough_in_number_the_sum_of_resources_is_what_lacks() -> None:
+    unlike = gang(node(1, 1), node(4, 0, 200))
+    lacking = "needs 2 nodes with 5 CPUs, 1 GPU, 300 MiB in all; all hosts together have 5 CPUs, 1 GPU, 16 GiB"
+    assert never_fits(unlike, [single("a", 4, 1), single("b", 1)]) == lacking
+    shared = [single("a", 2), host("b", 2)]
+    assert never_fits(gang(*[node(2)] * 3), shared) == (
+        "needs 3 nodes with 6 CPUs, 0 GPUs, 300 MiB in all; all hosts together have 4 CPUs, 0 GPUs, 16 GiB"
+    )
+
+
+def test_what_the_queue_of_an_engine_gives_at_most_is_named_in_place_of_hosts() -> None:
+    limited = [replace(host("slurm/main", 4), queue=True)]
+    most = "queue slurm/main gives a gang at most 4 CPUs, 0 GPUs, 8 GiB"
+    assert never_fits(gang(node(5)), limited) == f"each node needs 5 CPUs, 0 GPUs, 100 MiB; {most}"
+    assert never_fits(gang(*[node(3)] * 2), limited) == f"needs 2 nodes with 6 CPUs, 0 GPUs, 200 MiB in all; {most}"
+    waits = Pass(limited, [job("ant", 2)], [running("cart", on("slurm/main", 3))]).reason("ant")
+    assert waits.endswith(f"; {most} until job cart (cart-012) ends")
+
+
 def test_hosts_that_are_away_are_taken_only_where_the_gang_needs_them() -> None:
     hosts = [single("a", away=True), single("b"), single("c")]
     assert where(gang(*[node()] * 2), *hosts) == "b c"
+    assert where(gang(*[node()] * 2, minimum=1), *hosts) == "b c"
     assert where(gang(*[node()] * 3, minimum=2), *hosts) == "b c", "fewer nodes start now"
     assert where(gang(*[node()] * 3), *hosts) == "b c a"
     assert never_fits(gang(*[node()] * 3), hosts) is None

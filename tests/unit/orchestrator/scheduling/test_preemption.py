@@ -83,7 +83,11 @@ def test_no_more_are_preempted_than_needed_and_none_while_some_stop() -> None:
     assert Pass([host("a"), host("b")], [job("ant", 3, queue="high")], held, HIGH).preempted == "large"
     held = [cart(2, name="first", ending=True), cart(2, name="second")]
     assert Pass([host()], [job("ant", 2, queue="high")], held, HIGH).preempted == ""
-    assert Pass([host()], [job("ant", 3, queue="high")], held, HIGH).preempted == "second"
+    decided = Pass([host()], [job("ant", 3, queue="high")], held, HIGH)
+    assert decided.preempted == "second"
+    assert decided.reason("ant").endswith(" until job second (second-0), preempted for it, has stopped")
+    report = decided.decisions.report
+    assert [report.preempts(each.job) for each in held] == [False, True]
 
 
 def test_in_a_share_a_higher_priority_preempts_a_lower_one() -> None:

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import pytest
 
+from orchestrator.scheduling.decide import decide
 from orchestrator.scheduling.fit import fit
-from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue
+from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue, Snapshot
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
     MAXIMUM,
+    NOW,
     REQUIREMENT,
     Pass,
     environment,
@@ -53,6 +55,13 @@ def test_while_an_engine_has_not_told_its_hosts_its_jobs_wait_and_say_so() -> No
     assert decided.started == "cart:a", "in a compute environment that is known"
     assert decided.reason("ant") == f"{CAPACITY} - {needs(1)}; the ray engine has not answered yet"
     assert decided.reason("huge").endswith("the ray engine has not answered yet"), "it may have that much"
+    waiting = line(job("large", 4, queue="both"), job("next", 3, queue="both"))
+    cart = running("cart", on("a", 1), environment="there")
+    assert "behind job large" in Pass([host()], waiting, [cart], queues, [silent, there]).reason("next")
+    quiet = replace(environment("quiet", hosts=()), unknown="the slurm engine has not answered yet")
+    waiting, queues[1] = [job("ant", queue="both")], queue("both", environments=("quiet", "silent"))
+    assert Pass([], waiting, (), queues, [silent, quiet]).reason("ant").endswith(quiet.unknown), "its first one"
+    queues[1] = queue("both", environments=("silent", "there"))
     asked = fit(gang(node(64)), queues[1], {"silent": silent, "there": there}, [host()])
     assert (asked.allocation, asked.problem) == (None, None), "it is not refused"
 
@@ -93,14 +102,14 @@ def test_a_queue_without_a_usable_compute_environment_says_so(
 
 
 def test_the_board_lists_who_still_waits_and_numbers_them() -> None:
-    waiting = line(job("runs"), job("large", 4), *[job(f"j{i:02}", 4) for i in range(2, 25)])
+    waiting = line(job("runs"), job("large", 4), *[job(f"j{i:02}", 4) for i in range(2, 120)])
     decided = Pass([host()], waiting, [running("cart", on("a", 1), timeout=160)])
     assert decided.started == "runs:a" and decided.waits("nowhere") == ""
-    assert decided.waits() == " ".join(["large", *[f"j{i:02}" for i in range(2, 25)]])
+    assert decided.waits() == " ".join(["large", *[f"j{i:02}" for i in range(2, 120)]])
     behind = "behind job large (large-01), which needs 1 node with 4 CPUs, 0 GPUs, 100 MiB in all"
     assert decided.reason("j02") == f"2nd in queue default, {behind}"
-    ordinals = [decided.reason(f"j{i:02}").partition(" ")[0] for i in (3, 4, 10, 11, 12, 13, 20, 21, 22, 23)]
-    assert ordinals == ["3rd", "4th", "10th", "11th", "12th", "13th", "20th", "21st", "22nd", "23rd"]
+    ordinals = [decided.reason(f"j{i:02}").partition(" ")[0] for i in (3, 4, 10, 11, 12, 13, 20, 21, 22, 23, 111)]
+    assert ordinals == ["3rd", "4th", "10th", "11th", "12th", "13th", "20th", "21st", "22nd", "23rd", "111th"]
     with pytest.raises(KeyError):
         decided.reason("runs")
 
@@ -111,8 +120,62 @@ def test_a_reason_says_that_room_is_in_pieces_and_names_the_last_gangs_that_it_w
         f"{CAPACITY} - {needs(2)}; "
         "2 CPUs, 0 GPUs, 16 GiB free, but not in one piece for each node until job v (v-012345) ends"
     )
+    held = [running("x", on("a", 2), ending=True), running("y", on("a", 2), timeout=700)]
+    assert (
+        Pass([host()], [job("ant", 4)], held)
+        .reason("ant")
+        .endswith("free until jobs x (x-012345), y (y-012345) end, at the latest at 2027-01-15 08:10:00 UTC")
+    )
+    late = [running("x", on("a", 2), timeout=50)]
+    assert Pass([host()], [job("ant", 4)], late).reason("ant").endswith("free until job x (x-012345) ends"), "overdue"
     held = [running(f"r{i}", on("a", 1), timeout=100 + i) for i in range(1, 6)]
     assert Pass([host(cpus=5)], [job("ant", 5)], held).reason("ant") == (
         f"{CAPACITY} - {needs(5)}; 0 CPUs, 0 GPUs, 8 GiB free until jobs r3 (r3-01234), r4 (r4-01234), "
         "r5 (r5-01234) and 2 more end, at the latest at 2027-01-15 08:00:05 UTC"
     )
+
+
+@pytest.mark.parametrize(
+    ("most", "used", "says"),
+    [
+        (4, 3.5, "compute environment all may use 0.5 CPUs more at this time"),
+        (4, 6, "compute environment all may use 0 CPUs more at this time"),
+        (6, 2, "2 CPUs, 0 GPUs, 8 GiB free"),  # exactly the 4 CPUs that it needs: the host lacks them
+    ],
+)
+def test_a_reason_names_the_limit_of_the_compute_environment_where_that_is_what_lacks(
+    most: float, used: float, says: str
+) -> None:
+    hosts = [host(cpus=4 if most == 6 else 64)]
+    waits = Pass(hosts, [job("ant", 4)], [running("cart", on("a", used))], (), [environment(max_cpus=most)])
+    assert waits.reason("ant") == f"{CAPACITY} - {needs(4)}; {says} until job cart (cart-012) ends"
+
+
+def test_a_time_is_of_the_wall_clock_whatever_the_pass_counts_from() -> None:
+    held = [running("cart", on("a", 1), timeout=700)]
+    snapshot = Snapshot(NOW, [host()], {"all": environment()}, {"default": queue()}, [job("ant", 4)], held, {})
+    ahead = decide(replace(snapshot, drift=3_600_000)).report.reason("ant-0123456789")
+    assert ahead.endswith("at the latest at 2027-01-15 09:10:00 UTC")
+
+
+@pytest.mark.parametrize(
+    ("ends_in", "hint"),
+    [
+        (1.0, ": with a timeout of at most 1 s it could start"),
+        (0.999, ""),  # no timeout is that short
+        (2.999, ": with a timeout of at most 2 s it could start"),
+    ],
+)
+def test_the_hint_of_a_timeout_is_in_whole_seconds(ends_in: float, hint: str) -> None:
+    cart = replace(running("cart", on("a", 1), timeout=100), started_at=NOW - 100_000 + round(1000 * ends_in))
+    decided = Pass([host()], line(job("large", 4), job("small", timeout=9)), [cart])
+    assert decided.reason("small").endswith(f"it would fit now, but on what is kept for that job{hint}")
+
+
+def test_no_timeout_is_advised_where_another_reservation_without_a_known_time_is_in_the_way() -> None:
+    queues = [queue("one", 3, ("p",)), queue("two", 2, ("q",)), queue("any", 1, ("p", "q"))]
+    held = [running("x", on("a", 3), environment="p", timeout=700), running("y", on("b", 1), environment="q")]
+    waiting = [job("large", 4, queue="one"), job("other", 4, queue="two"), job("wide", 3, queue="any")]
+    places = [environment("p", ("a",)), environment("q", ("b",))]
+    decided = Pass([host("a"), host("b")], waiting, held, queues, places)
+    assert decided.reason("wide").endswith("; it would fit now, but on what is kept for that job")

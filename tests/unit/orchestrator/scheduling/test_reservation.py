@@ -94,6 +94,11 @@ def test_long_jobs_together_leave_the_head_its_resources_and_no_more_is_kept() -
     assert Pass([host(cpus=6)], elastic, [cart(3, timeout=700)]).started == "small:a next:a"
 
 
+def test_memory_is_kept_too() -> None:
+    waiting = line(job("large", gang(node(1, 0, 1000))), job("long"))
+    assert Pass([host(memory=1000)], waiting, [running("cart", on("a", 1, memory=500), timeout=700)]).started == ""
+
+
 def test_gpus_are_kept_by_number() -> None:
     held = [running("cart", on("a", 1, [0, 1]), timeout=700)]
     waiting = line(job("large", gang(node(1, 3))), *[job(f"j{i}", gang(node(1, 1))) for i in range(2)])
@@ -164,8 +169,12 @@ def test_a_job_with_several_compute_environments_is_the_head_of_those_that_are_n
     held = [cart(environment="p"), running("ant", on("b", 1), environment="q", timeout=700)]
     large = [job("one-large", 4, queue="one"), job("both-large", 4, queue="both")]
     waiting = [*large, job("two-small", queue="two"), job("two-short", queue="two", timeout=600)]
+    waiting += [job("both-next", 3, queue="both"), job("any", 3, queue="any")]
+    queues.append(queue("any", 0, ("p", "q")))
     decided = Pass(TWO_HOSTS, waiting, held, queues, APART)
     assert decided.started == "two-short:b"
+    assert ", behind job both-large (both-lar), " in decided.reason("both-next"), "the head of its own queue"
+    assert ", behind job one-large (one-larg), " in decided.reason("any"), "the first of those before it"
     assert decided.reason("two-small") == (
         f"{CAPACITY} - 1st in queue two, behind job both-large (both-lar), "
         f"which {needs(4)} and starts by 2027-01-15 08:10:00 UTC; "
