@@ -70,6 +70,13 @@ def test_victims_are_ordered_by_queue_then_priority_then_age() -> None:
     ]
     chosen = [Pass([host()], [job("ant", cpus, queue="high")], held, HIGH).preempted for cpus in (1, 2, 3, 4)]
     assert chosen == ["young", "young old", "young old dear", "young old dear mid"]
+    held = [cart(2, name="running", for_seconds=0), cart(2, name="starting", for_seconds=None)]
+    assert Pass([host()], [job("ant", 2, queue="high")], held, HIGH).preempted == "starting"
+
+
+def test_a_gang_whose_host_is_gone_is_preempted_for_the_cpus_that_it_counts_for() -> None:
+    lost, places = cart(host="gone"), [environment(max_cpus=4)]
+    assert Pass([host()], [job("ant", 2, queue="high")], [lost], HIGH, places).preempted == "cart"
 
 
 def test_no_more_are_preempted_than_needed_and_none_while_some_stop() -> None:
@@ -91,8 +98,8 @@ def test_no_more_are_preempted_than_needed_and_none_while_some_stop() -> None:
 
 
 def test_in_a_share_a_higher_priority_preempts_a_lower_one() -> None:
-    for priority, expected in ((2, "cart"), (1, "")):
-        waiting, held = [job("ant", share="s", priority=priority)], [cart(queue="default", share="s", priority=1)]
+    for share, priority, expected in (("s", 2, "cart"), ("s", 1, ""), (None, 2, "cart")):
+        waiting, held = [job("ant", share=share, priority=priority)], [cart(queue="default", share=share, priority=1)]
         assert Pass([host()], waiting, held, [queue(policy=FAIR)]).preempted == expected
 
 

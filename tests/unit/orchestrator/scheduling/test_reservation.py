@@ -142,6 +142,13 @@ def test_equal_jobs_are_tried_once_a_pass_however_many_there_are(monkeypatch: py
     assert len(tried) < 20
 
 
+def test_gangs_of_unknown_ends_are_awaited_the_oldest_first_and_also_where_their_hosts_are_gone() -> None:
+    held = [running("a", on("a", 1), for_seconds=9), running("b", on("a", 3), for_seconds=900)]
+    assert Pass([host()], [LARGE], held).reason("large").endswith(" until jobs b (b-012345), a (a-012345) end")
+    decided = Pass([host()], [job("ant", 2)], [running("x", on("gone", 4))], (), [environment(max_cpus=4)])
+    assert decided.reason("ant").endswith("may use 0 CPUs more at this time until job x (x-012345) ends")
+
+
 # -- several reservations ---------------------------------------------------------------------------------------------
 
 TWO_HOSTS, APART = [host("a"), host("b")], [environment("p", ("a",)), environment("q", ("b",))]
@@ -216,6 +223,12 @@ def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_a
     )
     elastic = [job("ant", gang(*[node(1, 1)] * 6, minimum=2), share="s")]
     assert Pass([host(cpus=8, gpus=8)], elastic, queues=[queue(policy=HALF)]).started == "ant:a+a+a+a"
+
+
+def test_within_its_quota_a_job_waits_for_room_like_any_other() -> None:
+    waiting, held = line(job("first", 2), job("second")), [running("cart", on("a", 4), queue="other")]
+    decided = Pass([host()], waiting, held, [queue(policy=HALF), queue("other")])
+    assert decided.started == "" and ", behind job first (first-01), " in decided.reason("second")
 
 
 @pytest.mark.parametrize(
