@@ -231,6 +231,10 @@ def replace_by_pipe(path: Path) -> None:
     os.mkfifo(path / "rank-0.pt")
 
 
+def link_to_itself(name: str) -> Callable[[Path], Any]:
+    return lambda path: (delete(name)(path), (path / name).symlink_to(name))
+
+
 def replace_by_directory(path: Path) -> None:
     (path / "manifest.json").unlink()
     (path / "manifest.json").mkdir()
@@ -262,6 +266,8 @@ DAMAGES = {
     "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
     "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
     "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
+    "a manifest that leads in a circle": (link_to_itself("manifest.json"), UNREADABLE),
+    "a file that leads in a circle": (link_to_itself("rank-0.pt"), "rank-0.pt is not a regular file"),
     "no format": (edit(format=None), "manifest.json has no format"),
     **{
         f"a {key} that is a list": (edit(**{key: [1]}), f"manifest.json: {key} is not a number")
@@ -287,11 +293,15 @@ def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: 
     assert message.startswith(f"checkpoint 00000050-e1: {said}")
 
 
-def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(run: Run) -> None:
+def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for expected in ("00000050-e1.damaged", "00000050-e1.damaged-2", "00000050-e1.damaged-3"):
         moved = set_aside(commit(run, 50))
         assert moved.name == expected and (moved / "rank-0.pt").exists() and list_checkpoints(run) == []
-    commit(run, 50).verify()
+    seen, left = durable_operations(monkeypatch), commit(run, 50)
+    left.verify()
+    assert seen.index(("rename", str(set_aside(left)))) == len(seen) - 2 and seen[-1] == ("fsync", str(run.checkpoints))
 
 
 def test_setting_aside_killed_at_any_step_loses_nothing(run: Run, tmp_path: Path) -> None:
@@ -316,7 +326,15 @@ def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
     (run.checkpoints / ".nfs0001").write_text("the file system's own")
     assert sorted(sweep(run)) == [".00000005-e1.0a1b2c3d.trash", ".00000075-e1.tmp", ".LATEST.0a1b2c3d.tmp"]
     assert sorted(os.listdir(run.checkpoints)) == [".nfs0001", "00000025-e1", "00000050-e1.damaged", "LATEST"]
+    (run.checkpoints / "made-by-somebody.tmp").write_text("")
     assert sweep(run) == []
+
+
+def test_sweeping_up_to_a_checkpoint_spares_what_is_made_after_it(run: Run) -> None:
+    for iteration, epoch in ((80, 1), (70, 2), (75, 2), (80, 2), (5, 3)):
+        CheckpointWriter(run, iteration, epoch)
+    assert sorted(sweep(run, up_to=(2, 75))) == [".00000070-e2.tmp", ".00000075-e2.tmp", ".00000080-e1.tmp"]
+    assert sorted(os.listdir(run.checkpoints)) == [".00000005-e3.tmp", ".00000080-e2.tmp"]
 
 
 def test_sweeping_killed_at_any_step_spares_committed_checkpoints(run: Run, tmp_path: Path) -> None:
