@@ -116,6 +116,18 @@ def test_a_checkpoint_is_durable_before_it_gets_its_name(run: Run, monkeypatch: 
     assert ("rename", str(run.checkpoints / "LATEST")) in after
 
 
+def test_all_ranks_write_into_one_folder_whose_notes_and_older_manifest_are_no_part_of_it(run: Run) -> None:
+    first, second = CheckpointWriter(run, 25, 1), CheckpointWriter(run, 25, 1)
+    for name in ("rank-0.pt", ".rank-0.json", "manifest.json"):
+        (second.path / name).write_text("{}")
+    found = first.commit({})
+    found.verify()
+    assert list(found.manifest["files"]) == ["rank-0.pt"]
+    assert sorted(os.listdir(found.path)) == ["manifest.json", "rank-0.pt"]
+    digests = {"rank-0.pt": {"size": 1, "sha256": "its writer's"}}
+    assert CheckpointWriter(run, 26, 1).commit({}, digests=digests).manifest["files"] == digests
+
+
 def test_a_name_is_never_written_twice(run: Run) -> None:
     first = commit(run, 25)
     before = (first.path / "rank-0.pt").read_bytes()
