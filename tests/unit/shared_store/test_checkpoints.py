@@ -275,6 +275,10 @@ DAMAGES = {
     ),
     "a zero byte in a name": (edit(files={"a\0b": ONE}), r"manifest.json names 'a\x00b', which is no file of it"),
     "a size that is a text": (edit(files={"rank-0.pt": {"size": "x", "sha256": "0"}}), ENTRY),
+    **{
+        f"a size of {size}": (edit(files={"rank-0.pt": {"size": size, "sha256": "0"}}), ENTRY)
+        for size in (True, -1, 2**63)
+    },
     "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
     "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
     "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
@@ -395,6 +399,30 @@ def test_retention_never_deletes_the_newest(run: Run) -> None:
     commit(run, 10)
     commit(run, 20)
     assert retain(run, 0) == ["00000010-e1"] and names(run) == ["00000020-e1"]
+
+
+def test_a_commit_keeps_what_is_exported_and_sweeps_what_was_never_finished(run: Run) -> None:
+    commit(run, 10)
+    (run.exports / "00000010-e1").mkdir(parents=True)
+    CheckpointWriter(run, 20, 1)
+    for iteration in (30, 40):
+        commit(run, iteration, keep=1)
+    assert sorted(os.listdir(run.checkpoints)) == ["00000010-e1", "00000040-e1", "LATEST"]
+
+
+def test_an_attempt_that_was_frozen_in_its_commit_deletes_nothing_of_its_successor(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit(run, 10)
+    rename = os.rename
+
+    def frozen(old: Path, new: Path) -> None:
+        rename(old, new)
+        raise_epoch(run, 2)
+
+    monkeypatch.setattr(os, "rename", frozen)
+    commit(run, 20, keep=1)
+    assert names(run) == ["00000010-e1", "00000020-e1"]
 
 
 def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: Run) -> None:
