@@ -80,11 +80,9 @@ def test_submission_and_rank_refuse_a_setting_in_the_same_words(
 def test_rules_over_several_settings_are_refused_with_file_line_and_key(tmp_path: Path, case: str) -> None:
     (task, algorithm, settings), said = case.split(" ", 2), WRONG[case]
     path = job(tmp_path, task, algorithm, settings)
-    with pytest.raises(SpecError) as refused:
-        load(path)
     key = f"train.{algorithm}" + ("." if said.partition(":")[0].isidentifier() else ": ")
     given = settings.partition(":")[0] == said.partition(":")[0]
-    assert str(refused.value) == f"{path}:{8 if given else 7}: {key}{said}"
+    assert refusal(load, path, error=SpecError) == f"{path}:{8 if given else 7}: {key}{said}"
 
 
 def test_settings_of_the_job_override_those_of_the_task(tmp_path: Path) -> None:
@@ -116,11 +114,8 @@ def test_a_number_that_json_does_not_have_is_refused_wherever_it_stands(
     tmp_path: Path, algorithm: str, settings: str, key: str, found: str
 ) -> None:
     path = job(tmp_path, "Ant", algorithm, settings)
-    with pytest.raises(SpecError) as refused:
-        load(path)
-    assert (
-        str(refused.value) == f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
-    )
+    said = f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
+    assert refusal(load, path, error=SpecError) == said
 
 
 def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) -> None:
@@ -128,10 +123,8 @@ def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) 
     text = "name: a\ntrain:\n  task: Ant\n  worlds: 4\n  iterations: 2\n  algorithm: {}\n  {}: {{epochs: 3}}\n"
     for algorithm, section, belongs in (("sac", "ppo", "sac"), ("my_module:Mine", "ppo", "settings")):
         file.write_text(text.format(algorithm, section))
-        with pytest.raises(SpecError) as refused:
-            load(str(file))
         said = f"train.{section}: the algorithm is {algorithm}, so its settings belong under train.{belongs}"
-        assert str(refused.value) == f"{file}:7: {said}"
+        assert refusal(load, str(file), error=SpecError) == f"{file}:7: {said}"
 
 
 HOPPER = {

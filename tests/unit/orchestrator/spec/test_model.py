@@ -19,6 +19,7 @@ from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.file import load, read
 from orchestrator.spec.model import Spec, validate
 from orchestrator.spec.values import known_tasks
+from tests.support.refusals import refusal
 from worker.learning.ppo.settings import PPOConfig
 
 REPOSITORY = Path(__file__).parents[4]
@@ -35,9 +36,7 @@ def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
     """What is said of a file, without the directory that it lies in."""
     path = tmp_path / "job.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(SpecError) as caught:
-        load(str(path), list(assignments))
-    message = str(caught.value)
+    message = refusal(load, str(path), list(assignments), error=SpecError)
     assert "\n" not in message
     return message.replace(f"{tmp_path}/", "")
 
@@ -189,9 +188,7 @@ def test_text_that_is_not_yaml_is_reported_with_its_line(tmp_path: Path, text: s
 
 def test_a_file_that_can_not_be_read_is_named(tmp_path: Path) -> None:
     for path, said in ((tmp_path / "none.yaml", "No such file or directory"), (tmp_path, "Is a directory")):
-        with pytest.raises(SpecError) as caught:
-            load(str(path))
-        assert str(caught.value) == f"{path}: {said}"
+        assert refusal(load, str(path), error=SpecError) == f"{path}: {said}"
 
 
 VALUES = st.none() | st.booleans() | st.integers(-3, 300) | st.floats() | st.text(max_size=6)
@@ -353,6 +350,5 @@ def test_a_file_may_use_aliases_while_they_stand_for_little(tmp_path: Path) -> N
     ],
 )
 def test_a_change_beyond_a_limit_is_refused_in_one_short_line_that_names_it(value: str, said: str) -> None:
-    with pytest.raises(SpecError) as refused:
-        override({}, [f"train.config={value}"])
-    assert said in str(refused.value) and len(str(refused.value)) < 400 and "\n" not in str(refused.value)
+    refused = refusal(override, {}, [f"train.config={value}"], error=SpecError)
+    assert said in refused and len(refused) < 400

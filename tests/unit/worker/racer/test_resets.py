@@ -130,14 +130,6 @@ def test_penalties_are_seconds_for_each_mishap_of_their_kind() -> None:
     assert counted(task, "metric_penalty") == pytest.approx(7.5, rel=1e-5)
 
 
-def test_the_clock_goes_on_while_a_car_is_put_back() -> None:
-    task = continuous(speed_factor=(1e-4, 1e-4), episode_seconds=4.0)
-    for step in range(1, 61):
-        task.step(straight(task))
-        assert task.time_outs[0].item() == (step == 60)
-    assert traced(task, "resets") == 4
-
-
 def test_a_car_against_the_waypoints_is_put_back_against_them() -> None:
     task = continuous(alternate_direction=True, episode_seconds=20.0)
     while not known(task, "backwards")[0]:

@@ -32,14 +32,6 @@ def pool(body: str, worlds: int = WORLDS, processes: int = 2, **options: Any) ->
     return workers
 
 
-def test_every_car_is_given_its_own_parameters() -> None:
-    with pool("return params['speed'] * 2 + len(params['objects_location'])") as workers:
-        assert workers.rewards().tolist() == [2.0 * car + 3.0 for car in range(WORLDS)]
-        workers.numbers[4, parameters.NUMBER_COLUMNS["speed"]] = 100.0
-        workers.numbers[4, parameters.OBJECT_COUNT] = 0.0
-        assert workers.rewards()[4] == 200.0
-
-
 def test_the_dictionary_has_every_documented_key_with_its_type() -> None:
     checks = [
         f"type(params[{each.name!r}]) is {each.kind}" if each.shape == "one" else f"type(params[{each.name!r}]) is list"
