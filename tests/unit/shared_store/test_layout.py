@@ -82,11 +82,6 @@ def test_runs_keep_their_descriptions_and_are_listed_by_name_only_if_they_were_c
     assert [run.name for run in store.runs()] == ["a", "b"]
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store").open()
-
-
 def test_a_track_is_kept_with_its_measures(store: Store) -> None:
     assert tracks.names(store) == []
     kept = tracks.add(store, "hills", b"rows", {"length": 40.0, "origin": {"seed": 7}})

@@ -20,11 +20,6 @@ from shared_store.logs import LogFollower, LogLine, format_line, parse_line, tim
 START = 1_800_000_000.0
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Run:
-    return Run(tmp_path)
-
-
 def append(run: Run, text: str | bytes, node: int = 0, attempt: int = 1, job: str = "job") -> None:
     path = run.log(job, attempt, node)
     path.parent.mkdir(parents=True, exist_ok=True)

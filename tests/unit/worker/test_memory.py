@@ -20,6 +20,7 @@ from worker.learning.sac.settings import SACConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.config import Randomization
 
+torch.set_num_threads(1)
 HERE = alone()
 CONFIG: Any = PointConfig()
 """Of worlds that are built in no time; what an algorithm takes of each is measured as with any others."""
