@@ -22,6 +22,7 @@ from orchestrator.spec.values import known_tasks
 from tests.support.refusals import refusal
 from worker.learning.ppo.settings import PPOConfig
 
+pytestmark = pytest.mark.usefixtures("installed_once")
 REPOSITORY = Path(__file__).parents[4]
 SHIPPED = sorted((REPOSITORY / "job_specs").glob("*.yaml"))
 TRAIN = "train: {task: Cartpole, worlds: 4, iterations: 2}"

@@ -24,6 +24,7 @@ from shared_store.settings import setting_at
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.refusals import refusal
 
+pytestmark = pytest.mark.usefixtures("installed_once")
 RUN = Run(Path("/store/runs/ant"))
 TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
 OTHERS = ("evaluate", "race", "export", "record", "render")
