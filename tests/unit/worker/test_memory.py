@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -28,9 +30,12 @@ LEARNER = PPO, CONFIG.ppo
 
 
 @pytest.fixture(autouse=True)
-def fewer_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The measured builds of these tests: those of a rank take seconds each."""
+def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Smaller builds than a rank's, and nothing to collect of what was there before: each build collects garbage twice."""
     monkeypatch.setattr(memory, "MORE", 512)
+    gc.freeze()
+    yield
+    gc.unfreeze()
 
 
 def test_fitting_worlds_continue_and_other_errors_are_unchanged() -> None:

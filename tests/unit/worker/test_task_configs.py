@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
 from worker.tasks.config import STRICT, Randomization, TaskConfig, reward_weights
 from worker.tasks.configs.camera import CameraConfig
 from worker.tasks.overrides import Refused, configured, from_mapping
+from worker.tasks.quadruped import Quadruped
 
 
 def bits(value: Any) -> Any:
@@ -141,3 +143,8 @@ def test_a_yaml_changes_the_weights_that_it_names() -> None:
     assert config.rewards == {**AntConfig().rewards, "forward": 2.0, "fall": -7.5}
     assert tuple(config.rewards) == Ant.reward_terms, "the order is the kernel's, whatever the YAML's"
     assert configure(Ant, {}).rewards == AntConfig().rewards
+
+
+def test_an_infinite_end_of_a_range_is_refused_by_a_rank_too() -> None:
+    said = refusal(configure, Quadruped, {"config": {"command_turn": [0.0, math.inf]}}, error=UserError)
+    assert said == "train.config.command_turn: expected [least, greatest], found [0.0, inf]"
