@@ -99,6 +99,8 @@ PPO = {
 }
 """Of settings of ppo."""
 FILES: dict[str, str] = {
+    **{f"{COMMAND}{line}\n": f":3: {said}" for line, said in LINES.items()},
+    **{ppo(settings): f":6: train.ppo.{said}" for settings, said in PPO.items()},
     f"name: a\n{TRAIN}\nnodez: 2\n": ":3: nodez: unknown key; did you mean nodes?",
     f"name: a\n{TRAIN}\nxyzzyq: 2\n": f":3: xyzzyq: unknown key; valid here: {TOP}",
     "nme: a\ncommand: [x]\n": ":1: nme: unknown key; did you mean name? (and 1 more)",
@@ -167,18 +169,8 @@ NOT_YAML: dict[str | bytes, str] = {
 }
 
 
-@pytest.mark.parametrize("line", LINES)
-def test_a_wrong_key_or_value_is_reported_with_its_line_and_what_is_valid(tmp_path: Path, line: str) -> None:
-    assert problem(tmp_path, f"{COMMAND}{line}\n") == f"job.yaml:3: {LINES[line]}"
-
-
-@pytest.mark.parametrize("settings", PPO)
-def test_a_wrong_setting_of_an_algorithm_is_reported_alike(tmp_path: Path, settings: str) -> None:
-    assert problem(tmp_path, ppo(settings)) == f"job.yaml:6: train.ppo.{PPO[settings]}"
-
-
 @pytest.mark.parametrize("text", FILES)
-def test_missing_keys_and_keys_that_exclude_each_other_are_reported(tmp_path: Path, text: str) -> None:
+def test_a_wrong_or_missing_key_or_value_is_reported_with_its_line_and_what_is_valid(tmp_path: Path, text: str) -> None:
     assert problem(tmp_path, text) == f"job.yaml{FILES[text]}"
 
 
