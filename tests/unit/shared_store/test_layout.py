@@ -1,4 +1,4 @@
-"""Where things lie on the shared volume, what may be used as one, and its tracks, which are read only as they were written."""
+"""Where things lie on the shared volume, what may be used as one, and its tracks, which never change."""
 
 from __future__ import annotations
 

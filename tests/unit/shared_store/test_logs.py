@@ -1,4 +1,4 @@
-"""Log lines of all nodes and attempts come back once each, in the order of their times; windows of them from any place, by what they have."""
+"""Log lines of all nodes and attempts come once each, in the order of their times; windows from any place."""
 
 from __future__ import annotations
 

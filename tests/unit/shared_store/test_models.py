@@ -1,4 +1,4 @@
-"""Bundles, and the registry of models that are made of them: versions count up, are never changed, and any damage is named."""
+"""Bundles, and the registry of models made of them: versions count up, never change, and show any damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Races in the store: rules of a job's section, the table that a person reads, and standings by times written down by hand."""
+"""Races in the store: rules of a job's section, the table that a person reads, standings by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Episodes of an evaluation: what is recorded of each, causes and successes, that batches of worlds do not matter; intervals and comparisons by textbooks and by hand."""
+"""Evaluations: what is recorded of each episode, whatever the batches; intervals and comparisons by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tasks declare of their observations and actions is what their kernels compute; noise follows it; checkpoints hold it."""
+"""What tasks declare of their observations and actions is what their kernels compute, and noise follows it."""
 
 from __future__ import annotations
 

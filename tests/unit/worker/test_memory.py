@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 from collections.abc import Iterator
+from gc import freeze, unfreeze
 from typing import Any
 
 import pytest
@@ -31,11 +31,11 @@ LEARNER = PPO, CONFIG.ppo
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Smaller builds than a rank's, and nothing to collect of what was there before: each build collects garbage twice."""
+    """Smaller builds than a rank's; and each collects garbage twice, of which what was there before is no part."""
     monkeypatch.setattr(memory, "MORE", 512)
-    gc.freeze()
+    freeze()
     yield
-    gc.unfreeze()
+    unfreeze()
 
 
 def test_fitting_worlds_continue_and_other_errors_are_unchanged() -> None:

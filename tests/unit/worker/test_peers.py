@@ -1,4 +1,4 @@
-"""Benchmarks: a loaded machine is told, tables do not contradict one another; beside peers, the table of records, the conversion of policies, what is judged and refused."""
+"""Benchmarks: loaded machines, contradictions, and beside peers their records, policies and judgements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`muster compare`: which runs are one group, and the numbers and the curve of a group; how the weights of two exported policies differ."""
+"""`muster compare`: groups of runs, their numbers and curves; and how the weights of two policies differ."""
 
 from __future__ import annotations
 

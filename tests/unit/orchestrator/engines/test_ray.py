@@ -1,4 +1,4 @@
-"""Ray: the placement group that ``--dry-run`` shows, and ``containers/ray/`` as far as it can be checked without a cloud: Ray's own schema, KubeRay's structure."""
+"""Ray: the placement group of ``--dry-run``, and ``containers/ray/`` by Ray's own schema and KubeRay's structure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The toolkit of engines: what is inherited, waited for, tried again and stopped, a backend's last answer, outcomes and logs in a supervisor's place."""
+"""The toolkit of engines: environments, waiting, tries, stops, a backend's last answer, outcomes, copied logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The database: its tables, all or none, calls that are committed together, definitions that are read once, and whose a run is."""
+"""The database: its tables, commits that are made together, definitions that are read once, owners of runs."""
 
 from __future__ import annotations
 

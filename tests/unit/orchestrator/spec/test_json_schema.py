@@ -1,4 +1,4 @@
-"""The JSON Schema of the job YAML agrees with what is accepted, also of ``track``, ``secrets`` and checkpoints by name, and in which words the rest is refused."""
+"""The JSON Schema of the job YAML agrees with what is accepted; ``track``, ``secrets`` and checkpoints by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The place of a car on its track, by circles and ovals computed by hand; the car on the device, by a bicycle that is integrated by hand and by that geometry."""
+"""The place of a car on its track, by circles and ovals computed by hand; the car on the device, by the same."""
 
 from __future__ import annotations
 

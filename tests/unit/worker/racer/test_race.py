@@ -1,4 +1,4 @@
-"""Races on simulated worlds: lap times from counted steps, penalties, each end of a trial, step logs, the same again bit for bit; cars that are put back."""
+"""Races on simulated worlds: lap times, penalties, each end of a trial, step logs; cars that are put back."""
 
 from __future__ import annotations
 

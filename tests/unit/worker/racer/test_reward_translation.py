@@ -1,4 +1,4 @@
-"""The translated subset, case by case, and reward functions of the kinds that people write: compiled, they give Python's numbers and errors."""
+"""Compiled reward functions give Python's numbers and errors: case by case, and those that people write."""
 
 from __future__ import annotations
 

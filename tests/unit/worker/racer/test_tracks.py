@@ -1,4 +1,4 @@
-"""Made tracks: measures by hand, fifty seeds, the same bytes everywhere; names, pictures and files of tracks: what is read, mended, and refused in one line."""
+"""Tracks that are made or read: measures by hand, the same bytes everywhere, and what is refused as one."""
 
 from __future__ import annotations
 
