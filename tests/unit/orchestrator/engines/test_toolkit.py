@@ -1,9 +1,10 @@
-"""The toolkit of engines: environments, waiting, tries, stops, a backend's last answer, outcomes, copied logs."""
+"""The toolkit of engines: environments, waiting, tries, stops, an engine's health and answers, copied logs."""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import inf
@@ -13,9 +14,12 @@ from typing import Any
 
 import pytest
 
+from orchestrator.engines import runner
 from orchestrator.engines.api import EngineError, Handle, NotYet, Transient
+from orchestrator.engines.runner import Runner
 from orchestrator.engines.slurm import commands
 from orchestrator.engines.slurm import engine as slurm
+from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.testing.rigs import make_gang
 from orchestrator.engines.toolkit import backoff as module
 from orchestrator.engines.toolkit import log_copy
@@ -322,3 +326,31 @@ def test_a_slurm_that_went_away_can_t_tell_its_hosts_and_its_last_answer_is_not_
     assert wait_for(problem, 10, "the trouble") == "Slurm: slurmctld does not answer"
     answers.append("NodeName=n2 CPUTot=4 RealMemory=1000 State=IDLE")
     wait_for(lambda: not problem() and engine.capacity().machines[0].name == "slurm/n2", 10, "the recovery")
+
+
+def test_an_engine_s_health_says_when_it_answered_last_why_it_fails_and_that_it_hangs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    engine = FakeEngine()
+    asked = Runner(engine, lambda: None)
+    try:
+        asked.capacity(patience=10)
+        told = asked.health.told_at
+        assert told is not None and time.time() * 1000 - 60_000 < told <= time.time() * 1000
+        assert (asked.health.problem, asked.health.failing, asked.health.retry) == (None, 0, None)
+        engine.error = Transient("the daemon refuses the connection")
+        asked.capacity(patience=10)
+        assert asked.health.problem == "the daemon refuses the connection" and asked.health.told_at == told
+        engine.error = None
+        asked.capacity(patience=10)
+        assert asked.health.problem is None
+        monkeypatch.setattr(runner, "OVERDUE", 0.1)
+        engine.answers.clear()
+        asked.capacity()
+        said = str(wait_for(lambda: asked.health.problem, 10, "the silence"))
+        assert "the fake engine has not answered since" in said
+        engine.answers.set()
+        wait_for(lambda: asked.health.problem is None, 10, "the recovery")
+    finally:
+        engine.answers.set()
+        asked.close()
