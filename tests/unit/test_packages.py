@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -45,15 +46,20 @@ PURE = ("domain", "spec", "scheduling")
 HTTP_SERVER = {"fastapi", "starlette", "uvicorn"}
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level names of everything that the module imports, at any depth of nesting."""
+@cache
+def imports_of(path: Path) -> frozenset[str]:
+    """Full names of everything that the module imports, at any depth of nesting."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            names.add(node.module.partition(".")[0])
-    return names
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return frozenset(names)
+
+
+def imported(path: Path) -> set[str]:
+    return {name.partition(".")[0] for name in imports_of(path)}
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
@@ -66,13 +72,7 @@ def test_no_module_imports_what_its_room_may_not(package: str) -> None:
 
 def imported_modules(path: Path) -> set[tuple[str, ...]]:
     """What the module imports of the orchestrator, name by name, each by its parts."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return {tuple(name.split(".")) for name in names if name.startswith("orchestrator.")}
+    return {tuple(name.split(".")) for name in imports_of(path) if name.startswith("orchestrator.")}
 
 
 def modules_of(room: str) -> list[Path]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from muster_policy.actions import Commands
+from muster_policy.contract import read as node_read
 from muster_policy.errors import Refused
 from muster_policy.messages import Messages
 from muster_policy.observations import Observations
-from shared_store.policy_contract import Action, Contract, Group, Target, Term
+from shared_store.policy_contract import Action, Contract, Group, Target, Term, read
 from tests.support.policy_node import for_node
 
 SEEN = Term(
@@ -71,10 +73,5 @@ def test_a_contract_of_the_format_before_is_read() -> None:
     document = choosing((), ()).document()
     for action in document["actions"]:
         del action["targets"]
-    from muster_policy.contract import read as node_read
-    from shared_store.policy_contract import read
-
     assert read({**document, "format": 2}) == dataclasses.replace(choosing((), ()), format=2)
-    import json
-
     assert node_read(json.dumps({**document, "format": 2}).encode(), "contract.json").actions[0].targets == ()

@@ -16,6 +16,7 @@ from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWI
 from muster_policy.observations import Observations
 from shared_store.policy_contract import Command, Contract, Frame, Group, Image
 from tests.support.policy_node import for_node
+from tests.support.refusals import refusal
 from tests.unit.policy_node.walker import HALF, JOINTS, TRUNK, UNIT, contract, term
 
 MESSAGES = Messages()
@@ -300,9 +301,7 @@ UNAVAILABLE = {
 @pytest.mark.parametrize("said", UNAVAILABLE)
 def test_a_policy_that_needs_an_unavailable_quantity_is_refused_in_one_line(said: str) -> None:
     terms = UNAVAILABLE[said]
-    with pytest.raises(Refused) as caught:
-        Observations(for_node(contract(*terms)))
-    line = str(caught.value)
+    line = refusal(Observations, for_node(contract(*terms)), error=Refused)
     assert line.startswith(f"task Walker can't run on a robot: {said}") and "\n" not in line
 
 

@@ -1,22 +1,26 @@
-"""When the node commands, what, and when it stops: without a clock and without a network."""
+"""When the node commands, what, and when it stops, without a clock and without a network; what is printed."""
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from muster_policy import lines as module
 from muster_policy.actions import Commands, limits
 from muster_policy.bundle import open_bundle
 from muster_policy.errors import Refused
 from muster_policy.inputs import Inputs
+from muster_policy.lines import Lines
 from muster_policy.messages import JOINT_STATE, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
 from shared_store.policy_contract import Action
 from tests.support.policy_node import for_node, write_bundle
+from tests.support.refusals import refusal
 from tests.unit.policy_node.walker import JOINTS, KNEE, contract, term
 
 MESSAGES = Messages()
@@ -181,6 +185,23 @@ NO_JOINTS = {
 @pytest.mark.parametrize("said", NO_JOINTS)
 def test_a_policy_that_drives_no_joints_is_refused_in_one_line(said: str) -> None:
     changes = NO_JOINTS[said]
-    with pytest.raises(Refused) as caught:
-        Commands(for_node(contract(SPEED, LAST, **changes)))
-    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert said in refusal(Commands, for_node(contract(SPEED, LAST, **changes)), error=Refused)
+
+
+def test_a_stopped_terminal_does_not_block_and_later_lines_are_dropped() -> None:
+    goes_on, said = threading.Event(), list[str]()
+
+    def tell(line: str) -> None:
+        goes_on.wait()
+        said.append(line)
+
+    lines = Lines(tell)
+    for number in range(2 * module.MOST):
+        lines.say(str(number))
+    assert said == []
+    goes_on.set()
+    while len(said) < module.MOST:
+        pass
+    lines.say("the end")
+    lines.close()
+    assert said[:3] == ["0", "1", "2"] and said[-1] == "the end" and len(said) <= module.MOST + 2

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared_store.contract import ContractError, NodeContract, rank_variables, sealed, sealed_in_image
+from tests.support.refusals import refusal
 
 
 def contract(**changes: Any) -> NodeContract:
@@ -127,9 +128,7 @@ MALFORMED = [
 def test_a_missing_or_malformed_variable_is_named_with_its_value(name: str, change: dict[str, str], said: str) -> None:
     whole = contract().to_env()
     for env in ({**whole, **change}, *([{k: v for k, v in whole.items() if k != name}] if said == MISSING else [])):
-        with pytest.raises(ContractError) as caught:
-            NodeContract.from_env(env)
-        assert str(caught.value).startswith(f"{name} is {said}")
+        assert refusal(NodeContract.from_env, env, error=ContractError).startswith(f"{name} is {said}")
 
 
 def test_optional_variables_have_defaults_and_a_single_node_job_has_none_of_nodes() -> None:

@@ -22,11 +22,6 @@ from tests.support.shared_store.leagues import CONFIG, entry, league, race, summ
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store").open()
-
-
-@pytest.fixture
 def cup(store: Store) -> StoredLeague:
     return leagues.create(store, league())
 

@@ -48,11 +48,6 @@ def drained(run: Run) -> list[str]:
     return [line.text for line in LogFollower(run, "job").drain()]
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Run:
-    return Run(tmp_path)
-
-
 def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) -> None:
     path, count = run.log("job", 1, 0), 10_000
     writer = written(path, 200)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, retain
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints, retain
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store
 from shared_store.parent import NewRun, RunExists, TeacherCopy, parent_checkpoint
@@ -121,21 +121,6 @@ def test_a_lineage_that_leads_elsewhere_is_refused(store: Store) -> None:
     run.parent.symlink_to(store.run("source").checkpoints)
     with pytest.raises(DamagedFile, match="a link"):
         parent_checkpoint(run)
-
-
-def test_the_best_goes_by_the_score_and_never_by_the_reward(store: Store) -> None:
-    def best() -> str:
-        found = best_checkpoint(store.run("source"))
-        return found.name if found else "none"
-
-    add_checkpoint(store, "source", 4, score=None, reward=1e9)
-    assert best() == "00000003-e1"
-    later = add_checkpoint(store, "source", 5, score=2.0)
-    assert best() == "00000005-e1", "the later one of equals"
-    (later.path / "manifest.json").write_text("{")
-    assert best() == "00000003-e1"
-    add_run(store, "idle")
-    assert best_checkpoint(store.run("idle")) is None
 
 
 # -- the teacher ------------------------------------------------------------------------------------------------------

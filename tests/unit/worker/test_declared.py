@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 import warp as wp
 
-from tests.support.refusals import refusal
-from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, TorchSliders, far_away
+from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
 from tests.support.worker.tasks import observe, play, put, same, statistics
-from worker.tasks import Action, Adaptive, Command, Declaration, Event, Reward, Robot, Termination, WorldArrays, terms
 from worker.tasks.adapting import adaptive_steps, begin_evaluation
 
 WORLDS = 6
@@ -219,81 +215,3 @@ def test_a_second_task_of_the_same_terms_shares_their_kernels(sliders: Sliders) 
         pass
 
     assert Others(SlidersConfig(), 1, seed=1)._kernels.source == sliders._kernels.source
-
-
-@wp.func
-def _untyped(world: int, worlds: WorldArrays, joint) -> float:
-    return 0.0
-
-
-@wp.func
-def _nothing(world: int, worlds: WorldArrays):
-    worlds.joint_q[world, 0] = 0.0
-
-
-@wp.func
-def _vector(world: int) -> wp.vec3:
-    return wp.vec3(0.0, 0.0, 0.0)
-
-
-MISFITS: dict[str, Any] = {
-    "rewards.place: _vector must give a float (-> float)": Reward(_vector),
-    "rewards.place: _nothing must give a float": Reward(_nothing),
-    "rewards.place: _untyped: its parameter joint has no type": Reward(_untyped),
-    "rewards.place: 'nothing_alike' is no function; a term is a": Reward("nothing_alike"),
-    "rewards.place: 'joint_speeed' is no function; did you mean terms.joint_speed?": Reward("joint_speeed"),
-    "rewards.place: no joint of robot matches 'third'; there are first, second": Reward(
-        terms.joint_position, joints="third"
-    ),
-    "rewards.place: the task has no robot or object 'cube'; there are robot": Reward(
-        terms.joint_position, robot="cube"
-    ),
-    "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
-    "rewards.plce: SlidersConfig.rewards has no weight of this name; did you mean place?": Reward(terms.alive),
-    "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(far_away, limt=3.0),
-    "terminations.out: far_away needs limit=float": Termination(far_away),
-    "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(
-        far_away, limit=3.0, limt=3.0
-    ),
-    "terminations.alive: alive has a parameter terminated, which there is nothing for here": Termination(terms.alive),
-    "terminations.time_out: the clock's own has this name": Termination(far_away, limit=1.0),
-    "actions: joint first is driven by two terms": Action(terms.effort),
-    "actions.force.scale: no column matches 'frst'; did you mean first?": Action(terms.effort, scale={"frst": 1.0}),
-    "actions.force.scale: no pattern fits second; add one, such as '*'": Action(terms.effort, scale={"first": 1.0}),
-    "commands.target: far_away has a parameter joint, which there is nothing for here": Command(
-        far_away, names=("a",), limit=1.0
-    ),
-    "events.kick: an interval needs seconds=(least, greatest), above 0": Event(far_away, limit=1.0, when="interval"),
-}
-
-
-@pytest.mark.parametrize("message", MISFITS)
-def test_misfits_are_refused_in_one_line(message: str) -> None:
-    section, name = (*message.split(":")[0].split("."), "another")[:2]
-
-    class Wrong(Sliders):
-        def sections(self) -> dict[str, Any]:
-            sections = super().sections()
-            return {**sections, section: {**sections[section], name: MISFITS[message]}}
-
-    assert refusal(Wrong.sketch, SlidersConfig()).startswith(f"task Wrong: {message}")
-
-
-def test_other_refusals() -> None:
-    with pytest.raises(ValueError, match=r"below is 2.0, which must be less than above, 1.0"):
-        Adaptive("events.kick.speed", 0.0, 1.0, above=1.0, below=2.0)
-    with pytest.raises(ValueError, match=r"config.numbers: the task has no number 'rewards.plac.x'; did you mean"):
-        Sliders.sketch(SlidersConfig(numbers={"rewards.plac.x": 1.0}))
-    with pytest.raises(ValueError, match=r"config.numbers.actions.force.scale: expected 2 numbers, found 1.0"):
-        Sliders.sketch(SlidersConfig(numbers={"actions.force.scale": 1.0}))
-    with pytest.raises(ValueError, match=r"rewards.Place: a term's name has small letters, digits and underscores"):
-        Declaration(actions={}, observations={}, rewards={"Place": Reward(terms.alive)})
-    with pytest.raises(ValueError, match=r"observations.policy.place: expected an Observation, found a Reward"):
-        Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})
-
-    class Bare(Sliders):
-        def robot(self, config: SlidersConfig) -> Robot:
-            return Robot(MODEL.replace('<motor joint="second" gear="3"/>', ""), passive=True)
-
-    with pytest.raises(ValueError, match=r"actions.force: joint second has no actuator; give the robot one, or leave"):
-        Bare.sketch(SlidersConfig())

@@ -7,98 +7,167 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import warp as wp
 
 from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from tests.support.refusals import refusal
-from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, kick, target
+from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, far_away, kick, target
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.terrain import Terrain
-from worker.tasks import Action, Adaptive, Command, Event, Observation, Robot, terms
+from worker.tasks import (
+    Action,
+    Adaptive,
+    Command,
+    Declaration,
+    Event,
+    Observation,
+    Reward,
+    Robot,
+    Termination,
+    WorldArrays,
+    terms,
+)
 from worker.tasks.randomize import Randomize
 
 
-def refused(config: SlidersConfig | None = None, **changed: Any) -> str:
-    """The line with which sliders of other sections are refused."""
+def refused(config: SlidersConfig | None = None, *, beside: Mapping[str, Any] = {}, **changed: Any) -> str:
+    """The line with which sliders are refused that have other sections, or further entries in their own."""
 
     class Wrong(Sliders):
         def sections(self) -> dict[str, Any]:
-            return {**super().sections(), **changed}
+            own = super().sections()
+            return {**own, **changed, **{name: {**own[name], **more} for name, more in beside.items()}}
 
     return refusal(Wrong.sketch, config or SlidersConfig()).removeprefix("task Wrong: ")
 
 
-OBSERVATIONS: Mapping[str, tuple[dict[str, Any], str]] = {
-    "noise of one": (dict(noise=("normal",)), "noise is ('normal',); give half the width, 0 or more, or (\"normal\", "),
-    "noise by pattern": (
-        dict(noise={"*": 0.1}),
-        "noise is {'*': 0.1}; give half the width, 0 or more, or (\"normal\", ",
+def observed(**options: Any) -> dict[str, Any]:
+    return {"observations": {"a": Observation(terms.joint_position, **options)}}
+
+
+def commanded(**options: Any) -> dict[str, Any]:
+    return {"commands": {"target": Command(target, **{"names": ("place",), "place": (-1.0, 1.0), **options})}}
+
+
+def every(seconds: Any) -> dict[str, Any]:
+    return {"events": {"e": Event(kick, speed=1.0, when="interval", seconds=seconds)}, "curricula": {}}
+
+
+def drawn(quantity: str, **options: Any) -> dict[str, Any]:
+    return {"randomize": {"f": Randomize(quantity, **{"range": (0.5, 1.0), **options})}}
+
+
+HALF = 'give half the width, 0 or more, or ("normal", '
+STEPS = "give whole control steps, from 0 up, or two, the lesser first"
+TWO = "expected 2 numbers, found "
+CLIP = ".clip: expected the lesser number first, found [1.0, -1.0]"
+SECTIONS: Mapping[str, dict[str, Any]] = {
+    f"observations.a: noise is ('normal',); {HALF}": observed(noise=("normal",)),
+    f"observations.a: noise is {{'*': 0.1}}; {HALF}": observed(noise={"*": 0.1}),
+    f"observations.a: noise is ('gauss', 0.1); {HALF}": observed(noise=("gauss", 0.1)),
+    f"observations.a: noise is -0.1; {HALF}": observed(noise=-0.1),
+    f"observations.a: delay is 1.5; {STEPS}": observed(delay=1.5),
+    f"observations.a: delay is (1,); {STEPS}": observed(delay=(1,)),
+    f"observations.a: delay is (2, 1); {STEPS}": observed(delay=(2, 1)),
+    "observations.a: history is 2.0; it counts the present step, so it is 1 or more": observed(history=2.0),
+    "observations.a: 1 units for 2 columns; give one for all, or one for each": observed(unit=("m",)),
+    "observations.a: memory is -2; give a whole number from 0 up": observed(memory=-2),
+    f"observations.a{CLIP}": observed(clip=(1.0, -1.0)),
+    f"actions.force{CLIP}": {"actions": {"force": Action(terms.effort, clip=(1.0, -1.0))}},
+    f"commands.target.seconds: {TWO}'a'": commanded(seconds="a"),
+    "commands.target.seconds: expected the least and the greatest time, above 0": commanded(seconds=(0.0, 1.0)),
+    "commands.target: 2 units for 1 numbers; give one for each": commanded(units=("m", "s")),
+    "commands.target: names are (); name each number that the policy is told": commanded(names=()),
+    "commands.target: names are (3,); name each number that the policy is told": commanded(names=3),
+    "commands.target: hidden is -1; give how many numbers, from 0 up": commanded(hidden=-1),
+    f"events.e.seconds: {TWO}2.0": every(2.0),
+    f"events.e.seconds: {TWO}(2.0,)": every((2.0,)),
+    "randomize.m: expected a Randomize, found a str": {"randomize": {"m": "mass"}},
+    "sensors.m: expected a sensor, such as ContactSensor(...), found a str": {"sensors": {"m": "mass"}},
+    "randomize.f: no body of robot matches 'nar'; did you mean near? there are near, far": drawn("mass", bodies="nar"),
+    "randomize.f: no joint of robot matches 'third*'; ": drawn("encoder_bias", joints="third*", range=(0.0, 0.1)),
+    "randomize.f: no joint of robot matches 'frst'; did you mean": drawn("stiffness", actuators="frst"),
+    "randomize.f: no geom of robot matches 'foot'; ": drawn("friction", geoms=("*", "foot")),
+    "randomize.f: no robot or object is called 'robt'; did you": drawn("mass", bodies="*", robot="robt"),
+}
+"""What is said, or its beginning, of these sections."""
+
+
+@pytest.mark.parametrize("message", SECTIONS)
+def test_a_section_that_can_not_be_is_refused_with_its_place(message: str) -> None:
+    assert refused(**SECTIONS[message]).startswith(message)
+
+
+@wp.func
+def _untyped(world: int, worlds: WorldArrays, joint) -> float:
+    return 0.0
+
+
+@wp.func
+def _nothing(world: int, worlds: WorldArrays):
+    worlds.joint_q[world, 0] = 0.0
+
+
+@wp.func
+def _vector(world: int) -> wp.vec3:
+    return wp.vec3(0.0, 0.0, 0.0)
+
+
+MISFITS: dict[str, Any] = {
+    "rewards.place: _vector must give a float (-> float)": Reward(_vector),
+    "rewards.place: _nothing must give a float": Reward(_nothing),
+    "rewards.place: _untyped: its parameter joint has no type": Reward(_untyped),
+    "rewards.place: 'nothing_alike' is no function; a term is a": Reward("nothing_alike"),
+    "rewards.place: 'joint_speeed' is no function; did you mean terms.joint_speed?": Reward("joint_speeed"),
+    "rewards.place: no joint of robot matches 'third'; there are first, second": Reward(
+        terms.joint_position, joints="third"
     ),
-    "unknown noise": (dict(noise=("gauss", 0.1)), "noise is ('gauss', 0.1); give half the width"),
-    "negative noise": (dict(noise=-0.1), "noise is -0.1; give half the width, 0 or more"),
-    "half a step": (dict(delay=1.5), "delay is 1.5; give whole control steps, from 0 up, or two, the lesser first"),
-    "one of two delays": (dict(delay=(1,)), "delay is (1,); give whole control steps"),
-    "delays the wrong way": (dict(delay=(2, 1)), "delay is (2, 1); give whole control steps"),
-    "history": (dict(history=2.0), "history is 2.0; it counts the present step, so it is 1 or more"),
-    "units": (dict(unit=("m",)), "1 units for 2 columns; give one for all, or one for each"),
-    "memory": (dict(memory=-2), "memory is -2; give a whole number from 0 up"),
+    "rewards.place: the task has no robot or object 'cube'; there are robot": Reward(
+        terms.joint_position, robot="cube"
+    ),
+    "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
+    "rewards.plce: SlidersConfig.rewards has no weight of this name; did you mean place?": Reward(terms.alive),
+    "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(far_away, limt=3.0),
+    "terminations.out: far_away needs limit=float": Termination(far_away),
+    "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(
+        far_away, limit=3.0, limt=3.0
+    ),
+    "terminations.alive: alive has a parameter terminated, which there is nothing for here": Termination(terms.alive),
+    "terminations.time_out: the clock's own has this name": Termination(far_away, limit=1.0),
+    "actions: joint first is driven by two terms": Action(terms.effort),
+    "actions.force.scale: no column matches 'frst'; did you mean first?": Action(terms.effort, scale={"frst": 1.0}),
+    "actions.force.scale: no pattern fits second; add one, such as '*'": Action(terms.effort, scale={"first": 1.0}),
+    "commands.target: far_away has a parameter joint, which there is nothing for here": Command(
+        far_away, names=("a",), limit=1.0
+    ),
+    "events.kick: an interval needs seconds=(least, greatest), above 0": Event(far_away, limit=1.0, when="interval"),
 }
 
 
-@pytest.mark.parametrize(("options", "message"), OBSERVATIONS.values(), ids=list(OBSERVATIONS))
-def test_options_of_an_observation(options: dict[str, Any], message: str) -> None:
-    found = refused(observations={"a": Observation(terms.joint_position, **options)})
-    assert found.startswith(f"observations.a: {message}")
+@pytest.mark.parametrize("message", MISFITS)
+def test_misfits_are_refused_in_one_line(message: str) -> None:
+    section, name = (*message.split(":")[0].split("."), "another")[:2]
+    assert refused(beside={section: {name: MISFITS[message]}}).startswith(message)
 
 
-def test_ends_the_wrong_way_round() -> None:
-    wrong = ".clip: expected the lesser number first, found [1.0, -1.0]"
-    observed = Observation(terms.joint_position, clip=(1.0, -1.0))
-    assert refused(observations={"a": observed}) == f"observations.a{wrong}"
-    assert refused(actions={"force": Action(terms.effort, clip=(1.0, -1.0))}) == f"actions.force{wrong}"
+def test_other_refusals() -> None:
+    with pytest.raises(ValueError, match=r"below is 2.0, which must be less than above, 1.0"):
+        Adaptive("events.kick.speed", 0.0, 1.0, above=1.0, below=2.0)
+    with pytest.raises(ValueError, match=r"config.numbers: the task has no number 'rewards.plac.x'; did you mean"):
+        Sliders.sketch(SlidersConfig(numbers={"rewards.plac.x": 1.0}))
+    with pytest.raises(ValueError, match=r"config.numbers.actions.force.scale: expected 2 numbers, found 1.0"):
+        Sliders.sketch(SlidersConfig(numbers={"actions.force.scale": 1.0}))
+    with pytest.raises(ValueError, match=r"rewards.Place: a term's name has small letters, digits and underscores"):
+        Declaration(actions={}, observations={}, rewards={"Place": Reward(terms.alive)})
+    with pytest.raises(ValueError, match=r"observations.policy.place: expected an Observation, found a Reward"):
+        Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})
 
+    class Bare(Sliders):
+        def robot(self, config: SlidersConfig) -> Robot:
+            return Robot(MODEL.replace('<motor joint="second" gear="3"/>', ""), passive=True)
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(seconds="a"), "commands.target.seconds: expected 2 numbers, found 'a'"),
-        (dict(seconds=(0.0, 1.0)), "commands.target.seconds: expected the least and the greatest time, above 0"),
-        (dict(units=("m", "s")), "commands.target: 2 units for 1 numbers; give one for each"),
-        (dict(names=()), "commands.target: names are (); name each number that the policy is told"),
-        (dict(names=3), "commands.target: names are (3,); name each number that the policy is told"),
-        (dict(hidden=-1), "commands.target: hidden is -1; give how many numbers, from 0 up"),
-    ],
-)
-def test_options_of_a_command(options: dict[str, Any], message: str) -> None:
-    command = Command(target, **{"names": ("place",), "place": (-1.0, 1.0), **options})
-    assert refused(commands={"target": command}).startswith(message)
-
-
-@pytest.mark.parametrize("seconds", [2.0, (2.0,)])
-def test_an_interval_has_two_times(seconds: Any) -> None:
-    event = Event(kick, speed=1.0, when="interval", seconds=seconds)
-    assert refused(events={"e": event}, curricula={}).startswith("events.e.seconds: expected 2 numbers, found ")
-
-
-def test_sections_hold_what_they_are_for() -> None:
-    assert refused(randomize={"m": "mass"}) == "randomize.m: expected a Randomize, found a str"
-    assert refused(sensors={"m": "mass"}) == "sensors.m: expected a sensor, such as ContactSensor(...), found a str"
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        (
-            Randomize("mass", bodies="nar", range=(0.5, 1.0)),
-            "no body of robot matches 'nar'; did you mean near? there are near, far",
-        ),
-        (Randomize("encoder_bias", joints="third*", range=(0.0, 0.1)), "no joint of robot matches 'third*'; "),
-        (Randomize("stiffness", actuators="frst", range=(0.5, 1.0)), "no joint of robot matches 'frst'; did you mean"),
-        (Randomize("friction", geoms=("*", "foot"), range=(0.5, 1.0)), "no geom of robot matches 'foot'; "),
-        (Randomize("mass", bodies="*", robot="robt", range=(0.5, 1.0)), "no robot or object is called 'robt'; did you"),
-    ],
-)
-def test_what_is_randomized_must_be_there(entry: Randomize, message: str) -> None:
-    assert refused(randomize={"f": entry}).startswith(f"randomize.f: {message}")
+    with pytest.raises(ValueError, match=r"actions.force: joint second has no actuator; give the robot one, or leave"):
+        Bare.sketch(SlidersConfig())
 
 
 def test_what_belongs_to_no_robot_is_looked_for_in_the_worlds() -> None:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from gc import freeze, unfreeze
 from typing import Any
 
 import pytest
 import torch
 
 from tests.support.worker.loop import alone
+from tests.support.worker.point_task import TASK as POINT
+from tests.support.worker.point_task import PointConfig
 from worker.errors import UserError, is_out_of_memory
 from worker.learning import memory
 from worker.learning.algorithms import find_algorithm
@@ -18,21 +22,26 @@ from worker.learning.sac.settings import SACConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.config import Randomization
 
+torch.set_num_threads(1)
 HERE = alone()
-CONFIG = CartpoleConfig()
+CONFIG: Any = PointConfig()
+"""Of worlds that are built in no time; what an algorithm takes of each is measured as with any others."""
 LEARNER = PPO, CONFIG.ppo
 
 
 @pytest.fixture(autouse=True)
-def fewer_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The measured builds of these tests: those of a rank take seconds each."""
+def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Smaller builds than a rank's; and each collects garbage twice, of which what was there before is no part."""
     monkeypatch.setattr(memory, "MORE", 512)
+    freeze()
+    yield
+    unfreeze()
 
 
 def test_fitting_worlds_continue_and_other_errors_are_unchanged() -> None:
-    with memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
+    with memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         pass
-    with pytest.raises(RuntimeError, match="something else"), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
+    with pytest.raises(RuntimeError, match="something else"), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         raise RuntimeError("something else")
 
 
@@ -48,23 +57,22 @@ def test_a_failed_allocation_is_reported_as_such(monkeypatch: pytest.MonkeyPatch
     assert all(is_out_of_memory(error) for error in FULL)
     assert not is_out_of_memory(RuntimeError("shapes do not fit"))
     assert not is_out_of_memory(ValueError("the memory of a GRU is of no use here"))
-    monkeypatch.setattr(memory, "MORE", 128)
     error = FULL[0]
-    there = r"^worlds: 64 worlds of Cartpole on rank 0 need more memory than there is; set fewer"
-    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
+    there = r"^worlds: 64 worlds of Point on rank 0 need more memory than there is; set fewer"
+    with pytest.raises(UserError, match=there), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         raise error  # 64 worlds would fit: somebody else took it
     monkeypatch.setattr(memory, "free_bytes", lambda gang: 100_000)
     little = r"than the 0.0 GB that are free: about 0.0 GB. (About \d+ fit|Not even one fits): set "
-    with pytest.raises(UserError, match=little), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
+    with pytest.raises(UserError, match=little), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         raise error
-    with pytest.raises(type(error)), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE, lambda: False):
+    with pytest.raises(type(error)), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE, lambda: False):
         raise error  # long after the start: not the worlds' fault, and not the user's
 
 
 DISTILLATION = RslRlConfig(algorithm={"class_name": "Distillation"}, teacher_checkpoint="taught")
 LEARNERS: dict[str, tuple[str, Any]] = {
-    "ppo": ("ppo", CONFIG.ppo),
-    "sac": ("sac", CONFIG.sac),
+    "ppo": ("ppo", CartpoleConfig().ppo),
+    "sac": ("sac", CartpoleConfig().sac),
     "rsl_rl's PPO": ("rsl_rl", RslRlConfig()),
     "rsl_rl's Distillation": ("rsl_rl", DISTILLATION),
 }
@@ -75,21 +83,21 @@ def test_more_worlds_than_fit_are_refused_before_they_are_built_whatever_learns(
     algorithm, settings = LEARNERS[name]
     learner = find_algorithm(algorithm), settings
     there = (
-        r"^worlds: 200,000,000 worlds of Cartpole on rank 0 need more memory than the [\d.]+ GB that are free: "
+        r"^worlds: 200,000,000 worlds of Point on rank 0 need more memory than the [\d.]+ GB that are free: "
         r"about [\d,.]+ GB\. About [\d,]+ fit: set `worlds`$"
     )
-    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, learner, 200_000_000, HERE):
+    with pytest.raises(UserError, match=there), memory.within_memory(POINT, CONFIG, learner, 200_000_000, HERE):
         pytest.fail("they are not to be built")
 
 
 def test_a_batch_of_sac_is_measured_although_the_first_iteration_only_collects() -> None:
     def need(settings: SACConfig) -> memory.Need:
-        return memory.measure(Cartpole, CONFIG, (find_algorithm("sac"), settings), HERE)
+        return memory.measure(POINT, CONFIG, (find_algorithm("sac"), settings), HERE)
 
-    few = need(dataclasses.replace(CONFIG.sac, updates=2, warm_up=3000))
-    many = need(dataclasses.replace(CONFIG.sac, updates=2, warm_up=3000, batch_size=65_536))
+    sac = dataclasses.replace(CartpoleConfig().sac, updates=2, warm_up=3000)
+    few, many = need(sac), need(dataclasses.replace(sac, batch_size=32_768))
     # of each sample of a batch at least what goes through two critics of two layers of 64, and 51 atoms, with gradients
-    assert many.fixed - few.fixed > 65_000 * 2 * (64 + 64 + 51) * 4
+    assert many.fixed - few.fixed > 32_000 * 2 * (64 + 64 + 51) * 4
     assert few.world > 0.0
 
 
@@ -100,9 +108,11 @@ def test_constant_memory_leaves_less_for_the_worlds() -> None:
     assert told.endswith("Not even one fits: set smaller networks or batches")
 
 
-def test_settings_that_cannot_be_are_the_users_error_here_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "MORE", 128)
-    pushed = dataclasses.replace(CONFIG, randomize=Randomization(push_interval=1.0, push_velocity=1.0))
-    there = "the robot is fixed"
-    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, pushed, LEARNER, 9000, HERE):
+def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:
+    pushed = dataclasses.replace(CartpoleConfig(), randomize=Randomization(push_interval=1.0, push_velocity=1.0))
+    learner = PPO, CartpoleConfig().ppo
+    with (
+        pytest.raises(UserError, match="the robot is fixed"),
+        memory.within_memory(Cartpole, pushed, learner, 9000, HERE),
+    ):
         pytest.fail("nothing is to be built")

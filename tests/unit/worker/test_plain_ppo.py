@@ -16,6 +16,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.support.refusals import refusal
 from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.distributed import Gang, Placement
@@ -227,9 +228,8 @@ def test_it_goes_on_from_its_state_with_the_same_bits() -> None:
 
 def test_an_unsupported_setting_is_refused_with_an_alternative() -> None:
     def refused(spaces: Spaces, **settings: Any) -> str:
-        with pytest.raises(ValueError) as caught:
-            PlainPPO(dataclasses.replace(PointPPO(), **settings), Setting(spaces, Share(0, 2, 2), alone(), 0))
-        return str(caught.value)
+        setting = Setting(spaces, Share(0, 2, 2), alone(), 0)
+        return refusal(PlainPPO, dataclasses.replace(PointPPO(), **settings), setting)
 
     numbers = {"policy": (2,)}
     assert "choices nor images; algorithm ppo has both" in refused(Spaces(numbers, 3, discrete=True))

@@ -224,17 +224,6 @@ def test_an_update_is_that_of_rsl_rl(entropy_coef: float) -> None:
     assert stock.learning_rate != config.learning_rate, "the rule was never exercised"
 
 
-def test_losses_ignore_what_terminal_observations_hold_where_nothing_ended() -> None:
-    ppo = make()
-    task = Point(PointConfig(), 4)
-    ppo.begin(0)
-    for _ in range(8):
-        task.step(ppo.act(groups(task.observations)))
-        terminal = torch.where(task.time_outs.unsqueeze(1), task.terminal_observations, float("nan"))
-        ppo.record(dataclasses.replace(transition_of(task), terminal_observations=groups(terminal)))
-    assert all(torch.isfinite(value) for value in ppo.learn(groups(task.observations)).values())
-
-
 def test_every_epoch_has_its_own_minibatches_with_each_sample_once_and_as_many_of_every_world() -> None:
     ppo = make(epochs=3, minibatches=2)
     ppo.begin(0)
@@ -328,15 +317,6 @@ def test_whole_updates_are_those_of_the_plain_loss(settings: dict[str, object]) 
     fused, plain = played(make(**settings)), played(make(plain=True, **settings))
     for name, tensor in fused.items():
         torch.testing.assert_close(tensor, plain[name], rtol=1e-3, atol=1e-5, msg=name)
-
-
-def test_a_separate_critic_has_its_own_widths_and_normaliser() -> None:
-    ppo = make(critic_observations="critic", critic_hidden_sizes=(24,))
-    assert [layer.out_features for layer in ppo.critic.mlp if isinstance(layer, torch.nn.Linear)] == [24, 1]
-    assert ppo.critic.obs_normalizer is not ppo.actor.obs_normalizer
-    played(ppo)
-    assert int(ppo.critic.obs_normalizer.count) == int(ppo.actor.obs_normalizer.count) == 96
-    torch.testing.assert_close(ppo.critic.obs_normalizer._mean, ppo.actor.obs_normalizer._mean)
 
 
 def test_unsupported_settings_are_refused_by_name() -> None:

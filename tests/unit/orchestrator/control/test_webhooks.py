@@ -1,4 +1,4 @@
-"""The file of webhooks, which jobs each is told of, and the signature."""
+"""The file of webhooks, which jobs each is told of, what of them, and the signature."""
 
 from __future__ import annotations
 
@@ -9,9 +9,15 @@ from typing import Any
 
 import pytest
 
-from orchestrator.control.webhooks import PAUSES, Webhook, WebhooksError, kind_of, read_webhooks
+from orchestrator.control.deliveries import _evaluated
+from orchestrator.control.webhooks import PAUSES, Webhook, WebhooksError, kind_of, read_webhooks, run_of
 from orchestrator.persistence.models import Job
+from shared_store.files import write_json
+from shared_store.layout import Store
 from tests.support.orchestrator.receiver import SECRET, write_webhooks
+from tests.support.orchestrator.rows import job
+from tests.support.orchestrator.trained import add_checkpoint, add_run
+from tests.support.refusals import refusal
 
 URL = "https://chat.example:8443/hooks/T0/secret"
 
@@ -50,9 +56,7 @@ SHORT = "whsec_c2hvcnQ="
 )
 def test_a_mistake_is_told_in_one_line_without_a_secret(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     path = write_webhooks(tmp_path / "hooks.json", chat={"url": URL, **changes})
-    with pytest.raises(WebhooksError) as caught:
-        read_webhooks(path)
-    told = str(caught.value)
+    told = refusal(read_webhooks, path, error=WebhooksError)
     assert words in told and told.startswith(f"{path}: ") and "\n" not in told
     for secret in (SECRET, SHORT, SECRET.removeprefix("whsec_")):
         assert secret not in told
@@ -90,3 +94,27 @@ def test_a_webhook_gets_its_states_queues_and_kinds_arrays_as_a_whole_and_damage
     assert everything.wants(ended("SUCCEEDED", "lab")) and not everything.wants(ended("RUNNING"))
     assert not everything.wants(ended(parent="array"))
     assert kind_of(ended(spec="{")) == kind_of(Job(id="j", own_node_properties={})) == "command"
+
+
+def test_an_evaluation_tells_of_itself_and_a_training_of_its_newest_checkpoint(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    add_run(store, "taught")
+    for iteration in (3, 6):
+        add_checkpoint(store, "taught", iteration)
+    run = store.run("taught")
+    figures = {"mean_length": 9.0, "max_length": 10, "episodes": 4, "time": 1.0}
+    write_json(run.evaluations / "00000003-e1-1f2e3d4c.json", {**figures, "mean_return": 3.0})
+    write_json(run.evaluations / "00000006-e1.json", {**figures, "mean_return": 6.0})
+
+    def told(job_id: str, spec: dict[str, object]) -> tuple[str | None, float | None]:
+        environment = [{"name": "MUSTER_SPEC", "value": json.dumps(spec)}]
+        ranges = [{"targetNodes": "0:", "container": {"environment": environment}}]
+        properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
+        about = job(job_id, run="taught" if "train" in spec else "evaluate-taught", node_properties=properties)
+        assert run_of(about) == "taught"
+        checkpoint, summary = _evaluated(run, about)
+        return checkpoint, summary and summary["mean_return"]
+
+    assert told("1f2e3d4c-5b6a", {"evaluate": {"run": "taught"}}) == ("00000003-e1", 3.0)
+    assert told("99999999-5b6a", {"evaluate": {"run": "taught"}}) == (None, None), "it failed before it had one"
+    assert told("99999999-5b6a", {"train": {"task": "Cartpole"}}) == ("00000006-e1", 6.0)

@@ -1,21 +1,38 @@
-"""The toolkit of engines: the environment of started processes, waiting with an end, and outcomes and logs in a supervisor's place."""
+"""The toolkit of engines: environments, waiting, tries, stops, an engine's health and answers, copied logs."""
 
 from __future__ import annotations
 
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from math import inf
 from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
 
 import pytest
 
-from orchestrator.engines.api import Handle
+from orchestrator.engines import runner
+from orchestrator.engines.api import EngineError, Handle, NotYet, Transient
+from orchestrator.engines.runner import Runner
+from orchestrator.engines.slurm import commands
+from orchestrator.engines.slurm import engine as slurm
+from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.testing.rigs import make_gang
+from orchestrator.engines.toolkit import backoff as module
 from orchestrator.engines.toolkit import log_copy
+from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.engines.toolkit.environment import PRIVATE, inherited
 from orchestrator.engines.toolkit.log_copy import LogCopy
 from orchestrator.engines.toolkit.outcomes import all_recorded, log_of, record, recorded, seen, store_facts
+from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.view import CachedView, View
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT, LogWriter
+from tests.conftest import wait_for
 
 
 def test_a_started_process_inherits_all_variables_but_the_controller_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,3 +116,241 @@ def test_lines_for_which_there_was_no_room_are_written_later(handle: Handle, mon
         copy.append(["d\n"])
         assert copy.is_whole
     assert path.read_text() == "a\nb\nc\nd\n"
+
+
+def test_an_action_that_is_not_tried_any_more_is_forgotten_and_a_waiting_one_is_kept() -> None:
+    backoff = Backoff(logging.getLogger("test"), first=0.0)
+    backoff.failed(("start", "over"), "can't start")
+    waiting = Backoff(logging.getLogger("test"), first=60.0)
+    waiting.failed(("start", "waits"), "can't start")
+    for each in (backoff, waiting):
+        each.tidy(idle=0.0)
+    assert not backoff and waiting.said(("start", "waits")) == "can't start"
+
+
+def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer_each_time(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    moment = 0.0
+    monkeypatch.setattr(module.time, "monotonic", lambda: moment)
+    backoff = Backoff(logging.getLogger("test"), first=1.0, most=60.0)
+    for pause in (1.0, 2.0, 4.0):
+        backoff.failed("job", "can't end")
+        moment += pause - 0.1
+        assert backoff.waits("job")
+        moment += 0.1
+        assert not backoff.waits("job") and not backoff.worked("job", lasting=True)
+    assert [record.getMessage() for record in caplog.records] == ["can't end"]
+    moment += 3.9
+    assert not backoff.worked("job", lasting=True) and backoff.said("job") == "can't end"
+    moment += 0.1
+    assert backoff.worked("job", lasting=True) and not backoff
+
+
+HANDLE = Handle("any", "job/1/1", 1, {"slurm": "7"})
+
+
+def stop(seconds: float, step: Callable[[], str]) -> None:
+    stop_within(seconds, step, engine="fake", gang="job/1/1", pause=0.001)
+
+
+def test_a_stop_goes_on_until_nothing_is_left_whether_the_backend_answers_or_not() -> None:
+    answers = iter(["two nodes run", NotYet("no route"), "one node runs", "", "not asked for"])
+
+    def step() -> str:
+        answer = next(answers)
+        if isinstance(answer, NotYet):
+            raise answer
+        return str(answer)
+
+    stop(60.0, step)
+    assert next(answers) == "not asked for"
+
+
+def refused() -> str:
+    raise EngineError("not authorized")
+
+
+def test_a_stop_that_is_never_answered_ends_with_the_last_answer_and_a_refused_one_at_once() -> None:
+    with pytest.raises(EngineError, match=r"^not authorized$"):
+        stop(60.0, refused)
+
+    def step() -> str:
+        raise NotYet("the daemon is away")
+
+    for last, words in ((step, "the daemon is away"), (lambda: "one node runs", "one node runs")):
+        with pytest.raises(Transient) as told:
+            stop(0.02, last)
+        assert str(told.value) == f"the fake engine has not ended gang job/1/1 within 0.02 s; last answer: {words}"
+
+
+def test_a_slurm_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    from orchestrator.engines.slurm import engine as slurm
+
+    def away(*_: str, **__: Any) -> str:
+        raise slurm.Unreachable("slurmctld does not answer (connection refused); see `scontrol ping`")
+
+    monkeypatch.setattr("orchestrator.engines.slurm.commands.call", lambda *_, **__: "")
+    engine = slurm.SlurmEngine()
+    monkeypatch.setattr("orchestrator.engines.slurm.commands.call", away)
+    monkeypatch.setattr(slurm, "call", away)
+    monkeypatch.setattr(slurm, "_KILLING", 0.05)
+    with pytest.raises(Transient, match=r"^the slurm engine has not ended gang job/1/1 .*: slurmctld does not answer"):
+        engine.stop(HANDLE, 0.0)
+
+
+def test_a_ray_driver_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from orchestrator.engines.ray import engine as ray
+    from orchestrator.engines.ray.folder import Folder
+
+    engine = object.__new__(ray.RayEngine)
+    engine.home = tmp_path
+    folder = Folder.of(tmp_path, "job")
+    folder.make()
+    folder.plan("job/1/1").write_text("{}")
+    monkeypatch.setattr(Folder, "send", lambda *_: True)
+    monkeypatch.setattr(ray, "_ENDING", 0.05)
+    with pytest.raises(Transient, match=r"^the ray engine has not ended gang .*: its driver has said nothing yet$"):
+        engine.stop(HANDLE, 0.0)
+
+
+def test_what_is_told_replaces_what_was_told_before_and_ends_the_trouble() -> None:
+    view = View("nothing")
+    assert (view.value, view.age, view.trouble) == ("nothing", inf, None)
+    view.answered("first", 10.0)
+    view.missed("away")
+    assert (view.value, view.taken, view.trouble) == ("first", 10.0, "away"), "stale, and it says so"
+    view.answered("second", 20.0)
+    view.answered("older", 15.0)
+    assert (view.value, view.taken, view.trouble) == ("second", 20.0, None)
+
+
+class Backend:
+    """Answers what a test puts there, and hangs while there is nothing."""
+
+    def __init__(self) -> None:
+        self.answers: SimpleQueue[str | Exception] = SimpleQueue()
+        self.asked = 0
+
+    def __call__(self) -> str:
+        self.asked += 1
+        answer = self.answers.get()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+@pytest.fixture
+def backend() -> Iterator[Backend]:
+    found = Backend()
+    yield found
+    found.answers.put("the end")  # of a thread that still asks
+
+
+@pytest.fixture
+def view(backend: Backend) -> CachedView[str]:
+    return CachedView("nothing", backend, name="view", silence="no answer yet")
+
+
+def test_a_value_comes_at_once_without_patience_and_is_read_again_once_it_is_too_old(
+    backend: Backend, view: CachedView[str]
+) -> None:
+    assert view.get(0.0) == "nothing" and view.trouble is None
+    backend.answers.put("first")
+    wait_for(lambda: view.value == "first", 10, "the answer")
+    assert view.get(60.0, patience=60.0) == "first" and view.get(60.0, patience=60.0) == "first"
+    assert backend.asked == 1, "it holds for a minute"
+    backend.answers.put("second")
+    assert view.get(0.0, patience=60.0) == "second"
+
+
+def test_a_backend_that_fails_leaves_the_old_value_and_says_why_it_is_stale(
+    backend: Backend, view: CachedView[str]
+) -> None:
+    backend.answers.put("first")
+    view.read()
+    backend.answers.put(NotYet("the daemon is away"))
+    assert view.get(0.0, patience=60.0) == "first" and view.trouble == "the daemon is away" and view.age < inf
+    assert view.get(60.0, patience=60.0) == "first" and backend.asked == 2, "a failure is not tried again at once"
+    backend.answers.put(EngineError("refused"))
+    with pytest.raises(EngineError, match="refused"):
+        view.read()
+    assert view.trouble == "refused"
+    backend.answers.put("second")
+    assert view.read() == "second" and view.trouble is None
+
+
+def test_a_backend_that_hangs_delays_one_caller_and_is_asked_once(backend: Backend, view: CachedView[str]) -> None:
+    assert view.get(0.0, patience=0.01) == "nothing" and view.trouble == "no answer yet"
+    assert [view.get(0.0, patience=600.0) for _ in range(3)] == ["nothing"] * 3, "later callers don't wait"
+    assert backend.asked == 1
+    backend.answers.put("first")
+    wait_for(lambda: view.value == "first" and view.trouble is None, 10, "the answer")
+
+
+def test_a_bug_in_the_reading_is_trouble_and_not_the_end_of_the_view(
+    backend: Backend, view: CachedView[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[BaseException | None] = []
+    monkeypatch.setattr(threading, "excepthook", lambda told: seen.append(told.exc_value))
+    backend.answers.put(KeyError("hosts"))
+    assert view.get(0.0, patience=60.0) == "nothing" and view.trouble == "KeyError: 'hosts'"
+    wait_for(lambda: [type(each) for each in seen] == [KeyError], 10, "its traceback")
+    backend.answers.put("first")
+    assert view.get(0.0, patience=60.0) == "first"
+
+
+def test_a_slurm_that_went_away_can_t_tell_its_hosts_and_its_last_answer_is_not_taken_for_the_truth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answers = ["NodeName=n1 CPUTot=4 RealMemory=1000 State=IDLE"]
+
+    def call(*command: str, **_: object) -> str:
+        if not answers:
+            raise commands.Unreachable("slurmctld does not answer")
+        return answers[0] if "nodes" in command else ""
+
+    monkeypatch.setattr(commands, "call", call)
+    monkeypatch.setattr(slurm, "_HOSTS_AGE", 0.0)
+    engine = slurm.SlurmEngine()
+    assert [host.name for host in engine.capacity().machines] == ["slurm/n1"]
+    answers.clear()
+
+    def problem() -> str:
+        try:
+            engine.capacity()
+        except NotYet as error:
+            return str(error)
+        return ""
+
+    assert wait_for(problem, 10, "the trouble") == "Slurm: slurmctld does not answer"
+    answers.append("NodeName=n2 CPUTot=4 RealMemory=1000 State=IDLE")
+    wait_for(lambda: not problem() and engine.capacity().machines[0].name == "slurm/n2", 10, "the recovery")
+
+
+def test_an_engine_s_health_says_when_it_answered_last_why_it_fails_and_that_it_hangs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    engine = FakeEngine()
+    asked = Runner(engine, lambda: None)
+    try:
+        asked.capacity(patience=10)
+        told = asked.health.told_at
+        assert told is not None and time.time() * 1000 - 60_000 < told <= time.time() * 1000
+        assert (asked.health.problem, asked.health.failing, asked.health.retry) == (None, 0, None)
+        engine.error = Transient("the daemon refuses the connection")
+        asked.capacity(patience=10)
+        assert asked.health.problem == "the daemon refuses the connection" and asked.health.told_at == told
+        engine.error = None
+        asked.capacity(patience=10)
+        assert asked.health.problem is None
+        monkeypatch.setattr(runner, "OVERDUE", 0.1)
+        engine.answers.clear()
+        asked.capacity()
+        said = str(wait_for(lambda: asked.health.problem, 10, "the silence"))
+        assert "the fake engine has not answered since" in said
+        engine.answers.set()
+        wait_for(lambda: asked.health.problem is None, 10, "the recovery")
+    finally:
+        engine.answers.set()
+        asked.close()

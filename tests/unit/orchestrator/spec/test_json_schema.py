@@ -1,4 +1,4 @@
-"""The JSON Schema of the job YAML: what editors are told agrees with what is accepted."""
+"""The JSON Schema of the job YAML agrees with what is accepted; ``track``, ``secrets`` and checkpoints by name."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from orchestrator.domain.errors import SpecError
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.json_schema import schema
 from orchestrator.spec.model import KINDS, Spec, validate
 from orchestrator.spec.values import known_tasks
@@ -45,7 +46,7 @@ def test_the_json_schema_tells_right_from_wrong(changes: str, fine: bool) -> Non
 
 
 def test_the_json_schema_lists_every_key_and_the_known_tasks() -> None:
-    document = schema()
+    document: Any = validator().schema
     assert document["$schema"] == "https://json-schema.org/draft/2020-12/schema"
     assert list(document["properties"]) == list(Spec.model_fields)
     assert set(KINDS) < document["properties"].keys()
@@ -85,5 +86,89 @@ def test_the_json_schema_knows_the_configuration_of_each_task(case: str, fine: b
 
 
 def test_the_json_schema_is_valid() -> None:
-    jsonschema.Draft202012Validator.check_schema(schema())
-    assert not any("PPO" in name for name in schema()["$defs"]), "how a task is trained has a section of its own"
+    jsonschema.Draft202012Validator.check_schema(validator().schema)
+    assert not any("PPO" in name for name in validator().schema["$defs"]), (
+        "how a task is trained has a section of its own"
+    )
+
+
+TRAIN = {"task": "Cartpole", "worlds": 4, "iterations": 2}
+
+
+def spec(**changes: Any) -> dict[str, Any]:
+    return {"name": "a", "train": TRAIN, **changes}
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ("wandb", {"wandb": {"tags": []}}),
+        (["wandb", "mlflow"], {"wandb": {"tags": []}, "mlflow": {"tags": {}}}),
+        ({"mlflow": None}, {"mlflow": {"tags": {}}}),
+        (
+            {"wandb": {"project": "ant", "mode": "offline", "tags": ["x"]}},
+            {"wandb": {"project": "ant", "mode": "offline", "tags": ["x"]}},
+        ),
+        ({"mlflow": {"uri": "http://host:5000/a"}}, {"mlflow": {"uri": "http://host:5000/a", "tags": {}}}),
+    ],
+)
+def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, kept: Any) -> None:
+    found = validate(spec(track=given), "job.yaml")
+    assert found.track is not None and found.track.model_dump(mode="json", exclude_none=True) == kept
+    assert accepts(spec(track=given))
+    again = validate(found.model_dump(mode="json", exclude_none=True), "run.json")
+    assert again == found  # as a run that is resumed reads it
+
+
+URI = "track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and "
+URI += "MLFLOW_TRACKING_PASSWORD as secrets"
+STORED = "the key would be stored in the run; remove it, and give it as a secret: secrets"
+WRONG_TRACKING = {
+    "track: wandv": "track: no service is called 'wandv'; did you mean wandb?",
+    "track: [wandb, 3]": "track: no service is called '3'; there are wandb, mlflow",
+    "track: 3": "track: expected wandb, mlflow, a list of them, or each with its settings, found 3",
+    "track: {wandb: {projct: x}}": "track.wandb.projct: unknown key; did you mean project?",
+    "track: {wandb: {mode: 'off'}}": "track.wandb.mode: expected 'online' or 'offline', found 'off'",
+    "track: {mlflow: {uri: 'http://me:word@host'}}": URI,
+    "track: {mlflow: {uri: 'https://word@host/?password=word'}}": URI,
+    "{track: mlflow, environment: {MLFLOW_TRACKING_URI: 'postgresql://host/db?password=word'}}": (
+        f"environment.MLFLOW_TRACKING_URI: {STORED}: {{MLFLOW_TRACKING_URI: NAME}}"
+    ),
+    "{track: wandb, environment: {WANDB_API_KEY: x}}": f"environment.WANDB_API_KEY: {STORED}: {{WANDB_API_KEY: NAME}}",
+    "{track: wandb, train: null, evaluate: {run: x}}": (
+        "track: only a training has metrics to track; this job has evaluate"
+    ),
+    "secrets: {MUSTER_TOKEN: x}": (
+        "secrets: MUSTER_TOKEN is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
+    ),
+    "secrets: {KEY: ''}": "secrets: 'KEY': expected the name under which the controller has the value",
+    "{secrets: {KEY: x}, environment: {KEY: y}}": "secrets: KEY is in environment, too; give it once",
+    "secrets: {KEY: 3}": "secrets.KEY: expected a text, found a whole number (3)",
+}
+
+
+@pytest.mark.parametrize("changes", WRONG_TRACKING)
+def test_invalid_tracking_and_secrets_are_refused_in_one_line(changes: str) -> None:
+    with pytest.raises(SpecError) as refused:
+        validate(spec(**yaml.safe_load(changes)), "job.yaml")
+    assert str(refused.value) == f"job.yaml: {WRONG_TRACKING[changes]}"
+
+
+def test_secrets_become_those_of_the_job_definition() -> None:
+    made = compile_definition(validate(spec(secrets={"WANDB_API_KEY": "wandb"}), "s"), "/home/me")
+    [entry] = made["nodeProperties"]["nodeRangeProperties"]
+    assert entry["container"]["secrets"] == [{"name": "WANDB_API_KEY", "valueFrom": "wandb"}]
+    [carried] = [each for each in entry["container"]["environment"] if each["name"] == "MUSTER_SPEC"]
+    assert json.loads(carried["value"])["secrets"] == {"WANDB_API_KEY": "wandb"}  # the name alone
+
+
+@pytest.mark.parametrize("kind", ["evaluate", "race", "export", "record", "render"])
+def test_a_checkpoint_is_named_in_the_same_ways_by_every_kind_of_job(kind: str) -> None:
+    for wanted in (3, "best", "latest"):
+        job = {"name": "a", kind: {"run": "x", "checkpoint": wanted}}
+        assert getattr(validate(job, "job.yaml"), kind).checkpoint == wanted
+        assert accepts(job)
+    for wrong in (-1, "newest", True, 1.5):
+        with pytest.raises(SpecError) as refused:
+            validate({"name": "a", kind: {"run": "x", "checkpoint": wrong}}, "job.yaml")
+        assert str(refused.value).startswith(f"job.yaml: {kind}.checkpoint: expected an iteration, best or latest")

@@ -13,6 +13,7 @@ from orchestrator.spec import file as specfile
 from orchestrator.spec import kept_files
 from orchestrator.spec.changes import override
 from orchestrator.spec.kept_files import MOST, changes_with_files, with_files
+from tests.support.refusals import refusal
 
 GOOD = "# ½ 😀 \"quoted\" \\ and\ttabs\ndef reward_function(params):\n    return params['speed']\n"
 METADATA = {"action_space": [{"steering_angle": angle, "speed": 1} for angle in (-20, 0, 20)]}
@@ -85,15 +86,13 @@ def test_no_file_is_read_for_fields_that_name_none(train: Any) -> None:
 
 def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Path) -> None:
     (directory / "mine.py").write_text("import os\n" + GOOD)
-    with pytest.raises(SpecError) as refused:
-        specfile.load("job.yaml")
+    refused = refusal(specfile.load, "job.yaml", error=SpecError)
     said = "mine.py:1: IMPORT_ERROR: os can't be imported; a reward function may import math, random, numpy, scipy, shapely"
-    assert str(refused.value) == f"job.yaml:7: train.config.reward_function: {said}"
+    assert refused == f"job.yaml:7: train.config.reward_function: {said}"
     (directory / "mine.py").unlink()
-    with pytest.raises(SpecError) as refused:
-        specfile.load("job.yaml")
+    refused = refusal(specfile.load, "job.yaml", error=SpecError)
     here = f"a path is relative to the directory of the command, {directory}"
-    assert str(refused.value) == f"job.yaml:7: train.config.reward_function: mine.py: No such file or directory; {here}"
+    assert refused == f"job.yaml:7: train.config.reward_function: mine.py: No such file or directory; {here}"
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.file import load
+from orchestrator.spec.model import ALGORITHMS, validate
+from tests.support.refusals import refusal
 from tests.support.waiting import PATIENCE
+from worker.errors import UserError
+from worker.learning.algorithms import find_algorithm, installed
+from worker.learning.algorithms import settings as settings_of
+from worker.tasks.configs.cartpole import CartpoleConfig
 
 WRONG = {
     "Ant ppo learning_rate_limits: [0.1, 0.001]": "learning_rate_limits: expected the least, then the greatest",
@@ -43,15 +51,38 @@ def job(path: Path, task: str, algorithm: str, settings: str) -> str:
     return str(file)
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "key", "value", "said"),
+    [
+        ("ppo", "hidden_sizes", [], "hidden_sizes: expected at least one number, found []"),
+        ("ppo", "epochs", 2.5, "epochs: expected a whole number, found a number (2.5)"),
+        ("ppo", "schedule", "linear", "schedule: expected 'adaptive' or 'fixed', found 'linear'"),
+        ("sac", "gamma", 2.0, "gamma: expected a value less than or equal to 1, found 2.0"),
+        ("rsl_rl", "actor", [64], "actor: expected a mapping, found a list"),
+        ("rsl_rl", "actor", {"init": math.inf}, "actor.init: expected a finite number, found a number (inf)"),
+        ("rsl_rl", "algorithm", {"max_grad_norm": None}, "algorithm.max_grad_norm: expected a number, found nothing"),
+        (
+            *("rsl_rl", "algorithm", {"num_mini_batches": 2.5}),
+            "algorithm.num_mini_batches: expected a whole number, found a number (2.5)",
+        ),
+    ],
+)
+def test_submission_and_rank_refuse_a_setting_in_the_same_words(
+    algorithm: str, key: str, value: Any, said: str
+) -> None:
+    section = {"task": "Cartpole", "worlds": 8, "iterations": 1, "algorithm": algorithm, algorithm: {key: value}}
+    submission = refusal(validate, {"name": "job", "train": section}, "job.yaml", error=SpecError)
+    rank = refusal(settings_of, find_algorithm(algorithm), algorithm, CartpoleConfig(), section, error=UserError)
+    assert (rank, submission) == (f"train.{algorithm}.{said}", f"job.yaml: {rank}")
+
+
 @pytest.mark.parametrize("case", WRONG)
 def test_rules_over_several_settings_are_refused_with_file_line_and_key(tmp_path: Path, case: str) -> None:
     (task, algorithm, settings), said = case.split(" ", 2), WRONG[case]
     path = job(tmp_path, task, algorithm, settings)
-    with pytest.raises(SpecError) as refused:
-        load(path)
     key = f"train.{algorithm}" + ("." if said.partition(":")[0].isidentifier() else ": ")
     given = settings.partition(":")[0] == said.partition(":")[0]
-    assert str(refused.value) == f"{path}:{8 if given else 7}: {key}{said}"
+    assert refusal(load, path, error=SpecError) == f"{path}:{8 if given else 7}: {key}{said}"
 
 
 def test_settings_of_the_job_override_those_of_the_task(tmp_path: Path) -> None:
@@ -83,11 +114,8 @@ def test_a_number_that_json_does_not_have_is_refused_wherever_it_stands(
     tmp_path: Path, algorithm: str, settings: str, key: str, found: str
 ) -> None:
     path = job(tmp_path, "Ant", algorithm, settings)
-    with pytest.raises(SpecError) as refused:
-        load(path)
-    assert (
-        str(refused.value) == f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
-    )
+    said = f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
+    assert refusal(load, path, error=SpecError) == said
 
 
 def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) -> None:
@@ -95,10 +123,8 @@ def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) 
     text = "name: a\ntrain:\n  task: Ant\n  worlds: 4\n  iterations: 2\n  algorithm: {}\n  {}: {{epochs: 3}}\n"
     for algorithm, section, belongs in (("sac", "ppo", "sac"), ("my_module:Mine", "ppo", "settings")):
         file.write_text(text.format(algorithm, section))
-        with pytest.raises(SpecError) as refused:
-            load(str(file))
         said = f"train.{section}: the algorithm is {algorithm}, so its settings belong under train.{belongs}"
-        assert str(refused.value) == f"{file}:7: {said}"
+        assert refusal(load, str(file), error=SpecError) == f"{file}:7: {said}"
 
 
 HOPPER = {
@@ -140,23 +166,16 @@ for wrong in ({"hop": {"hopps": 4}}, {"hop": {"hops": "many"}}, {"ppo": {"epochs
     except SpecError as error:
         print(error)
 """
-RANK = """
-from worker.learning import algorithms
-from worker.learning.job import configure
-from worker.tasks import find_task
-
-section = {"algorithm": "hop", "hop": {"hops": 4}}
-found = algorithms.find_algorithm("hop")
-print(found.__name__, algorithms.settings(found, "hop", configure(find_task("Cartpole"), section), section).hops)
-"""
 
 
-def test_an_algorithm_of_an_installed_package_is_known_to_the_submission_and_to_the_rank(tmp_path: Path) -> None:
+def test_an_algorithm_of_an_installed_package_is_known_to_the_submission_and_to_the_rank(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, text in HOPPER.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-c", CONTROLLER + RANK]
+    # what is installed is known from the start of a controller on
+    command, env = [sys.executable, "-c", CONTROLLER], {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300 * PATIENCE)
     assert done.stdout.splitlines() == [
         "{'hops': 4}",
@@ -164,13 +183,13 @@ def test_an_algorithm_of_an_installed_package_is_known_to_the_submission_and_to_
         "job.yaml: train.hop.hops: expected a whole number, found a text ('many')",
         "job.yaml: train.ppo: the algorithm is hop, so its settings belong under train.hop",
         "job.yaml: train.config.hop: not a key of CartpoleConfig; settings of hop stand under train.hop",
-        "Hop 4",
     ], done.stderr
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = find_algorithm("hop")
+    section = {"algorithm": "hop", "hop": {"hops": 4}}
+    assert (found.__name__, settings_of(found, "hop", CartpoleConfig(), section).hops) == ("Hop", 4)
 
 
 def test_every_installed_algorithm_names_its_class_and_its_settings() -> None:
-    from orchestrator.spec.model import ALGORITHMS
-    from worker.learning.algorithms import find_algorithm, installed
-
     assert installed().keys() == ALGORITHMS.keys()
     assert all(find_algorithm(name).config_type is ALGORITHMS[name] for name in ALGORITHMS)

@@ -22,7 +22,9 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Run, Store
 from shared_store.settings import setting_at
 from tests.support.orchestrator.trained import add_checkpoint, add_run
+from tests.support.refusals import refusal
 
+pytestmark = pytest.mark.usefixtures("installed_once")
 RUN = Run(Path("/store/runs/ant"))
 TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
 OTHERS = ("evaluate", "race", "export", "record", "render")
@@ -255,9 +257,7 @@ def test_a_learning_rate_that_would_have_no_effect_is_refused_in_whatever_form_i
     key = RATES[name]
     chosen = saved_with(tmp_path, 0.0004, name, f"train.{name}.{key}=0.001")
     after = changed("train", form, algorithm=name)[1]
-    with pytest.raises(ClientError) as refused:
-        _check_rate(RUN, chosen, after, [form])
-    assert str(refused.value).startswith(
+    assert refusal(_check_rate, RUN, chosen, after, [form], error=ClientError).startswith(
         f"run ant: train.{name}.{key} is 0.001 already, so that the run would continue with the rate of its checkpoint, "
         "which is 0.0004 now; set another value"
     )

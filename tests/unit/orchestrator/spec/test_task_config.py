@@ -18,6 +18,7 @@ from orchestrator.spec.json_schema import schema
 from orchestrator.spec.model import validate
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import known_tasks
+from tests.support.refusals import refusal
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks import find_task
@@ -45,11 +46,19 @@ WRONG = {
     "Cartpole substeps: 0": "substeps: expected a value greater than or equal to 1, found 0",
     "Humanoid nan_limit: -0.5": "nan_limit: expected a value greater than or equal to 0, found -0.5",
     "Quadruped command_turn: [1, -1]": "command_turn: expected [least, greatest], found [1, -1]",
+    "Quadruped command_turn: [1.0]": "command_turn: expected [least, greatest], found [1.0]",
+    "Quadruped command_seconds: 0": "command_seconds: expected a value greater than 0, found 0",
     "Quadruped command_stand: 2": "command_stand: expected a value less than or equal to 1, found 2",
     "Ant randomize: {mass: [0, 1]}": f"randomize.mass: {TWO_FACTORS} above 0, found [0, 1]",
     "Ant randomize: {gravity: [1]}": f"randomize.gravity: {TWO_FACTORS} of 0 or more, found [1]",
     "CartpolePixels camera: {samples: 65}": "camera.samples: expected a value less than or equal to 64, found 65",
     "CartpolePixels camera: {target: [0, 1]}": "camera.target: expected [x, y, z], found [0, 1]",
+    # weights
+    "Ant rewards: {7: 1.0}": "rewards.7: expected a text, found a whole number (7)",
+    "Ant rewards: {forward: true}": "rewards.forward: expected a number, found true or false (True)",
+    "Ant rewards: {forward: .nan}": "rewards.forward: expected a finite number, found a number (nan)",
+    "Ant rewards: {up: .inf}": "rewards.up: expected a finite number, found a number (inf)",
+    "Ant rewards: {up: null}": "rewards.up: expected a number, found nothing",
     # a curriculum
     "Ant curriculum: {forwrd: [[0, 1]]}": "curriculum.forwrd: there is no such term; did you mean forward?",
     "Ant curriculum: {forward: 3}": "curriculum.forward: expected points [iteration, value], found 3",
@@ -79,12 +88,10 @@ def test_the_submission_and_the_rank_refuse_the_same_in_the_same_words(tmp_path:
     task, config = case.split(" ", 1)
     path = tmp_path / "job.yaml"
     path.write_text(f"name: a\ntrain:\n  task: {task}\n  worlds: 4\n  iterations: 2\n  config:\n    {config}\n")
-    with pytest.raises(SpecError) as submitted:
-        load(str(path))
-    assert str(submitted.value).startswith(f"{path}:7: train.config.{WRONG[case]}")
-    with pytest.raises(UserError) as started:
-        configure(find_task(task), yaml.safe_load(path.read_text())["train"])
-    assert str(submitted.value) == f"{path}:7: {started.value}" and "\n" not in str(started.value)
+    submitted = refusal(load, str(path), error=SpecError)
+    assert submitted.startswith(f"{path}:7: train.config.{WRONG[case]}")
+    started = refusal(configure, find_task(task), yaml.safe_load(path.read_text())["train"], error=UserError)
+    assert submitted == f"{path}:7: {started}"
 
 
 def test_the_line_is_that_of_the_value_and_a_change_has_none(tmp_path: Path) -> None:
@@ -94,9 +101,8 @@ def test_the_line_is_that_of_the_value_and_a_change_has_none(tmp_path: Path) -> 
     with pytest.raises(SpecError, match=r"job\.yaml:10: train\.config\.rewards\.foward: AntConfig has no term"):
         load(str(path))
     path.write_text("name: a\ntrain: {task: Ant, worlds: 4, iterations: 2}\n")
-    with pytest.raises(SpecError) as refused:
-        load(str(path), ["train.config.fall_height=low"])
-    assert str(refused.value) == "--set: train.config.fall_height: expected a number, found a text ('low')"
+    said = refusal(load, str(path), ["train.config.fall_height=low"], error=SpecError)
+    assert said == "--set: train.config.fall_height: expected a number, found a text ('low')"
 
 
 def test_every_installed_task_publishes_the_class_that_its_rank_uses() -> None:
@@ -189,9 +195,7 @@ def test_a_task_of_an_installed_package_is_checked_by_the_class_that_it_names() 
         ({"rewards": {"nera": 1}}, "rewards.nera: ReachConfig has no term 'nera'; did you mean near?"),
         ({"substeps": 0}, "substeps: expected a value greater than or equal to 1, found 0"),
     ):
-        with pytest.raises(SpecError) as refused:
-            submit("Reach", config)
-        assert str(refused.value) == f"job.yaml: train.config.{said}"
+        assert refusal(submit, "Reach", config, error=SpecError) == f"job.yaml: train.config.{said}"
 
 
 @pytest.mark.usefixtures("reach")

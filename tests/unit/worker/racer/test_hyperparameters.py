@@ -30,9 +30,8 @@ def job(hyperparameters: Any, task: str = "Racer", **train: Any) -> Spec:
 
 
 def refused(hyperparameters: Any, task: str = "Racer", **train: Any) -> str:
-    with pytest.raises(SpecError) as found:
-        job(hyperparameters, task, **train)
-    return str(found.value).removeprefix("racer.yaml: train.hyperparameters")
+    found = refusal(job, hyperparameters, task, **train, error=SpecError)
+    return found.removeprefix("racer.yaml: train.hyperparameters")
 
 
 def test_a_usual_file_becomes_settings_of_ppo() -> None:

@@ -1,10 +1,12 @@
-"""The translated subset, case by case: the numbers and errors of the compiled function are Python's."""
+"""Compiled reward functions give Python's numbers and errors: case by case, and those that people write."""
 
 from __future__ import annotations
 
 import math
+import random
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from worker.racer.rewards import reward as reward_module
 from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
 from worker.racer.rewards.problems import Failure, RewardRefused
 from worker.racer.rewards.reward import RewardFunction
-from worker.racer.rewards.samples import oval, samples
+from worker.racer.rewards.samples import Line, oval, random_sample, samples
 from worker.racer.rewards.translation import Outside, Translated, translate
 
 VALUES = (-2.5, -2.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.5, 7.0, 1e6)
@@ -133,11 +135,10 @@ def test_a_translated_function_gives_pythons_number_or_an_error_where_python_rai
     race, given = arrays()
     rewards = wp.empty(len(VALUES), dtype=wp.float32, device="cpu")
     wp.launch(compiled[name], dim=len(VALUES), inputs=[race, rewards], device="cpu")
-    scope: dict[str, Any] = {}
-    exec(compile(CASES[name], "<reward>", "exec"), scope)
+    function = interpreted(CASES[name])
     for params, reward, (code, count) in zip(given, rewards.numpy().tolist(), race.errors.numpy(), strict=True):
         try:
-            expected = scope["reward_function"](params)
+            expected = function(params)
             expected = float(expected) if isinstance(expected, int | float) else math.nan
         except (ArithmeticError, ValueError, LookupError, NameError):
             expected = math.nan
@@ -247,3 +248,89 @@ def test_a_function_compiles_in_a_process_that_has_used_no_warp_yet() -> None:
 def test_code_that_the_guard_refuses_does_not_run() -> None:
     with pytest.raises(RewardRefused, match=r"^r\.py:1: IMPORT_ERROR: os can't be imported"):
         RewardFunction(f"import os\n{SOURCE}", TRACKS, 2, file="r.py")
+
+
+CORPUS = {path.stem: path.read_text() for path in sorted((Path(__file__).parent / "corpus").glob("*.py"))}
+OUTSIDE = {
+    "global_state": "line 7: the global variable last_progress, which keeps its value: such functions run in Python workers",
+    "numpy_arrays": "line 7: numpy.array(): such functions run in Python workers",
+    "stateful_class": "line 18: an object of the class Reward: such functions run in Python workers",
+}
+DRAWN = 250
+
+
+def tried() -> list[dict[str, Any]]:
+    """Sample inputs and drawn ones, as the arrays hold them."""
+    chance, line = random.Random(16), Line(oval())
+    drawn = [*samples().values(), *(random_sample(line, chance) for _ in range(DRAWN))]
+    rounded = np.float32(line.points).tolist()
+    found = []
+    for params in drawn:
+        numbers, objects = parameters.row_of(params)
+        rows = np.float32(objects).tolist()
+        found.append(parameters.parameters_of(np.float32(numbers).tolist(), rows, [tuple(p) for p in rounded]))
+    return found
+
+
+def arrays_of(drawn: list[dict[str, Any]]) -> Any:
+    """The same in arrays."""
+    race = race_arrays(len(drawn), [drawn[0]["waypoints"]], "cpu")
+    numbers, objects = race.numbers.numpy(), race.objects.numpy()
+    for world, params in enumerate(drawn):
+        row, rows = parameters.row_of(params)
+        numbers[world] = row
+        objects[world, : len(rows)] = rows if rows else 0.0
+    return race
+
+
+@pytest.fixture(scope="module")
+def rewarded() -> tuple[list[dict[str, Any]], dict[str, tuple[np.ndarray, dict[str, Failure]]]]:
+    """The inputs, and the rewards and errors of every function that compiles; all in one module of Warp."""
+    drawn = tried()
+    names = [name for name in CORPUS if name not in OUTSIDE]
+    found = kernels([warp_function(translate(CORPUS[name]).snippet) for name in names], "corpus")
+    results = {}
+    for name, kernel in zip(names, found, strict=True):
+        race = arrays_of(drawn)
+        rewards = wp.empty(len(drawn), dtype=wp.float32, device="cpu")
+        wp.launch(kernel, dim=len(drawn), inputs=[race, rewards], device="cpu")
+        results[name] = (rewards.numpy(), told_errors(race.errors.numpy()))
+    return drawn, results
+
+
+def interpreted(source: str) -> Any:
+    scope: dict[str, Any] = {}
+    exec(compile(source, "<reward>", "exec"), scope)
+    return scope["reward_function"]
+
+
+@pytest.mark.parametrize("name", [name for name in CORPUS if name not in OUTSIDE])
+def test_a_compiled_reward_function_equals_python_s(name: str, rewarded: Any) -> None:
+    drawn, results = rewarded
+    rewards, errors = results[name]
+    function, expected, raised = interpreted(CORPUS[name]), [], 0
+    for params in drawn:
+        try:
+            expected.append(float(function(params)))
+        except (ArithmeticError, ValueError, IndexError):
+            expected.append(math.nan)
+            raised += 1
+    assert rewards == pytest.approx(np.float32(expected), rel=2e-6, abs=1e-6, nan_ok=True)
+    assert sum(failure.count for failure in errors.values()) == raised
+    assert len({round(value, 9) for value in expected}) > 1, "all rewards are the same: the test shows nothing"
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_function_outside_the_subset_is_refused_with_its_line_and_the_reason(name: str) -> None:
+    assert refusal(translate, CORPUS[name], error=Outside) == OUTSIDE[name]
+
+
+def test_nine_of_ten_functions_compile() -> None:
+    assert len(CORPUS) >= 30 and len(OUTSIDE) / len(CORPUS) <= 0.1
+
+
+def test_the_corpus_compiles_for_a_gpu(tmp_path: Path) -> None:
+    functions = [warp_function(translate(CORPUS[name]).snippet) for name in CORPUS if name not in OUTSIDE]
+    kernels(functions, "corpus_for_a_gpu")
+    wp.compile_aot_module(wp.get_module("muster.corpus_for_a_gpu"), arch=90, module_dir=tmp_path)
+    assert list(tmp_path.glob("*.sm90.*"))
