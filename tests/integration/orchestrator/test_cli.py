@@ -86,16 +86,6 @@ def test_a_server_that_can_t_start_says_why(shared_server: Serving, tmp_path: Pa
         refused([*serve, *option], home, 2, option[0], said)
 
 
-def test_off_loopback_a_token_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setenv("MUSTER_TOKEN", "a-secret-of-this-test")
-        server = Serving(tmp_path / "home", "--host", "0.0.0.0")
-    with server:
-        refused(["list"], server.home, 1, "this token is not known here", MUSTER_TOKEN="wrong")
-        refused(["list"], server.home, 1, "a token is needed")
-        assert server.muster("list", MUSTER_TOKEN="a-secret-of-this-test").returncode == 0
-
-
 def test_commands_without_a_controller_say_how_to_start_one_and_take_no_other(tmp_path: Path) -> None:
     with socket.socket() as holder:  # a port that nobody serves
         holder.bind(("127.0.0.1", 0))
