@@ -137,7 +137,7 @@ torture: $(READY)
 	$(BIN)/python -m tests.support.faults.torture --kills $(or $(N),300) --rounds $(or $(ROUNDS),10)
 
 bits: $(READY)
-	MUSTER_LONG=1 $(BIN)/pytest -q tests/training/faults/test_bits.py tests/long/faults/test_bits_of_algorithms.py tests/training/e2e tests/integration/engines/test_docker_faults.py tests/training/engines
+	MUSTER_LONG=1 $(BIN)/pytest -q tests/training/faults/test_bits.py tests/long/faults/test_bits_of_algorithms.py tests/training/e2e tests/integration/engines/test_several.py tests/training/engines
 
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/integration/conformance/test_fuzz.py tests/integration/conformance/test_hostile_clients.py

@@ -1,12 +1,17 @@
-"""The page of a job, through a real server: what it shows, what it follows, and what a person can do there."""
+"""The page of a job, through a real server: what it shows, what it follows, what a person can do there, and its live view."""
 
 from __future__ import annotations
 
 import json
-from typing import Any
+import sys
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from orchestrator.api.errors import ClientError
+from orchestrator.console import job_view
+from orchestrator.console.job_view import State, Views
 from orchestrator.domain.errors import ApiError
 from shared_store.layout import Run, Store
 from shared_store.logs import format_line
@@ -87,8 +92,7 @@ def test_a_job_that_waits_says_why_and_shows_what_it_will_do(console: Console, t
     assert place["data-curves"] == "/runs/taught/curves"
 
 
-def test_a_job_is_found_by_its_name_and_by_the_start_of_its_id(console: Console, training: str) -> None:
-    visitor = console.visitor()
+def test_a_job_is_found_by_its_name_and_by_the_start_of_its_id(visitor: Visitor, training: str) -> None:
     for reference in ("taught", training[:8]):
         assert visitor.http.get(f"/jobs/{reference}").url.path == f"/jobs/{training}"
     assert "does not exist" in visitor.page("/jobs/nothing", 404).text
@@ -120,8 +124,7 @@ def test_what_a_job_says_is_text_wherever_it_is_shown(console: Console, talking:
     assert "<script>alert(1)</script>" in visitor.page(f"/jobs/{waiting}").text, "as text it is there"
 
 
-def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(console: Console, talking: str) -> None:
-    visitor = console.visitor()
+def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(visitor: Visitor, talking: str) -> None:
     last = log_of(visitor, talking, node="0")
     assert len(last["lines"]) == 400 and last["more"]
     first = log_of(visitor, talking, node="0", before=json.dumps(last["first"]))
@@ -135,19 +138,7 @@ def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(console: C
         assert visitor.http.get(f"/jobs/{talking}/log", params=wrong).status_code == 400
 
 
-def test_the_log_is_searched_and_the_first_error_found_with_lines_around_it(console: Console, talking: str) -> None:
-    visitor = console.visitor()
-    found = log_of(visitor, talking, "/search", text="LINE 77 OF")
-    assert sorted(said(found)) == ["line 77 of 0", "line 77 of 1"] and found["over"]
-    error = log_of(visitor, talking, "/search")
-    (line,) = error["lines"]
-    assert line[2] == 0 and line[5].startswith("Traceback")
-    around = said(log_of(visitor, talking, node="0", around=json.dumps({"1/0": error["positions"][0]})))
-    assert "line 599 of 0" in around and "ValueError: the reason" in around
-
-
-def test_the_stream_has_what_changed_and_ends_with_the_job(console: Console, talking: str) -> None:
-    visitor = console.visitor()
+def test_the_stream_has_what_changed_and_ends_with_the_job(visitor: Visitor, talking: str) -> None:
     events = list(visitor.events(f"/jobs/{talking}/stream"))
     names = [name for name, _, _ in events]
     assert names == ["facts", "attempts", "checkpoints", "end"], "the page has the lines already"
@@ -155,8 +146,7 @@ def test_the_stream_has_what_changed_and_ends_with_the_job(console: Console, tal
     assert json.loads(events[0][2])["l"] == log_of(visitor, talking)["last"]
 
 
-def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(console: Console, talking: str) -> None:
-    visitor = console.visitor()
+def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(visitor: Visitor, talking: str) -> None:
     middle = log_of(visitor, talking, before=json.dumps(log_of(visitor, talking)["first"]))
     had = json.dumps({"i": None, "l": middle["last"]})
     expected = said(log_of(visitor, talking))
@@ -178,8 +168,7 @@ def test_a_page_that_missed_too_much_gets_the_last_lines(console: Console, talki
     assert said(window)[-1].startswith("late 19999 ")
 
 
-def test_the_stream_has_new_iterations_and_tells_what_went_back(console: Console, training: str, store: Store) -> None:
-    visitor = console.visitor()
+def test_the_stream_has_new_iterations_and_tells_what_went_back(visitor: Visitor, training: str, store: Store) -> None:
     told = visitor.http.get("/runs/taught/curves", params={"name": "reward*"}).json()
     assert told["series"]["reward"] == [i / 2 for i in range(1, 10)] and told["last"] == 9
     had = json.dumps({"i": 7, "l": {}})
@@ -208,8 +197,7 @@ def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(co
     assert exported["export"]["checkpoint"] == 9 and exported["queue"] == "default"
     recorded = spec_of(console, visitor.submit(f"/jobs/{training}/record", checkpoint="best"))
     assert recorded["record"]["checkpoint"] == 9
-    missing = visitor.submit(f"/jobs/{training}/evaluate", checkpoint="7")
-    assert missing.status_code == 404 and "it has: 3, 6, 9" in missing.json()["message"]
+    assert "it has: 3, 6, 9" in visitor.refusal(f"/jobs/{training}/evaluate", checkpoint="7", status=404)
     assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
 
 
@@ -227,14 +215,11 @@ def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console
     assert spec_of(console, told)["train"]["iterations"] == 30 and "from iteration 3" in told.json()["message"]
     page = visitor.page(told.json()["location"])
     assert "Compared with the job before it, again" in page.text and "train.iterations 9 30" in page.text
-    wrong = visitor.submit(f"/jobs/{first}/resume", changes="nonsense")
-    assert wrong.status_code == 400 and "expected KEY=VALUE" in wrong.json()["message"]
+    assert "expected KEY=VALUE" in visitor.refusal(f"/jobs/{first}/resume", changes="nonsense", status=400)
 
 
-def test_a_clone_shows_what_is_different_from_its_parent(console: Console, training: str) -> None:
-    visitor = console.visitor()
-    nameless = visitor.submit(f"/jobs/{training}/clone", checkpoint="6")
-    assert nameless.status_code == 400 and "give the new run a name" in nameless.json()["message"]
+def test_a_clone_shows_what_is_different_from_its_parent(visitor: Visitor, training: str) -> None:
+    assert "give the new run a name" in visitor.refusal(f"/jobs/{training}/clone", checkpoint="6", status=400)
     answer = visitor.submit(f"/jobs/{training}/clone", checkpoint="6", name="copied", changes="train.seed=7")
     assert "cloned taught@6 as run copied" in answer.json()["message"]
     page = visitor.page(answer.json()["location"])
@@ -248,10 +233,9 @@ def test_only_an_exported_checkpoint_becomes_a_model(console: Console, training:
     assert console.client.get("/api/models") == []
 
 
-def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, store: Store) -> None:
+def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, visitor: Visitor, store: Store) -> None:
     job = submit_gang(console.client, FOREVER, name="runs", queue="first")
     await_status(console.client, job, "RUNNING")
-    visitor = console.visitor()
     assert visitor.submit(f"/jobs/{job}/stop").json()["question"]["title"] == f"Stop runs ({job[:8]})?"
     saved = wait_for(  # a job may run before its node is on the bus
         lambda: answer if (answer := visitor.submit(f"/jobs/{job}/save")).status_code != 503 else None, 20, "the node"
@@ -270,8 +254,7 @@ def test_a_read_only_key_sees_no_buttons_nor_values_and_is_refused_actions(conso
     assert page.all("input", type="radio") == []
     jobs = console.client.get("/api/jobs")["total"]
     for action in ("stop", "save", "resume", "clone", "evaluate", "export", "record", "register"):
-        answer = visitor.submit(f"/jobs/{training}/{action}", name="x", confirmed="yes")
-        assert answer.status_code == 403 and "is read-only" in answer.json()["message"], answer.text
+        assert "is read-only" in visitor.refusal(f"/jobs/{training}/{action}", name="x", confirmed="yes")
     assert console.client.get("/api/jobs")["total"] == jobs
 
 
@@ -316,3 +299,85 @@ def test_the_page_of_an_array_leads_to_its_jobs(console: Console, store: Store) 
     wait_for(lambda: "RUNNABLE" in console.visitor().page(f"/jobs/{job}:1").text, 20, "the child's reason")
     with pytest.raises(ApiError):
         console.client.get(f"/api/jobs/{job}:7")
+
+
+# -- live views: when one starts and ends, with real processes in place of the viewer ----------------------------------
+
+
+OPEN = "import time; print('note: 2 worlds'); print('the view is at http://127.0.0.1:9', flush=True); time.sleep(600)"
+SHOWN = State(url="http://127.0.0.1:9")
+
+
+def script(text: str) -> list[str]:
+    return [sys.executable, "-c", text]
+
+
+def shown(views: Views, job: str, state: State) -> None:
+    wait_for(lambda: views.state(job) == state, 20, f"{job}: {state}")
+
+
+def test_a_view_is_open_until_it_is_closed_and_a_server_has_two_at_once() -> None:
+    views = Views()
+    assert views.state("a") == State()
+    views.start("a", script(OPEN))
+    views.start("b", script(OPEN))
+    assert views.state("a").text == "starting"
+    for job in ("a", "b"):
+        shown(views, job, SHOWN)
+    views.start("a", script("raise SystemExit(3)"))
+    assert views.state("a") == SHOWN, "it is open already"
+    with pytest.raises(ClientError, match="2 live views are open on this server; close one first"):
+        views.start("c", script(OPEN))
+    views.end("a")
+    shown(views, "a", State())
+    views.start("c", script(OPEN))
+    shown(views, "c", SHOWN)
+    for job in ("b", "c", "nobody's"):
+        views.end(job)
+        shown(views, job, State())
+
+
+def test_the_reason_of_a_view_that_ends_is_its_last_line() -> None:
+    views = Views()
+    views.start("a", script("print('muster: the training is on another machine'); raise SystemExit(1)"))
+    shown(views, "a", State(problem="the training is on another machine"))
+    views.start("a", script("raise SystemExit(3)"))
+    shown(views, "a", State(problem="exit code 3"))
+
+
+def test_a_view_ends_when_nobody_looks_at_its_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_view, "_UNSEEN", 2.0)
+    views = Views()
+    views.start("a", script(OPEN))
+    wait_for(lambda: views.state("a", is_seen=True) == SHOWN, 20, "the view")
+    shown(views, "a", State())
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("127.0.0.1:8080", "http://127.0.0.1:8080"),
+        ("LOCALHOST", "http://localhost:80"),
+        ("[::1]:8080", "http://[::1]:8080"),
+        ("127.0.0.1:8080; script-src *", None),
+        ("127.0.0.1 *", None),
+        ("robots.example:8080", None),
+        ("", None),
+    ],
+)
+def test_a_viewer_may_be_framed_by_the_console_of_this_machine_alone(host: str, origin: str | None) -> None:
+    request = cast(Any, SimpleNamespace(headers={"host": host}, url=SimpleNamespace(scheme="http")))
+    assert job_view.is_near(request) == (origin is not None)
+    if origin is not None:
+        assert job_view._origin(request) == origin
+
+
+def test_what_can_t_be_watched_is_refused_in_one_line(console: Console) -> None:
+    job = console.submit(console.register("waits"), "waits")
+    answer = console.visitor().submit(f"/jobs/{job}/view")
+    assert answer.status_code == 409
+    assert answer.json()["message"] == "job waits is no training that runs; its checkpoints can be recorded"
+    assert console.visitor("reader").submit(f"/jobs/{job}/view").status_code == 403
+    far = console.visitor().http.post(f"/jobs/{job}/view", headers={"Host": "robots.example", "Accept": "*/*"})
+    assert far.status_code == 403
+    console.client.batch("TerminateJob", jobId=job, reason="seen")

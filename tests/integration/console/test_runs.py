@@ -1,19 +1,31 @@
-"""The pages of runs and their comparison, through a real server whose store has trained runs."""
+"""The pages of runs and their comparison, through a real server; whatever a job wrote and a client asks for, pages show the rest."""
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+import json
+import threading
+from collections.abc import AsyncIterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pyarrow
 import pyarrow.parquet
 import pytest
+from fastapi import Request
 
-from shared_store.files import write_json
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http.access import Access
+from orchestrator.api.turns import Turns
+from orchestrator.console.live import Event, stream
+from shared_store.files import DamagedFile, open_inside, write_json
 from shared_store.layout import Run, Store
 from shared_store.metrics import MetricsWriter
 from tests.conftest import call_muster
 from tests.support.console.fixtures import Console
-from tests.support.console.visitor import Page
+from tests.support.console.visitor import Page, Visitor
+from tests.support.orchestrator.jobs import await_status
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
 HOSTILE = "<script>alert(1)</script>"
@@ -110,8 +122,7 @@ def test_the_comparison_is_that_of_the_command(console: Console, store: Store, m
     assert "fast* (2)" in grouped and "1, 2" in grouped
 
 
-def test_curves_over_seeds_have_their_spread(console: Console, store: Store) -> None:
-    visitor = console.visitor()
+def test_curves_over_seeds_have_their_spread(visitor: Visitor, store: Store) -> None:
     told = visitor.http.get("/compare/curves?run=fast*&run=sure", headers={"Accept": "application/json"}).json()
     group, single = told["lines"]
     assert (told["x"][0], told["x"][-1], len(told["x"])) == (100.0, 900.0, 200)
@@ -121,8 +132,7 @@ def test_curves_over_seeds_have_their_spread(console: Console, store: Store) -> 
     assert empty["x"] == [] and empty["lines"][0]["y"] == []
 
 
-def test_an_unknown_metric_is_refused_with_the_nearest_one(console: Console, store: Store) -> None:
-    visitor = console.visitor()
+def test_an_unknown_metric_is_refused_with_the_nearest_one(visitor: Visitor, store: Store) -> None:
     said = visitor.page("/compare?run=fast&metric=rewrd", 404).text
     assert "no run here has a metric 'rewrd'; did you mean reward?" in said
 
@@ -136,14 +146,13 @@ def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
     assert names(console.visitor("reader").page("/runs?search=sure")) == ["sure"]
 
 
-def test_what_is_in_a_run_is_text_and_nothing_else(console: Console, store: Store) -> None:
+def test_what_is_in_a_run_is_text_and_nothing_else(visitor: Visitor, store: Store) -> None:
     parent = {"run": HOSTILE, "checkpoint": HOSTILE}
     run = trained(store, "hostile", [1.0], train={"task": HOSTILE, "seed": HOSTILE}, owner=HOSTILE, parent=parent)
     written = run.evaluations / "00000009-e1-job.json"
     summary = {**SPEC, **LENGTHS, "mean_return": 1.0, "episodes": 1, "time": 1.0}
     hostile = {"seed": HOSTILE, "config": {HOSTILE: HOSTILE}, "success": HOSTILE, "return": HOSTILE}
     write_json(written, {**summary, **hostile})
-    visitor = console.visitor()
     add_checkpoint(store, "hostile", 12, reward=HOSTILE, score=[HOSTILE], created=HOSTILE)
     add_run(store, "odd", {"name": HOSTILE, "train": HOSTILE})
     compared = ("/compare?run=odd&run=hostile", "/compare?run=hostile&run=fast")
@@ -162,3 +171,108 @@ def test_a_damaged_run_says_so_and_takes_no_other_away(console: Console, store: 
     page = console.visitor().page("/runs?search=a")
     assert "damaged" in names(page) and "fast" in names(page) and "created is no time" in page.text
     assert "damaged file" in console.visitor().page("/runs/damaged", 409).text
+
+
+# -- what a job wrote in place of numbers, and clients that ask for too much -------------------------------------------
+
+
+NUMBERS = (
+    *("reward", "score", "score_error", "steps_per_second", "iteration_seconds", "time", "env_steps", "slowest_rank"),
+    *("slowest_excess", "kl"),
+)
+
+
+def test_no_page_fails_by_what_a_job_wrote_in_place_of_numbers(console: Console, visitor: Visitor) -> None:
+    small = {"cpus": 0.1, "memory": "64MiB"}
+    spec = {"name": "broken", "train": {**SPEC["train"], "task": "nowhere:Task"}, "resources": small}
+    answer = visitor.submit("/submit", yaml=json.dumps(spec))
+    assert answer.status_code == 200, answer.text
+    job = str(answer.json()["location"].rpartition("/")[2])
+    await_status(console.client, job, "FAILED")
+    run = Store(console.server.home / "store").run(console.client.get(f"/api/jobs/{job}")["run"])
+    run.metrics.mkdir(exist_ok=True)
+    paths = (
+        *("/", f"/jobs/{job}", "/runs", f"/runs/{run.name}", f"/runs/{run.name}/curves"),
+        *(f"/compare?run={run.name}", f"/compare/curves?run={run.name}", "/api/jobs", "/api/runs"),
+    )
+    wrong: list[Any] = []
+    for value in ("text", [1, "x"], {"a": 1}, 10**300, 10**4000):
+        records = [{"resumed_from": 0}, *({"iteration": i, **dict.fromkeys(NUMBERS, value)} for i in range(1, 6))]
+        (run.metrics / "metrics-e1.jsonl").write_text("".join(json.dumps(each) + "\n" for each in records))
+        wrong += [(str(value)[:9], path) for path in paths if visitor.http.get(path).status_code != 200]
+    assert not wrong
+
+
+def test_a_comparison_looks_for_few_patterns(console: Console) -> None:
+    answer = console.visitor("reader").http.get(f"/compare?run={'+'.join(['a*'] * 41)}")
+    assert answer.status_code == 400 and "40 at most" in answer.text
+
+
+def test_a_form_searches_for_no_longer_text_than_the_page(console: Console) -> None:
+    answer = console.visitor().submit("/jobs/stop", all="yes", search="%" * 70_000)
+    assert answer.status_code == 400 and "more than 200 characters" in answer.json()["message"]
+
+
+def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends() -> None:
+    state = SimpleNamespace(closing=threading.Event(), access=Access())
+    request = cast(Request, SimpleNamespace(app=SimpleNamespace(state=state), headers={"authorization": ""}))
+
+    def opened() -> AsyncIterator[bytes]:
+        return cast(AsyncIterator[bytes], aiter(stream(request, lambda: [Event("rows", {})]).body_iterator))
+
+    async def story() -> tuple[bytes, bytes]:
+        there = [opened() for _ in range(100)]
+        for each in there:
+            await anext(each)
+        another = opened()
+        refused = [await anext(another), await anext(another)]
+        await cast(Any, there[0]).aclose()
+        there[0] = opened()
+        again = await anext(there[0])
+        for each in there:
+            await cast(Any, each).aclose()
+        return b"".join(refused), again
+
+    refused, again = asyncio.run(story())
+    assert b"event: trouble" in refused and b"100 pages are open" in refused
+    assert b"retry: 1000" in again
+
+
+def test_those_who_wait_for_a_turn_are_few_and_the_others_are_refused_at_once() -> None:
+    turns, begun, over = Turns("busy", at_once=1, waiting=1), threading.Event(), threading.Event()
+
+    def work() -> None:
+        with turns.turn():
+            begun.set()
+            over.wait()
+
+    workers = [threading.Thread(target=work) for _ in range(2)]
+    workers[0].start()
+    begun.wait()
+    workers[1].start()
+    try:
+        while turns._there._value:  # the second one waits
+            threading.Event().wait(0.01)
+        with pytest.raises(ClientError, match="busy; try again"), turns.turn():
+            pass
+    finally:
+        over.set()
+        for each in workers:
+            each.join()
+    with turns.turn():
+        pass
+
+
+def test_no_directory_on_the_way_to_a_file_may_be_a_link(tmp_path: Path) -> None:
+    (tmp_path / "run" / "recordings" / "inner").mkdir(parents=True)
+    (tmp_path / "run" / "recordings" / "inner" / "gait.gif").write_bytes(b"GIF89a")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "gait.gif").write_bytes(b"secret")
+    with open_inside(tmp_path / "run", ["recordings", "inner", "gait.gif"]) as file:
+        assert file.read() == b"GIF89a"
+    (tmp_path / "run" / "recordings" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "run" / "recordings" / "gait.gif").symlink_to(tmp_path / "elsewhere" / "gait.gif")
+    with pytest.raises(NotADirectoryError):
+        open_inside(tmp_path / "run", ["recordings", "link", "gait.gif"])
+    with pytest.raises(DamagedFile):
+        open_inside(tmp_path / "run", ["recordings", "gait.gif"])

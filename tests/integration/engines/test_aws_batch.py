@@ -17,16 +17,54 @@ import boto3
 import pytest
 
 from orchestrator.domain.hosts import Limit, Placement
-from orchestrator.engines.api import EngineError, NotYet, Transient
+from orchestrator.engines.api import EngineError, Gang, NotYet, Transient
 from orchestrator.engines.aws_batch import engine as aws_batch
-from orchestrator.engines.aws_batch.config import is_mounted_from
+from orchestrator.engines.aws_batch.config import AwsConfig, is_mounted_from, save_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
 from tests.conftest import Serving, call_muster, wait_for
-from tests.support.engines.aws_bench import AwsBench
+from tests.support.engines.bench import Bench
 from tests.support.engines.sites import WAIT
 from tests.support.processes import command, processes_of
+
+
+class AwsBench(Bench):
+    """A controller's home and store, the volume that the nodes have, and the engine between them."""
+
+    engine: AwsBatchEngine
+    asks_again = ("AWS Batch",)
+
+    def __init__(self, aws: Serving, home: Path, **config: Any) -> None:
+        self.aws = aws
+        self.volume = Store(home / "efs").open()
+        settings = {"store": str(self.volume.path), "poll": 0.1, "quiet": 1.0, **config}
+        told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
+        save_config(home, AwsConfig(**told))
+        super().__init__(home, self.volume if config.get("store_is_shared") else None)
+
+    def new_engine(self) -> AwsBatchEngine:
+        return AwsBatchEngine(self.home)
+
+    def gang(
+        self, script: str = WAIT, nodes: int = 2, *, suffix: str = "", native: bool = True, **changes: Any
+    ) -> Gang:
+        """``native``: with Muster in the image."""
+        environment = {"GREETING": "hello", **({"MUSTER_ON_CHILD_FAILURE": "restart"} if native else {})}
+        facts = {
+            "environments": [environment] * nodes,
+            "placements": [Placement("aws-batch/default", (), 0.5, 64)] * nodes,
+            "directory": "/no/such/directory",
+            "is_native": native,
+            "containers": [{"image": "muster" if native else "busybox"}] * nodes,
+            "title": self.home.name.replace("_", "-"),
+        }
+        return super().gang(script, nodes, suffix=suffix, **{**facts, **changes})
+
+    def processes(self) -> list[int]:
+        """Of all nodes: those that "AWS" runs, and those that see the volume."""
+        return [*processes_of(self.aws.home), *processes_of(self.volume.path)]
+
 
 LAST = (
     '[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/$MUSTER_JOB_ID/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '

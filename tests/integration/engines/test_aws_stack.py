@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import boto3
 import pytest
 import yaml
+from moto.batch import models as batch
+from moto.batch.utils import lowercase_first_key
 from moto.cloudformation.models import cloudformation_backends
+from moto.cloudformation.parsing import ResourceMap
 from moto.ec2.models import ec2_backends
+from moto.ec2.models.route_tables import RouteTable
+from moto.efs.models import AccessPoint
+from moto.server import ThreadedMotoServer
 
 from orchestrator.domain.hosts import Limit, Placement, Queued
 from orchestrator.domain.resources import Resources
@@ -24,7 +31,84 @@ from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from orchestrator.engines.aws_batch.stack import Event, first_failure
 from tests.conftest import REPOSITORY, call_muster
 from tests.support.engines.bench import make_gang
-from tests.support.engines.moto_aws import moto_server
+
+
+def _definition(
+    cls: Any, /, resource_name: str, cloudformation_json: dict[str, Any], account_id: str, region_name: str, **_: Any
+) -> Any:
+    """moto takes every definition of a template for one of a single container; this passes on what it is."""
+    properties = cloudformation_json["Properties"]
+    given: dict[str, Any] = dict(
+        def_name=resource_name,
+        parameters={},
+        _type=properties["Type"],
+        tags={},
+        retry_strategy=lowercase_first_key(properties["RetryStrategy"]),
+        container_properties=None,
+        node_properties=lowercase_first_key(properties["NodeProperties"]),
+        eks_properties=None,
+        timeout=lowercase_first_key(properties["Timeout"]),
+        platform_capabilities=None,
+        propagate_tags=properties["PropagateTags"],
+    )
+    return batch.batch_backends[account_id][region_name].register_job_definition(**given)
+
+
+_environment_of = batch.ComputeEnvironment.create_from_cloudformation_json
+
+
+def _environment(
+    cls: Any, /, resource_name: str, cloudformation_json: dict[str, Any], account_id: str, region_name: str, **_: Any
+) -> Any:
+    """moto wants a service role; AWS takes its service-linked one, which it makes with the first compute environment."""
+    roles = batch.batch_backends[account_id][region_name].iam_backend
+    made = (role for role in roles.roles.values() if role.name == "AWSServiceRoleForBatch")
+    role = next(made, None) or roles.create_service_linked_role("batch.amazonaws.com", "", "")
+    properties = {"ServiceRole": role.arn, **cloudformation_json["Properties"]}
+    return _environment_of(resource_name, {"Properties": properties}, account_id, region_name)
+
+
+def _delete_table(table: RouteTable, account: str, region: str) -> None:
+    ec2_backends[account][region].route_tables.pop(table.id, None)
+
+
+_delete = ResourceMap.delete
+
+
+def _delete_stack(resources: ResourceMap) -> None:
+    """moto does not know the newer word for a resource that outlives its stack, where that was ever whole."""
+    for resource in resources._resource_json_map.values():
+        if resource.get("DeletionPolicy") == "RetainExceptOnCreate":
+            resource["DeletionPolicy"] = "Retain"
+    _delete(resources)
+
+
+@contextmanager
+def moto_server() -> Iterator[str]:
+    """The URL of a moto that has no account's state yet."""
+    with pytest.MonkeyPatch.context() as patch:
+        reference = property(lambda point: point.access_point_id)  # what `Ref` of one gives
+        patch.setattr(AccessPoint, "physical_resource_id", reference, raising=False)
+        patch.setattr(RouteTable, "delete", _delete_table, raising=False)
+        patch.setattr(batch.JobDefinition, "create_from_cloudformation_json", classmethod(_definition))
+        patch.setattr(batch.ComputeEnvironment, "create_from_cloudformation_json", classmethod(_environment))
+        patch.setattr(ResourceMap, "delete", _delete_stack)
+        server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+        server.start()
+        try:
+            host, port = server.get_host_and_port()
+            url = f"http://{host}:{port}"
+            post(url, "/moto-api/reset", {})
+            post(url, "/moto-api/config", {"batch": {"use_docker": False}})
+            yield url
+        finally:
+            server.stop()
+
+
+def post(url: str, path: str, body: object) -> None:
+    request = urllib.request.Request(url + path, json.dumps(body).encode(), {"Content-Type": "application/json"})
+    urllib.request.urlopen(request, timeout=30).read()
+
 
 # both are in the template, and moto says that it can't make them
 pytestmark = pytest.mark.filterwarnings("ignore:Tried to parse AWS")
@@ -37,6 +121,14 @@ NO_CONFIGURATION["AWS_EC2_METADATA_DISABLED"] = "true"
 PARAMETERS = ["--parameter", "InstanceTypes=g6.12xlarge", "--parameter", "WorkstationImage=ami-12c6146b"]
 NO_STACK = "muster: there is no stack {} in us-east-1; create it with `muster aws up`\n"
 WHOLE = [f"--parameter={name}=true" for name in ("Workstation", "InterfaceEndpoints", "UseEfa")]
+
+
+class Loader(yaml.SafeLoader):
+    """Takes ``!Ref`` and the like for nothing."""
+
+
+Loader.add_multi_constructor("!", lambda loader, tag, node: None)
+RESOURCES = yaml.load(TEMPLATE.read_text(), Loader)["Resources"]
 
 
 class Account:
@@ -83,11 +175,10 @@ def test_the_template_is_clean() -> None:
 
 def test_every_resource_is_created_and_the_outputs_make_the_engine_s_configuration(account: Account) -> None:
     resources = account.client("cloudformation").describe_stack_resources(StackName="muster")["StackResources"]
-    declared = {line[2:].split(":")[0] for line in _section("Resources") if line[:2] == "  " and line[2:3].isalpha()}
     resources = [each for each in resources if "LogicalResourceId" in each]
     made = {each["LogicalResourceId"] for each in resources}
     # moto has no such resources; each is one line of the template, which cfn-lint reads
-    assert declared - made == {"PlacementGroup", "GangTalksByEfa"} and len(made) > 40
+    assert RESOURCES.keys() - made == {"PlacementGroup", "GangTalksByEfa"} and len(made) > 40
     assert {each["ResourceStatus"] for each in resources} == {"CREATE_COMPLETE"}
     config, outputs = load_config(account.home), account.outputs()
     assert (config.region, config.job_queue, config.stack) == (REGION, "muster", "muster")
@@ -158,10 +249,9 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
 
 def test_the_compute_environment_can_be_changed_where_it_is_and_a_failed_create_leaves_no_volume() -> None:
     """Moto allows it and AWS does not: an update in place with a service role of one's own."""
-    environment, volume = _resource("ComputeEnvironment"), _resource("FileSystem")
-    assert "ReplaceComputeEnvironment: false" in environment
-    assert not [line for line in environment if line.startswith("ServiceRole:")]
-    assert {"DeletionPolicy: RetainExceptOnCreate", "UpdateReplacePolicy: Retain"} <= set(volume)
+    environment, volume = RESOURCES["ComputeEnvironment"]["Properties"], RESOURCES["FileSystem"]
+    assert environment["ReplaceComputeEnvironment"] is False and "ServiceRole" not in environment
+    assert (volume["DeletionPolicy"], volume["UpdateReplacePolicy"]) == ("RetainExceptOnCreate", "Retain")
 
 
 def test_roles_allow_no_more_than_they_must(account: Account) -> None:
@@ -293,21 +383,3 @@ def test_the_resource_that_failed_first_is_named_not_those_that_it_took_along() 
     ]
     said = "NatGateway (AWS::EC2::NatGateway): The maximum number of addresses has been reached."
     assert first_failure(events) == said
-
-
-def _section(name: str) -> list[str]:
-    lines = TEMPLATE.read_text().splitlines()
-    start = lines.index(f"{name}:") + 1
-    end = next((number for number in range(start, len(lines)) if lines[number][:1].isalpha()), len(lines))
-    return lines[start:end]
-
-
-def _resource(name: str) -> list[str]:
-    """Lines of one resource, without indentation and comments."""
-    lines = iter(_section("Resources"))
-    found = []
-    for line in lines:
-        if line.startswith(f"  {name}:"):
-            inner = itertools.takewhile(lambda each: each[2:3] == " ", lines)
-            found = [each.partition(" #")[0].strip() for each in inner]
-    return found

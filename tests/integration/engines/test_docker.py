@@ -12,14 +12,57 @@ from typing import Any
 
 import pytest
 
-from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import EngineError, Gang, NotYet
 from orchestrator.engines.docker import engine as docker_engine
+from orchestrator.engines.docker.engine import DockerEngine
 from shared_store import __version__
 from shared_store.log_files import LogWriter
 from tests.conftest import REPOSITORY, wait_for
-from tests.support.engines.docker_bench import DockerBench
-from tests.support.engines.images import PLAIN, SUPERVISED, host_files
-from tests.support.engines.sites import STUBBORN
+from tests.support.engines.bench import Bench
+from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files
+from tests.support.engines.sites import STUBBORN, WAIT
+
+
+class DockerBench(Bench):
+    engine: DockerEngine
+
+    def __init__(self, client: Any, home: Path) -> None:
+        """``client``: of the Docker Engine, for the test."""
+        self.client = client
+        super().__init__(home)
+
+    def new_engine(self) -> DockerEngine:
+        return DockerEngine(self.home / "home", gpus=[])
+
+    def gang(
+        self,
+        script: str = WAIT,
+        nodes: int = 2,
+        *,
+        suffix: str = "",
+        image: str = PLAIN,
+        memory: int = 256,
+        container: dict[str, Any] | None = None,
+        **changes: Any,
+    ) -> Gang:
+        """``container``: more of the nodes' ``containerProperties``."""
+        facts = {
+            "environments": [{"PATH": PATH, "GREETING": "hello"}] * nodes,
+            "placements": [Placement("here", (), 0.5, memory)] * nodes,
+            "containers": [{"image": image, **host_files(), **(container or {})}] * nodes,
+        }
+        return super().gang(script, nodes, suffix=suffix, **{**facts, **changes})
+
+    def left(self) -> tuple[int, int]:
+        """Containers and networks of the gangs."""
+        mine = {"label": "muster.gang"}
+        containers = self.client.containers.list(all=True, filters=mine)
+        networks = self.client.networks.list(filters=mine)
+        return sum(self.job in c.labels["muster.gang"] for c in containers), sum(self.job in n.name for n in networks)
+
+    def nothing_is_left(self) -> None:
+        assert self.left() == (0, 0)
 
 
 @pytest.fixture

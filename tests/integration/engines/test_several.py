@@ -1,16 +1,176 @@
-"""One controller with two engines: a job goes where its queue, or ``--engine``, says."""
+"""Engines through a controller: the Docker engine, two at once where a job goes to the one that it names, and wrong choices."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import socket
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, wait_for
-from tests.support.engines.images import PLAIN, host_files, plain
-from tests.support.engines.sites import POLITE
+from orchestrator.domain.errors import ApiError
+from orchestrator.engines.api import EngineError
+from orchestrator.engines.ray.cluster import ray_environment
+from orchestrator.engines.slurm import commands as slurm_commands
+from orchestrator.engines.toolkit.mounts import Mount, with_mounts
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from shared_store.outcomes import read_outcome
+from tests.conftest import Serving, call_muster, wait_for
+from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files, plain
+from tests.support.engines.sites import POLITE, WAIT
+from tests.support.engines.slurm_cluster import need_slurm
+from tests.support.engines.training import submit
+
+
+@pytest.fixture(scope="module")
+def served(docker_client: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    with Serving(tmp_path_factory.mktemp("docker"), "--engine", "docker") as server:
+        yield server
+
+
+def test_a_job_whose_image_is_being_pulled_can_be_stopped_and_a_node_answers_on_the_bus(served: Serving) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as registry:  # takes connections, and never answers
+        image = f"127.0.0.1:{registry.getsockname()[1]}/far:1"
+        job = plain(served, image, "true")
+        wait_for(lambda: served.detail(job)["statusReason"] == f"pulling image {image}", 30, "the pull")
+        served.client.batch("TerminateJob", jobId=job, reason="no time for that")
+        assert served.wait(job, timeout=10)["statusReason"] == "no time for that"
+    environment = [{"name": "PATH", "value": PATH}]
+    job = plain(served, SUPERVISED, WAIT, environment=environment, **host_files())
+    wait_for(lambda: "ready" in served.log(job), 30, "its start")
+    [node] = wait_for(lambda: ask_stacks(served, job), 30, "an answer from inside the container")
+    assert "rank 0:" in node["stacks"]
+    served.client.batch("TerminateJob", jobId=job, reason="enough")
+    served.wait(job)
+
+
+class Relay:
+    """A socket that leads to this machine's Docker Engine, and can be cut off: an engine that is restarted, to whoever uses it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._open: list[socket.socket] = []
+
+    def open(self) -> None:
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(str(self.path))
+        listener.listen(64)
+        self._open.append(listener)
+        threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
+
+    def cut(self) -> None:
+        self.path.unlink()
+        for each in self._open:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+        self._open.clear()
+
+    def _accept(self, listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, far = listener.accept()[0], socket.socket(socket.AF_UNIX)
+                far.connect("/var/run/docker.sock")
+                self._open += [near, far]
+                for source, target in (near, far), (far, near):
+                    threading.Thread(target=self._copy, args=(source, target), daemon=True).start()
+
+    @staticmethod
+    def _copy(source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while chunk := source.recv(1 << 16):
+                target.sendall(chunk)
+            target.shutdown(socket.SHUT_WR)
+
+
+@pytest.mark.skipif(not Path("/var/run/docker.sock").exists(), reason="NO /var/run/docker.sock: nothing to cut off")
+def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    relay = Relay(tmp_path / "docker.sock")
+    relay.open()
+    monkeypatch.setenv("DOCKER_HOST", f"unix://{relay.path}")
+    served = Serving(tmp_path, "--engine", "docker", "--cpus", "4")
+    away = "no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST"
+
+    def says(job: str, status: str, reason: str) -> bool:
+        found = served.detail(job)
+        assert found["status"] != "FAILED", found["statusReason"]
+        return (found["status"], found["statusReason"]) == (status, reason)
+
+    try:
+        first, second = (plain(served, PLAIN, POLITE, **host_files()) for _ in range(2))
+        for job in (first, second):
+            wait_for(lambda job=job: says(job, "RUNNING", "attempt 1 runs on 1 node"), 30, "its start")
+        relay.cut()
+        third = plain(served, PLAIN, "echo here", **host_files())
+        wait_for(lambda: says(first, "RUNNING", away) and says(third, "STARTING", away), 20, "the reason")
+        served.client.batch("TerminateJob", jobId=first, reason="enough")
+        refused = f"attempt 1 can't be stopped: {away}; trying again"
+        wait_for(lambda: says(first, "RUNNING", refused) and says(second, "RUNNING", away), 20, "a stop that is tried")
+        relay.open()
+        assert served.wait(first)["statusReason"] == "enough"
+        assert served.wait(third)["status"] == "SUCCEEDED" and served.log(third) == ["here"]
+        wait_for(lambda: says(second, "RUNNING", "attempt 1 runs on 1 node"), 20, "it is seen again")
+        served.client.batch("TerminateJob", jobId=second, reason="enough")
+        assert served.wait(second)["statusReason"] == "enough"
+        assert served.log(second) == ["ready", "saved"], "its log goes on where it was"
+    finally:
+        served.close()
+    assert served.process.stderr is not None
+    said = served.process.stderr.read()
+    assert said.count("no Docker Engine answers") <= 2 and "Traceback" not in said and "store" not in said, said
+
+
+def test_memory_beyond_the_limit_is_named_under_a_supervisor_too(served: Serving) -> None:
+    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "128"}]
+    environment = [{"name": "PATH", "value": PATH}]
+    script = "exec python3 -c 'x = bytearray(300 << 20); print(len(x))'"
+    files = {**host_files(), "resourceRequirements": needs}
+    job = plain(served, SUPERVISED, script, environment=environment, **files)
+    if served.wait(job)["status"] == "SUCCEEDED":
+        pytest.skip("THIS KERNEL DOES NOT LIMIT MEMORY")
+    [node] = served.detail(job)["attempts"][0]["nodes"]
+    assert node["reason"] == "OutOfMemoryError: Container killed due to memory usage", (node, served.log(job))
+    outcome = read_outcome(Store(served.home / "store").run(served.detail(job)["run"]), job, 1, 0)
+    assert node["exitCode"] == 137 and outcome is not None and outcome.signal == "SIGKILL", (node, outcome)
+
+
+def ask_stacks(served: Serving, job: str) -> Any:
+    try:
+        return served.client.get(f"/api/jobs/{job}/stacks")
+    except ApiError:
+        return None
+
+
+@pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="three minutes: MUSTER_LONG=1, in make bits")
+def test_a_node_that_is_cut_off_is_noticed_and_the_gang_goes_on(docker_client: Any, tmp_path: Path) -> None:
+    docker = Serving(tmp_path, "--engine", "docker", "--cpus", "4")
+    run = Store(tmp_path / "store").run("cut")
+    job = ""
+    try:
+        job = submit(docker, "cut", "docker", 24, "stall_timeout=15s")
+        wait_for(lambda: len(read_metrics(run)) >= 5, 120, "some iterations")
+        [network] = [n for n in docker_client.networks.list(filters={"label": "muster.gang"}) if job in n.name]
+        network.reload()
+        [child] = [c for c in network.containers if c.labels["muster.node"] == "1"]
+        network.disconnect(child)
+        done = docker.wait(job, timeout=240)
+        assert done["status"] == "SUCCEEDED", (done["statusReason"], docker.log(job)[-20:])
+        first = done["attempts"][0]["statusReason"]
+        assert len(done["attempts"]) == 2 and "made no progress for 1" in first, first
+    finally:
+        docker.close()
+        for container in docker_client.containers.list(all=True, filters={"label": "muster.gang"}):
+            if job and container.labels["muster.gang"].startswith(job):
+                container.remove(force=True)
+
+
+# -- two engines -------------------------------------------------------------------------------------------------------
+
 
 SCRIPT = "echo on $(hostname)"
 JOB = f"""
@@ -112,3 +272,80 @@ def test_a_job_goes_to_the_engine_that_it_names_and_else_to_the_first(tmp_path: 
     with Serving(tmp_path, "--engine", "docker") as served:
         assert served.client.get("/api/capacity")["engines"] == {"docker": "default"}
         assert "on the docker engine, queue default" in lines(served, "submit", str(spec), "--dry-run")[0]
+
+
+# -- engines that can't be had, or can't do what is asked --------------------------------------------------------------
+
+
+def refused(home: Path, engine: str, code: int = 1, **env: str) -> str:
+    """The one line with which ``muster serve`` is refused with an engine."""
+    done = call_muster("serve", "--port", "0", "--engine", engine, home=home, **env)
+    assert done.returncode == code and done.stderr.count("\n") == 1, done.stderr
+    return done.stderr
+
+
+def test_an_engine_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    assert refused(tmp_path, "dokcer", 2) == "muster: --engine dokcer: there is no such engine; did you mean docker?\n"
+    assert not (tmp_path / "muster.db").exists()
+    said = "muster: no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST\n"
+    assert refused(tmp_path, "docker", DOCKER_HOST="unix:///nowhere.sock") == said
+    said = refused(tmp_path, "slurm", PATH="/nowhere")
+    assert said.startswith("muster: scontrol is not installed here: the slurm engine uses the cluster's own")
+
+
+def test_without_slurm_s_controller_nothing_starts(tmp_path: Path) -> None:
+    need_slurm()
+    configuration = tmp_path / "slurm.conf"
+    configuration.write_text(
+        "ClusterName=away\nSlurmctldHost=localhost\nSlurmctldPort=1\nAuthType=auth/none\nCredType=cred/none\n"
+        "NodeName=n1\nPartitionName=p Nodes=n1\nMessageTimeout=2\n"
+    )
+    said = refused(tmp_path, "slurm", SLURM_CONF=str(configuration))
+    assert said.startswith("muster: slurmctld does not answer (") and said.endswith("see `scontrol ping`\n")
+
+
+def test_a_missing_configuration_of_slurm_is_reported_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    need_slurm()
+    if Path("/etc/slurm/slurm.conf").exists():
+        pytest.skip("this machine belongs to a cluster")
+    monkeypatch.delenv("SLURM_CONF", raising=False)
+    bad = call_muster("doctor", "--engine", "slurm", home=tmp_path)
+    assert bad.returncode == 1
+    assert "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/" in bad.stdout
+    bad = call_muster("doctor", "--engine", "slurm", home=tmp_path, SLURM_CONF="/no/slurm.conf")
+    assert "SLURM_CONF is /no/slurm.conf, which is not there; set it to the cluster's slurm.conf" in bad.stdout
+
+
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_an_engine_that_may_not_mount_says_so_by_its_name(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    said = f"^volume /mnt: the {engine} engine mounts only as root; start `muster serve`"
+    with pytest.raises(EngineError, match=said):
+        with_mounts(["true"], [Mount("/data", "/mnt")], engine)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        ("-h", "/mnt"),
+        ("--", "/mnt"),
+        ("data", "/mnt"),
+        ("/data", "--"),
+        ("/data", "mnt"),
+        ("/data", "/"),
+        ("/a/../b", "/m"),
+    ],
+)
+def test_source_and_target_of_a_mount_must_be_absolute_paths(source: str, target: str) -> None:
+    with pytest.raises(EngineError, match=r"^volume .*: two absolute paths without '..' are needed$"):
+        with_mounts(["true"], [Mount(source, target)])
+
+
+def test_jobs_inherit_no_secrets_of_other_engines_from_an_engine_s_commands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"):
+        monkeypatch.setenv(name, "secret")
+    assert {name for name, value in slurm_commands.environment().items() if value == "secret"} == {"SLURM_JWT"}
+    found = {name for name, value in ray_environment("h:1").items() if value == "secret"}
+    assert found == {"RAY_AUTH_TOKEN", "SLURM_JWT"}

@@ -1,4 +1,4 @@
-"""The importable suite of engines: the fake one, the local one, and the one that docs/engines/write-your-own.md builds."""
+"""The importable suite of engines, which the one of docs/engines/write-your-own.md passes; and that through a controller."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.testing.rigs import FakeRig, ShellRig
 from orchestrator.engines.testing.suite import EngineSuite
 from tests.conftest import REPOSITORY
+from tests.support.engines.every_engine import EveryEngine
+from tests.support.engines.fixtures import sites
+from tests.support.engines.sites import SITES
 
 PAGE = REPOSITORY / "docs" / "engines" / "write-your-own.md"
 
@@ -74,3 +77,13 @@ def test_an_engine_of_another_package_is_found_by_its_entry_point_and_has_its_op
         "('local', 'docker', 'ray', 'slurm', 'aws-batch', 'plain') plain/here",
         "tag muster:nicenes: a compute environment of the plain engine has no such option; did you mean niceness?",
     ], done.stderr
+
+
+# -- through a controller ----------------------------------------------------------------------------------------------
+
+
+site = sites(*(name for name in SITES if name != "ray"))  # whose cluster takes a minute to start: see tests/cluster
+
+
+class TestEveryEngine(EveryEngine):
+    pass

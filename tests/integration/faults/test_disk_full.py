@@ -16,7 +16,7 @@ from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.domain.errors import ApiError
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database, DatabaseFull
-from tests.conftest import PATIENCE, Serving, run_muster, wait_for
+from tests.conftest import PATIENCE, Serving, wait_for
 from tests.support.conformance.streams import client_of
 from tests.support.faults.full_disk import fill, small_volume
 from tests.support.processes import processes_of
@@ -122,9 +122,3 @@ def test_a_minimum_is_a_size_a_share_or_nothing() -> None:
 def test_only_the_volume_that_is_short_is_named(tmp_path: Path) -> None:
     disk = Disk({"store": tmp_path, "database": tmp_path / "gone"}, MinFree(share=1.0))
     assert "the volume of the store" in str(disk.shortage()) and disk.shortage("database") is None
-
-
-def test_a_wrong_minimum_is_reported_in_one_line(tmp_path: Path) -> None:
-    said = run_muster("serve", "--min-free", "lots", home=tmp_path)
-    assert said.returncode != 0 and said.stderr.count("\n") == 1
-    assert "--min-free lots: expected a size such as 1GiB, a share such as 5%, or 0" in said.stderr

@@ -14,7 +14,8 @@ from orchestrator.control.peers import Peers
 from orchestrator.domain.errors import ApiError
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
-from tests.conftest import Serving, submit_gang, wait_for
+from tests.conftest import Serving, wait_for
+from tests.support.definitions import container, multinode
 
 WAIT = "import os, time\nwhile not os.path.exists(os.environ['END']): time.sleep(0.05)"
 
@@ -77,7 +78,10 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
     end, free = {"END": str(tmp_path / "end")}, {"END": str(tmp_path / "free")}
     with Serving(tmp_path / "a", *options) as first, Serving(tmp_path / "b", *options) as second:
         earlier = second.gang(WAIT, env=free)
-        waiting = after(second, earlier, {"MUSTER_RUN": "shared", **end})
+        needs = container(["python", "-c", WAIT], env={"MUSTER_RUN": "shared", **end})
+        second.client.batch("RegisterJobDefinition", **multinode("after", needs))
+        after = {"jobName": "after", "jobQueue": "default", "jobDefinition": "after", "dependsOn": [{"jobId": earlier}]}
+        waiting = second.client.batch("SubmitJob", **after)["jobId"]
         writer = first.gang(WAIT, env={"MUSTER_RUN": "shared", **end}, name="writer")
         first.wait(writer, "RUNNING")
         assert read_epoch(store.run("shared")) == 1
@@ -105,14 +109,3 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
     assert second.process.stderr is not None
     told = second.process.stderr.read()
     assert f"the controller of {tmp_path}/a on " in told and "Traceback" not in told
-
-
-def after(server: Serving, job: str, env: dict[str, str]) -> str:
-    """A job that waits for another one."""
-
-    class Waiting:
-        def batch(self, operation: str, **request: object) -> object:
-            more = {"dependsOn": [{"jobId": job}]} if operation == "SubmitJob" else {}
-            return server.client.batch(operation, **request, **more)
-
-    return submit_gang(Waiting(), WAIT, env=env)

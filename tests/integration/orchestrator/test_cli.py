@@ -38,41 +38,21 @@ def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str
 
 
 @pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("- a\n- list\n", ["expected a mapping", "found a list"]),
-        ("name: [unclosed\n", ["not valid YAML"]),
-        ("", ["expected a mapping", "found nothing"]),
-        ("name: a\ntrain: {task: Cartpol, worlds: 4, iterations: 1}\n", [":2: train.task", "did you mean Cartpole?"]),
-        ("name: a\nnodes: 0\ncommand: [x]\n", [":2: nodes", "greater than or equal to 1", "found 0"]),
-        ("name: a\nnodes: two\ncommand: [x]\n", [":2: nodes", "whole number of nodes"]),
-        ("name: a\nnode: 2\ncommand: [x]\n", [":2: node: unknown key; did you mean nodes?"]),
-        (
-            "name: a\ncommand: [x]\ntrain: {task: Ant, worlds: 1, iterations: 1}\n",
-            ["exactly one of", "found train and command"],
-        ),
-        ("name: a\nresources: {memory: lots}\ncommand: [x]\n", [":2: resources.memory", "such as 512MiB or 4GiB"]),
-    ],
-)
-def test_a_bad_spec_is_refused_with_file_line_and_key(tmp_path: Path, text: str, parts: list[str]) -> None:
-    spec = tmp_path / "job.yaml"
-    spec.write_text(text)
-    home = tmp_path / "home"
-    refused(["run", str(spec)], home, 2, str(spec), *parts)
-    assert not home.exists(), "a refused spec must not start a controller"
-
-
-@pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["nowhere.yaml"], "nowhere.yaml: No such file"),
-        (["--set", "train.iteration=5"], "train.iteration: unknown key; did you mean iterations?"),
-        (["--set", "novalue"], "--set novalue: expected KEY=VALUE"),
-        (["--set", "train.task=Cartpol", "--dry-run"], "muster: --set: train.task: no task is called 'Cartpol'"),
+        (["run", "{spec}"], "{spec}:2: nodes: expected a whole number of nodes"),
+        (["submit", "nowhere.yaml"], "nowhere.yaml: No such file"),
+        (["submit", SPEC, "--set", "novalue"], "--set novalue: expected KEY=VALUE"),
+        (["submit", SPEC, "--set", "train.task=Cartpol", "--dry-run"], "muster: --set: train.task: no task is called"),
     ],
 )
-def test_a_missing_file_and_a_bad_override_are_named(tmp_path: Path, arguments: list[str], said: str) -> None:
-    refused(["submit", *([SPEC] if arguments[0] == "--set" else []), *arguments], tmp_path, 2, said)
+def test_a_bad_spec_file_or_change_is_refused_before_any_controller(
+    tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    spec, home = tmp_path / "job.yaml", tmp_path / "home"
+    spec.write_text("name: a\nnodes: two\ncommand: [x]\n")
+    refused([each.format(spec=spec) for each in arguments], home, 2, said.format(spec=spec))
+    assert not home.exists()
 
 
 def test_more_than_any_host_has_is_refused_before_anything_is_registered(shared_server: Serving) -> None:
@@ -104,16 +84,6 @@ def test_a_server_that_can_t_start_says_why(shared_server: Serving, tmp_path: Pa
         (["--min-free", "lots"], "lots: expected a size such as 1GiB, a share such as 5%, or 0"),
     ):
         refused([*serve, *option], home, 2, option[0], said)
-
-
-def test_off_loopback_a_token_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setenv("MUSTER_TOKEN", "a-secret-of-this-test")
-        server = Serving(tmp_path / "home", "--host", "0.0.0.0")
-    with server:
-        refused(["list"], server.home, 1, "this token is not known here", MUSTER_TOKEN="wrong")
-        refused(["list"], server.home, 1, "a token is needed")
-        assert server.muster("list", MUSTER_TOKEN="a-secret-of-this-test").returncode == 0
 
 
 def test_commands_without_a_controller_say_how_to_start_one_and_take_no_other(tmp_path: Path) -> None:
@@ -165,25 +135,6 @@ def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
             refused([command, name], shared_server.home, 2, f"{name!r} names nothing{more}")
     detail = shared_server.wait(shared_server.gang("pass", name="plain"))
     refused(["resume", detail["run"]], shared_server.home, 2, "was not started from a YAML spec")
-
-
-def test_help_has_examples_for_every_command(tmp_path: Path) -> None:
-    listing = call_muster("--help", home=tmp_path).stdout
-    for command in [
-        "run",
-        "serve",
-        "submit",
-        "list",
-        "show",
-        "stop",
-        "schema",
-        "logs",
-        "resume",
-        "clone",
-        "checkpoints",
-    ]:
-        assert f" {command} " in listing
-        assert "Example" in call_muster(command, "--help", home=tmp_path).stdout or command == "schema"
 
 
 def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server: Serving, tmp_path: Path) -> None:
@@ -313,17 +264,7 @@ def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, A
 # -- reward functions that can't be: refused before anything is asked of a controller ----------------------------------
 
 BODIES = {
-    "while True: pass": ":2: TIMEOUT: the sample 'start' did not end within 5 s",
-    "return None": ":1: TEST_FAILURE: the sample 'start': it returned None; return a number on every way through the function",
-    "return 'far'": ":1: TEST_FAILURE: the sample 'start': it returned a str; return a number",
-    "return float('nan')": ":1: TEST_FAILURE: the sample 'start': it returned nan; return a finite number",
-    "return 1 / params['progress'].real if params['is_reversed'] else params['sped']": ":2: TEST_FAILURE: the sample 'start': KeyError: 'sped'",
-    "params['speed'] = 9.0; return 1.0": ":1: TEST_FAILURE: the sample 'start': it changed params['speed']; copy what you change",
-    "return float(len([0] * 10**10))": ":2: TEST_FAILURE: the sample 'start': it used more than 2 GiB of memory",
-    "[print('far away') for _ in range(1000000)]; return 1.0": ":2: TEST_FAILURE: the sample 'start' printed more than 64 KiB of text",
-    "import socket; return 1.0": ":2: IMPORT_ERROR: socket can't be imported; a reward function may import math, random, numpy, scipy, shapely",
-    "return eval('1.0')": ":2: FORBIDDEN: eval can't be used in a reward function",
-    "return (1.0": ":2: SYNTAX_ERROR: '(' was never closed",
+    "return params['sped']": ":2: TEST_FAILURE: the sample 'start': KeyError: 'sped'",
     "raise SystemExit(0)": ":2: TEST_FAILURE: the sample 'start': it ended the program (SystemExit)",
 }
 
@@ -337,3 +278,39 @@ def test_a_bad_reward_function_is_refused_in_one_line(body: str, tmp_path: Path)
     assert done.returncode == 2 and not done.stdout
     assert done.stderr == f"muster: --set: train.config.reward_function: {file}{BODIES[body]}\n"
     assert not (tmp_path / "home").exists(), "no controller was asked"
+
+
+# -- muster doctor ----------------------------------------------------------------------------------------------------
+
+
+def test_all_requirements_are_installed(tmp_path: Path) -> None:
+    done = call_muster("doctor", "--worker", "--engine", "local", home=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for said in ("torch 2.", "a durable write takes", "muster serve starts one", "1 host, "):
+        assert said in done.stdout
+
+
+def test_a_controller_is_found(shared_server: Serving) -> None:
+    found = json.loads(shared_server.muster("doctor", "--json").stdout)
+    [controller] = [each for each in found if each["what"] == "controller"]
+    assert (controller["state"], controller["said"]) == ("ok", f"{shared_server.url}, engines local")
+
+
+def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    bad = call_muster(
+        *("doctor", "--store", str(tmp_path / "file" / "store"), "--engine", "docker", "--engine", "nothing"),
+        home=tmp_path,
+        DOCKER_HOST="unix:///nowhere.sock",
+        MUSTER_URL="http://127.0.0.1:9",
+    )
+    assert bad.returncode == 1 and "Traceback" not in bad.stderr
+    lines = [line for line in bad.stdout.splitlines() if line.startswith("BAD")]
+    assert len(lines) == 4
+    for said in (
+        "file/store: Not a directory",
+        "set DOCKER_HOST",
+        "there is no engine 'nothing'",
+        "http://127.0.0.1:9",
+    ):
+        assert any(said in line for line in lines), said

@@ -78,14 +78,6 @@ def test_show_and_checkpoints_say_where_the_weights_are_from_and_how_sure_the_sc
     assert (first["score"], first["scoreError"], first["scoreEpisodes"]) == (5.0, 0.5, 120)
 
 
-def test_the_changes_are_in_the_new_run_s_spec(full: Serving, store: Store) -> None:
-    changes = ["train.config.rewards.alive=2.5", "train.seed=5", "train.iterations=50", "train.ppo.optimizer=adamw"]
-    options = [part for change in changes for part in ("--set", change)]
-    spec = spec_of(full, clone(full, "taught", "changed", *options, "--nodes", "1")["jobId"])
-    assert spec["train"]["config"] == {"rewards": {"alive": 2.5}} and spec["train"]["seed"] == 5
-    assert spec["train"]["iterations"] == 50 and spec["train"]["ppo"]["optimizer"] == "adamw"
-
-
 def test_a_waiting_clone_does_not_need_its_source_and_may_be_resumed(full: Serving, store: Store) -> None:
     add_run(store, "gone", {**SPEC, "name": "gone"})
     add_checkpoint(store, "gone", 5, b"kept")
@@ -214,12 +206,6 @@ def student(tmp_path: Path, teacher: str) -> str:
 def test_a_missing_teacher_is_refused(full: Serving, store: Store, tmp_path: Path, teacher: str, said: str) -> None:
     add_run(store, "idle")
     assert f"train.rsl_rl.teacher_checkpoint: {said}" in refusal(full, "submit", student(tmp_path, teacher))
-
-
-def test_a_resumed_run_has_its_teacher_and_needs_no_teachers_run(full: Serving, store: Store, tmp_path: Path) -> None:
-    add_run(store, "pupil", json.loads(Path(student(tmp_path, "late")).read_text()))
-    add_checkpoint(store, "pupil", 1, algorithm="rsl_rl", settings={"teacher_checkpoint": "late"})
-    assert full.client.post("/api/runs/pupil/resume", {})["iteration"] == 1
 
 
 def held(run: Run, teacher: str) -> list[bytes]:

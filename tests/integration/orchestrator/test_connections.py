@@ -1,4 +1,4 @@
-"""Connections that send no request: they give way, and neither jobs nor followers of a log notice them."""
+"""Connections that send no request give way, and neither jobs nor followers notice them; a client whose answers are lost asks again."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ import uvicorn
 from orchestrator.api.http import connections
 from orchestrator.api.http.connections import Connection, Connections, raise_descriptor_limit
 from orchestrator.client import Client
+from orchestrator.domain.errors import Unreachable
 from orchestrator.server import Server
 from tests.conftest import MUSTER, Serving, submit_gang, wait_for
+from tests.support.definitions import container, single
 from tests.support.orchestrator.jobs import serving
 
 DESCRIPTORS = 1024
@@ -201,3 +203,46 @@ def test_clients_that_take_no_answer_give_way_or_a_new_one_is_told(
     finally:
         for connection in stalled:
             connection.close()
+
+
+# -- answers that are lost --------------------------------------------------------------------------------------------
+
+
+def lose(patch: pytest.MonkeyPatch, path: str, losses: int) -> list[str]:
+    """Throw the first answers to requests for ``path`` away: the server has done it, and the client will never know. Returns them."""
+    genuine, lost = httpx.HTTPTransport.handle_request, list[str]()
+
+    def handle(transport: httpx.HTTPTransport, request: httpx.Request) -> httpx.Response:
+        answer = genuine(transport, request)
+        if request.url.path != path or len(lost) == losses:
+            return answer
+        lost.append(path)
+        answer.close()
+        raise httpx.RemoteProtocolError("Server disconnected without sending a response.")
+
+    patch.setattr(httpx.HTTPTransport, "handle_request", handle)
+    return lost
+
+
+def test_a_submission_whose_answer_was_lost_is_submitted_once(
+    shared_server: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = shared_server.client.batch
+    batch("RegisterJobDefinition", **single("lossy", container()))
+    lost = lose(monkeypatch, "/v1/submitjob", 1)
+    submitted = batch("SubmitJob", jobName="lossy-once", jobQueue="default", jobDefinition="lossy")
+    assert len(lost) == 1
+    there = [{"name": "JOB_NAME", "values": ["lossy-once"]}]
+    found = batch("ListJobs", jobQueue="default", filters=there)["jobSummaryList"]
+    assert [job["jobId"] for job in found] == [submitted["jobId"]]
+
+
+def test_a_log_whose_stream_always_breaks_off_is_given_up_when_the_job_is_over(
+    shared_server: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = shared_server.gang("print('never seen')", name="broken-log")
+    shared_server.wait(job)
+    lost = lose(monkeypatch, f"/api/jobs/{job}/logs", 50)
+    with Client(shared_server.url) as client, pytest.raises(Unreachable):
+        list(client.logs(job, follow=True))
+    assert 0 < len(lost) < 10

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -38,7 +36,7 @@ from orchestrator.server import Server
 from shared_store.layout import Store
 from tests.conftest import Serving, wait_for
 from tests.support.orchestrator import postgres
-from tests.support.orchestrator.databases import migrate
+from tests.support.orchestrator.databases import connected, migrate
 from tests.support.orchestrator.rows import job
 
 
@@ -63,12 +61,10 @@ def opened(url: str) -> Iterator[Callable[[], Database]]:
 
 def insert(url: str, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Rows of an older database, whose columns are known by their names alone."""
-    engine = create_engine(url)
-    with engine.begin() as connection:
+    with connected(url) as connection:
         for row in rows:
             columns, values = ", ".join(row), ", ".join(f":{name}" for name in row)
             connection.execute(text(f"INSERT INTO {table} ({columns}) VALUES ({values})"), dict(row))
-    engine.dispose()
 
 
 OLD = {"name": "old", "queue": "default", "definition": "arn", "request": "{}", "node_properties": "{}"}
@@ -93,10 +89,8 @@ def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, ope
     facts = {**OLD, "run": "r", "status": "FAILED", "created_at": 5, "attempts_allowed": 3}
     insert(url, "jobs", [{"id": "j1", **facts}])
     insert(url, "attempts", [{"job_id": "j1", "number": 1, "epoch": 1, "nodes": "[]", "created_at": 5, "spent": True}])
-    engine = create_engine(url)
-    with engine.begin() as connection:
+    with connected(url) as connection:
         connection.execute(text("DROP TABLE alembic_version"))  # the first version had no migrations
-    engine.dispose()
     with opened().session() as session:
         old = session.get_one(Job, "j1")
         assert [attempt.number for attempt in old.attempts] == [1]
@@ -117,10 +111,8 @@ def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, 
             job_ = session.get_one(Job, name)
             assert (job_.node_properties, job_.tags, job_.parameters) == ({"numNodes": 1}, {"a": "b"}, {})
     migrate(url, "downgrade", "0003")
-    engine = create_engine(url)
-    with engine.connect() as connection:
+    with connected(url) as connection:
         assert connection.scalar(text("SELECT count(*) FROM jobs WHERE node_properties IS NULL")) == 0
-    engine.dispose()
 
 
 def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, opened: Callable[[], Database]) -> None:
@@ -169,18 +161,6 @@ def test_a_database_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     assert "secret" not in str(refused.value) and "127.0.0.1:1/none" in str(refused.value)
     with pytest.raises(DatabaseError, match="nosuch"):
         Database("nosuch://x/y")
-
-
-def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dead(postgresql: postgres.Server) -> None:
-    url = postgresql.new_database()
-    script = f"from orchestrator.persistence.session import Database; d = Database({url!r}); print('up', flush=True); input()"
-    first = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert first.stdout is not None and first.stdout.readline() == b"up\n"
-    with pytest.raises(DatabaseError, match="another controller has it"):
-        Database(url)
-    first.kill()
-    first.wait()
-    Database(url).close()
 
 
 @pytest.mark.parametrize("how", ["{}", "sqlite:///{}"])

@@ -8,8 +8,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import pyarrow
-import pyarrow.parquet
 import pytest
 
 from shared_store.files import write_json
@@ -130,30 +128,6 @@ def test_compare_puts_seeds_into_one_group_and_draws_curves(full: Serving, tmp_p
     assert drawn == f"written: {picture}" and picture.read_bytes().startswith(b"\x89PNG")
     (group, _) = json.loads(full.muster("compare", "taught*", "slow", "--json").stdout)
     assert group["runs"] == ["taught", "taught-b"] and group["evaluated"]["mean"] == 27.0
-
-
-def test_single_runs_that_played_the_same_episodes_are_compared(full: Serving, store: Store, tmp_path: Path) -> None:
-    returns = {"fast": [10.0, 20.0, 30.0, 41.0], "sure": [11.0, 21.5, 31.0, 42.5, 99.0], "odd": [1.0, 2.0, 3.0, 4.0]}
-    for worlds, (name, values) in enumerate(returns.items(), 5):
-        add_run(store, name, {**SPEC, "name": name, "train": {**SPEC["train"], "worlds": worlds}})
-        add_checkpoint(store, name, 9)
-        table = store.run(name).evaluations / "00000009-e1-job.parquet"
-        mean, seed = sum(values) / len(values), 8 if name == "odd" else 7
-        evaluated(store, name, "00000009-e1-job", mean, seed=seed, iteration=9)
-        columns = {"episode": list(range(len(values))), "return": values}
-        pyarrow.parquet.write_table(pyarrow.table(columns), table)
-    try:
-        done = full.muster("compare", "fast", "sure", "odd", "-o", str(tmp_path / "curves.csv"))
-        assert done.returncode == 2 and "so nothing can be drawn" in done.stderr
-        done = full.muster("compare", "fast", "sure", "odd")
-        # the differences are 1, 1.5, 1, 1.5: mean 1.25, s = 0.5 / sqrt(3), and t(3) = 3.182446, so that half is 0.459
-        line = "sure@9 against fast@9: return +1.25 (+0.79 to +1.71, paired over 4 episodes): better"
-        assert done.stdout.splitlines()[-1] == line, "other worlds are not paired"
-        told = json.loads(full.muster("compare", "fast", "sure", "odd", "--json").stdout)
-        assert [each["against"] and each["against"]["verdict"] for each in told] == [None, "better", None]
-    finally:
-        for name in returns:
-            shutil.rmtree(store.run(name).path)
 
 
 def test_the_curves_are_written_as_numbers_too(full: Serving, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``muster league`` through a real server: what is submitted, entered, refused and shown; the races themselves are written by hand."""
+"""``muster league`` through a real server: what is submitted, entered, refused and shown; the races are written by hand. And ``muster tracks``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shared_store import leagues, models
@@ -20,10 +21,11 @@ from shared_store.evaluations import evaluation_name
 from shared_store.files import write_json
 from shared_store.layout import Store
 from shared_store.models import Model
-from tests.conftest import Serving
+from tests.conftest import Serving, call_muster
 from tests.support.orchestrator.jobs import FOREVER
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
-from tests.support.shared_store.leagues import CONFIG, league, race, summary
+from tests.support.shared_store.leagues import league, race, summary
+from worker.racer.naming import resolve
 
 TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
 JOBS = 6
@@ -204,23 +206,17 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
 
 def test_an_evaluation_that_is_not_of_the_league_s_race_is_not_entered(cups: Paddock) -> None:
     cups.done("create", "strict", "--track", "oval")
-
-    def refused(job: str, model: str = "fast@1") -> str:
-        return cups.refused("submit", "strict", model, "--evaluation", job)
-
     job = cups.raced(2, race([12.0, 12.0, 12.0]))
-    assert "it is of checkpoint 00000011-e1, the model of 00000012-e1" in refused(job, "fast@2")
+    said = cups.refused("submit", "strict", "fast@2", "--evaluation", job)
+    assert "it is of checkpoint 00000011-e1, the model of 00000012-e1" in said
     for driven, changes, said in (
-        (race([12.0] * 3), {"config": {**CONFIG, "speed_lag": 0.0}}, "its config.speed_lag is 0.0, the league's 0.2"),
         (race([12.0] * 3), {"seed": 5}, "its seed is 5, the league's 1"),
-        (race([12.0] * 3, continuous=True), {}, "its rules have continuous True, the league's False"),
-        (race([12.0] * 2), {}, "its rules have laps 2, the league's 3"),
         ({**race([12.0] * 3), "trials": [{}] * 3}, {}, "race.trials.0: expected trial 1 with its status"),
-        (race([12.0] * 3), {"race": None}, "it is no race"),
     ):
-        assert said in refused(cups.raced(2, driven, **changes))
-    assert "has left no evaluation of run racer" in refused(cups.jobs[5])
-    assert cups.rows("strict") == []
+        job = cups.raced(2, driven, **changes)
+        assert said in cups.refused("submit", "strict", "fast@1", "--evaluation", job)
+    said = cups.refused("submit", "strict", "fast@1", "--evaluation", cups.jobs[5])
+    assert "has left no evaluation of run racer" in said and cups.rows("strict") == []
 
 
 def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_closed(cups: Paddock) -> None:
@@ -285,3 +281,49 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
         assert said in cups.refused(*ask)
     (told,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
     assert said in told["problem"] and said in cups.done("list")
+
+
+# -- tracks ------------------------------------------------------------------------------------------------------------
+
+
+def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_path: Path) -> None:
+    home, picture, file = shared_server.home, tmp_path / "hills.png", tmp_path / "hills.npy"
+    store = Store(shared_server.client.get("/api/capacity")["store"])
+
+    def refused(*arguments: str) -> str:
+        done = call_muster("tracks", *arguments, home=home)
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+        return done.stderr
+
+    made = call_muster("tracks", "make", "hills", "--seed", "7", "--length", "40", "-o", str(picture), home=home)
+    assert made.returncode == 0, made.stderr
+    assert "hills: 40.00 m long, 1.00 m wide, counter-clockwise" in made.stdout and "seed 7, length 40" in made.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    track = resolve("hills", store)
+    assert len(track.center) == round(40 / 0.15)
+
+    assert "hills exists already, and tracks are immutable" in refused("make", "hills", "--seed", "8")
+    assert "give one of --preset" in refused("make", "both", "--seed", "8", "--preset", "oval")
+    assert "--roughness belongs to --seed" in refused("make", "x", "--preset", "oval", "--roughness", "1")
+    assert "did you mean hills?" in refused("show", "hils")
+    assert "it exists; --overwrite replaces it" in refused("show", "hills", "-o", str(picture))
+    assert "unknown ending; use one of .png, .npy" in refused("show", "hills", "-o", str(tmp_path / "hills.gif"))
+
+    shown = call_muster("tracks", "show", "hills", "-o", str(file), "--json", home=home)
+    assert json.loads(shown.stdout)["digest"] == track.digest
+    rows = np.load(file, allow_pickle=False)
+    np.testing.assert_array_equal(rows, track.rows())
+
+    np.save(tmp_path / "swapped.npy", rows[:, [0, 1, 4, 5, 2, 3]])
+    swapped = call_muster("tracks", "import", str(tmp_path / "swapped.npy"), "--name", "copy", home=home)
+    assert swapped.returncode == 0 and "mended:     the borders were swapped" in swapped.stdout, swapped.stderr
+    rows[9] = np.nan
+    np.save(tmp_path / "broken.npy", rows)
+    said = refused("import", str(tmp_path / "broken.npy"), "--name", "broken")
+    assert f"{tmp_path}/broken.npy: centre line: row 9" in said
+
+    (store.tracks / "copy" / "manifest.json").unlink()
+    listed = json.loads(call_muster("tracks", "list", "--json", home=home).stdout)
+    assert [each["name"] for each in listed] == ["oval", "rounded-rectangle", "chicane", "copy", "hills"]
+    assert "copy is damaged" in listed[3]["problem"] and listed[4]["origin"] == {"seed": 7, "length": 40.0}
+    assert "track copy is damaged" in refused("show", "copy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import os
 import signal
 import socket
@@ -10,18 +11,49 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.engines.api import Cause, EngineError, Handle, NodePhase
+from orchestrator.engines.api import Cause, EngineError, Gang, Handle
 from orchestrator.engines.local.engine import LocalEngine
 from shared_store.epoch import raise_epoch
 from shared_store.processes import children, end_all, find_process, marked
 from tests.conftest import wait_for
-from tests.support.engines.local_bench import LocalBench
+from tests.support import processes
+from tests.support.engines.bench import Bench
 from tests.support.engines.sites import STUBBORN, WAIT
 from tests.support.processes import alive, command, frozen
+
+_JOB = f"local-engine-job-{os.getpid()}"
+"""One for all tests of this process and no other, since the engine finds gangs by their names on the whole machine."""
+
+
+class LocalBench(Bench):
+    engine: LocalEngine
+
+    def __init__(self, home: Path) -> None:
+        super().__init__(home, job=_JOB)
+
+    def new_engine(self) -> LocalEngine:
+        return LocalEngine(self.home / "home", cpus=8, gpus=["0", "1", "2", "3"])
+
+    def gang(self, script: str = WAIT, nodes: int = 2, *, suffix: str = "", **changes: Any) -> Gang:
+        return super().gang(script, nodes, suffix=suffix, **{"directory": str(self.home), **changes})
+
+    def printed(self, attempt: int = 1) -> list[tuple[int, str]]:
+        """(node, text) of what the ranks printed."""
+        return [(line.node, line.text) for line in self.lines(attempt) if line.rank is not None]
+
+    def environments(self, gang: Gang) -> list[dict[str, str]]:
+        """What a gang that prints its environment as JSON printed, by node index."""
+        found: dict[int, dict[str, str]] = {node: json.loads(text) for node, text in self.printed(gang.attempt)}
+        return [found[index] for index in range(len(gang.commands))]
+
+    def close(self) -> None:
+        """End all that is left, without the engine: a test may have broken it."""
+        processes.end_all(self.store.path)
 
 
 @pytest.fixture
@@ -184,13 +216,6 @@ def test_a_port_that_is_in_use_at_any_address_is_not_given_to_the_gang(bench: Lo
     assert sorted(bench.printed()) == [(0, f"{first + 1}"), (1, f"{first + 1}")]
 
 
-def test_the_main_node_is_started_first(bench: LocalBench) -> None:
-    handle = bench.launch(bench.gang(nodes=3, main=2))
-    starts = [int(node["start"]) for node in handle.facts["nodes"]]
-    first, second, main = pids(handle)
-    assert main < first < second or starts[2] < min(starts[:2]), "pids grow until they wrap around"
-
-
 # -- launching and observing ------------------------------------------------------------------------------------------
 
 
@@ -222,25 +247,6 @@ def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: Loc
     bench.launch(gang)
     wait_for(lambda: len(bench.printed()) == 3, 10, "node 1 again")
     assert len({text for _, text in bench.printed()}) == 1
-
-
-def test_how_nodes_ended_is_seen_by_the_engine_that_started_them(bench: LocalBench) -> None:
-    gang = bench.gang(nodes=4, commands=[["sh", "-c", each] for each in ("exit 0", "exit 75", "exit 3", "kill -9 $$")])
-    status = bench.ended(bench.launch(gang))
-    assert [node.exit_code for node in status] == [0, 75, 3, 137]
-    assert [node.cause for node in status] == [Cause.EXIT, Cause.EXIT, Cause.EXIT, Cause.SIGNAL]
-    contracts = [node.contract for node in bench.engine.plan(gang).nodes]
-    assert [node.address for node in status] == [contract.address for contract in contracts]
-
-
-def test_a_new_engine_observes_from_the_handle_alone(bench: LocalBench) -> None:
-    handle = bench.ready(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "echo ready; exit 4"]]))
-    other = bench.new_engine()
-    wait_for(lambda: not other.observe(handle)[1].running, 10, "the end of node 1")
-    first, second = other.observe(handle)
-    assert (first.phase, first.exit_code) == (NodePhase.RUNNING, None)
-    assert (second.phase, second.cause) == (NodePhase.ENDED, Cause.HOST_LOST), "nobody that it knows saw the end"
-    assert bench.outcome(1).exit_code == 4, "but the store knows"
 
 
 def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench: LocalBench) -> None:
@@ -315,13 +321,3 @@ def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: LocalBench) -> None:
     assert bench.engine.observe(handles[2])[0].words.startswith("muster supervisor: run run: this attempt has epoch 4")
     assert list((bench.home / "home" / "supervisors").iterdir()) == []
     assert not bench.engine._children
-
-
-def test_stopping_one_gang_leaves_the_others_alone(bench: LocalBench) -> None:
-    handle = bench.ready(bench.gang())
-    # a name that the first one's begins with: job/1/1 and job/1/12
-    other = bench.ready(bench.gang(epoch=12, run="another"))
-    bench.engine.stop(handle, 5.0)
-    assert [node.running for node in bench.engine.observe(handle)] == [False, False]
-    assert [node.running for node in bench.engine.observe(other)] == [True, True]
-    bench.engine.stop(other, 5.0)

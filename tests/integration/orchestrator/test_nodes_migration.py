@@ -21,7 +21,7 @@ from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
 from orchestrator.persistence.session import Database
 from shared_store.epoch import Claim, take_epoch
 from shared_store.layout import Store
-from tests.support.orchestrator.databases import migrate
+from tests.support.orchestrator.databases import connected, migrate
 from tests.support.orchestrator.jobs import await_status, detail, serving
 
 DUMP = Path(__file__).parents[2] / "support" / "orchestrator" / "schema_0008.sql"
@@ -34,21 +34,17 @@ BEFORE |= {"done": "SUCCEEDED", "array": "SUCCEEDED"}
 def old(database_url: str) -> str:
     """URL of the database of the dump."""
     migrate(database_url, "upgrade", "0008")
-    engine = create_engine(database_url)
-    with engine.begin() as connection:
+    with connected(database_url) as connection:
         for line in DUMP.read_text().splitlines():
             if line.startswith("INSERT"):
                 connection.exec_driver_sql(line)
-    engine.dispose()
     return database_url
 
 
 def nodes_as_json(url: str) -> dict[tuple[str, int], list[dict[str, Any]]]:
     """The nodes of each attempt of a database of schema 0008."""
-    engine = create_engine(url)
-    with engine.connect() as connection:
+    with connected(url) as connection:
         rows = connection.execute(text("SELECT job_id, number, CAST(nodes AS VARCHAR) FROM attempts")).all()
-    engine.dispose()
     return {(job, number): json.loads(nodes) for job, number, nodes in rows}
 
 
@@ -102,12 +98,10 @@ def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old:
     told = {"gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"}
     kept = [{"index": 0, "host": "h", **told}, {"index": 1, "host": "h"}]
     written = {1: json.dumps(kept), 2: damaged}
-    engine = create_engine(old)
-    with engine.begin() as connection:
+    with connected(old) as connection:
         which = "WHERE number = :number AND job_id = (SELECT id FROM jobs WHERE name = 'failed')"
         for number, nodes in written.items():
             connection.execute(text(f"UPDATE attempts SET nodes = :nodes {which}"), {"nodes": nodes, "number": number})
-    engine.dispose()
     database = Database(old)
     with database.session() as session:
         first, second = session.scalars(select(Job).where(Job.name == "failed")).one().attempts
@@ -123,11 +117,9 @@ def test_jobs_in_every_state_continue_where_the_older_controller_left_them(old: 
     (tmp_path / "home").mkdir(mode=0o700)
     store = Store(tmp_path / "home" / "store").open()
     before = nodes_as_json(old)
-    engine = create_engine(old)
-    with engine.connect() as connection:
+    with connected(old) as connection:
         jobs = dict(connection.execute(text("SELECT name, id FROM jobs WHERE parent IS NULL")).all())
         assert dict(connection.execute(text("SELECT name, status FROM jobs WHERE parent IS NULL")).all()) == BEFORE
-    engine.dispose()
     for name in ("starting", "running"):  # as the killed controller had made their runs
         run = store.run(f"{name}-{jobs[name][:8]}")
         run.create({"run": run.name, "queue": "default"})

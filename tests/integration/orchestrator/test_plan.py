@@ -73,12 +73,6 @@ def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: 
     assert planned == replace(submitted, **{name: getattr(planned, name) for name in own})
 
 
-def test_a_job_that_fits_nowhere_has_no_plan(shared_server: Serving) -> None:
-    refused = shared_server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=900")
-    assert refused.returncode == 2 and refused.stderr.count("\n") == 1
-    assert "each node needs 900 CPUs" in refused.stderr
-
-
 @pytest.mark.parametrize(
     "definition",
     [{}, {"jobDefinitionName": "a", "type": "container"}, {"jobDefinitionName": "a", "type": "multinode"}, {"type": 3}],

@@ -1,4 +1,4 @@
-"""Jobs on which an engine or the controller fails again and again: the others start and end meanwhile, and the log stays short."""
+"""A controller on a fake engine. Jobs on which an engine or the controller fails again and again: the others start and end meanwhile."""
 
 from __future__ import annotations
 
@@ -7,21 +7,95 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import pytest
 
+from orchestrator.control import attempts
 from orchestrator.control.attempts import Attempts
+from orchestrator.control.bus import Bus
+from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.monitoring import exposition
+from orchestrator.control.peers import Peers
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.attempt import Event, Instructions, Phase, State, after, step
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
-from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, Plan
+from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, NodePhase, NodeStatus, NotYet, Plan
+from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Attempt, Job, Node
-from tests.support.orchestrator.fake_controller import FakeController, properties
+from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
+from orchestrator.persistence.session import Database
+from shared_store.layout import Store
+from shared_store.outcomes import Outcome, write_outcome
 from tests.support.orchestrator.rows import job
 from tests.support.waiting import wait_for
+
+E = TypeVar("E", bound=FakeEngine)
+
+
+def properties(cpus: int, nodes: int = 1, **variables: str) -> dict[str, Any]:
+    """Of a native job; ``cpus`` of each node."""
+    needs = [{"type": "VCPU", "value": str(cpus)}]
+    given = [{"name": name, "value": value} for name, value in {"MUSTER_ON_CHILD_FAILURE": "fail", **variables}.items()]
+    container = {"command": ["true"], "resourceRequirements": needs, "environment": given}
+    return {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
+
+
+class FakeController(Generic[E]):
+    """Its database has a queue ``urgent``, which goes before ``default``."""
+
+    def __init__(self, home: Path, engine: E, stack: ExitStack) -> None:
+        """``stack`` closes it."""
+        self.engine = engine
+        engines = EngineSet([engine])
+        stack.callback(engines.close)
+        (home / "store").mkdir()
+        self.store = Store(home / "store").open()
+        self.database = Database.at(home)
+        stack.callback(self.database.close)
+        with self.database.session() as session:
+            ensure_compute_environments(session, engines.names)
+            session.add(JobQueue(name="urgent", priority=9, compute_environments=["fake"]))
+        self.reconciler = Reconciler(
+            self.database, engines, self.store, Bus(home), Peers(self.store, home), interval=0.02
+        )
+        stack.callback(self.reconciler.close)
+
+    def submit(self, *names: str, **facts: Any) -> None:
+        with self.database.session() as session:
+            session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
+
+    def job(self, name: str) -> Job:
+        with self.database.session() as session:
+            return session.get_one(Job, name)
+
+    def wait(self, name: str, *wanted: Status) -> Job:
+        found: Job = wait_for(lambda: (j := self.job(name)).status in wanted and j, 30, f"{name} is {wanted}")
+        return found
+
+    def explains(self, name: str, said: str) -> None:
+        """Wait until a job's reason, as every answer shows it, has these words."""
+
+        def reason() -> str:
+            found = self.job(name)
+            return self.reconciler.reason(found) or found.status_reason or ""
+
+        wait_for(lambda: said in reason(), 30, f"{name} says {said!r}")
+
+    def runs_and_ends(self, *names: str) -> None:
+        """Submit jobs, and have them end well once they run."""
+        self.submit(*names)
+        for name in names:
+            self.wait(name, Status.RUNNING)
+            for index in range(2):
+                done = Outcome(index, 1, 0, None, "done", None, 1.0, 2.0)
+                write_outcome(self.store.run(name), name, 1, done)
+                self.engine.cluster.end(f"{name}/1/1", index, 0)
+        for name in names:
+            self.wait(name, Status.SUCCEEDED)
 
 
 class PoisonedEngine(FakeEngine):
@@ -174,3 +248,50 @@ def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_sta
     assert b'muster_cpus_in_use{engine="fake",queue="default"} 1.0' in exposition(bench.reconciler)
     [failed] = [record.getMessage() for record in caplog.records if record.exc_info]
     assert failed.startswith("job bad: the controller failed on this job")
+
+
+# -- every instruction of the attempt's state machine ------------------------------------------------------------------
+
+
+def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    left: dict[int, State] = {}
+    """By number of the attempt."""
+    found: list[tuple[State, State]] = []
+    phases: set[Phase] = set()
+
+    def recorded(state: State, event: Event) -> Instructions:
+        number, instructions = state.terms.number, step(state, event)
+        phases.add(state.phase)
+        if number in left:  # a request may have asked the job to end meanwhile
+            found.append((left[number], replace(state, stop_reason=left[number].stop_reason)))
+        for instruction in instructions:
+            state = after(state, instruction)
+        left[number] = state
+        return instructions
+
+    monkeypatch.setattr(attempts, "step", recorded)
+    with ExitStack() as stack:
+        bench = FakeController(tmp_path, FakeEngine(), stack)
+        bench.reconciler.start()
+        engine, gangs = bench.engine, bench.engine.cluster.gangs
+        engine.error = NotYet("no room yet")
+        gang = properties(1, nodes=2, MUSTER_ON_CHILD_FAILURE="restart")
+        bench.submit("job", attempts_allowed=2, node_properties=gang)
+        bench.explains("job", "no room yet")
+        engine.error = None
+        assert bench.wait("job", Status.RUNNING).status_reason == "attempt 1 runs on 2 nodes"
+        gangs["job/1/1"][0] = NodeStatus(NodePhase.UNREACHABLE, words="out of sight")
+        bench.explains("job", "out of sight")
+        engine.cluster.end("job/1/1", 1, 3, "exit 3")
+        bench.explains("job", "attempt 2 runs on 2 nodes")
+        with bench.database.session() as session:
+            session.get_one(Job, "job").stop_reason = "enough"
+        bench.wait("job", Status.FAILED)
+        with bench.database.session() as session:
+            job = session.get_one(Job, "job")
+            ends = [(each.ending, each.status_reason, each.exit_code, each.spent) for each in job.attempts]
+    assert ends == [("failed", "node 1: exit 3", 3, True), ("stopped", "enough", None, True)]
+    assert phases == {Phase.LAUNCHING, Phase.STARTING, Phase.RUNNING, Phase.ENDING}
+    assert all(left[number].closed for number in (1, 2))
+    for expected, state in found:
+        assert state == expected

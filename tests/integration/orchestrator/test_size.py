@@ -80,21 +80,6 @@ def test_an_array_stores_its_definition_once_for_all_children(inside: Server, ht
     assert [(each["status"], each["statusReason"]) for each in ended] == [("FAILED", "enough")] * 2
 
 
-def test_children_of_an_array_wait_for_each_other_as_asked(inside: Server, http: httpx.Client, waiting: str) -> None:
-    first = large_array(http, waiting, 3, dependsOn=[{"type": "SEQUENTIAL"}])
-    second = large_array(http, waiting, 3, dependsOn=[{"type": "N_TO_N", "jobId": first}])
-
-    def waits(job: str) -> list[tuple[str, str | None]]:
-        [detail] = call(http, "DescribeJobs", jobs=[job])["jobs"]
-        return [(each["jobId"], each.get("type")) for each in detail["dependsOn"]]
-
-    expected = [[], *([(f"{first}:{index}", "SEQUENTIAL")] for index in range(2))]
-    assert [waits(f"{first}:{index}") for index in range(3)] == expected
-    assert waits(f"{second}:2") == [(f"{first}:2", "N_TO_N")]
-    for array in (first, second):
-        call(http, "TerminateJob", jobId=array, reason="done with")
-
-
 @pytest.mark.parametrize("said", OVERSIZED)
 def test_a_request_beyond_a_limit_is_refused_by_the_limits_name(http: httpx.Client, said: str) -> None:
     operation, body = OVERSIZED[said]

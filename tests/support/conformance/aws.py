@@ -15,6 +15,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from tests.conftest import Serving
+from tests.support import definitions
 from tests.support.conformance.streams import GROUP, client_of
 from tests.support.waiting import PATIENCE, wait_for
 
@@ -118,16 +119,8 @@ class Batch:
 
 def container(script: str, changes: dict[str, Any]) -> dict[str, Any]:
     """``containerProperties`` for ``sh -c script``; takes ``env``, ``cpus`` and ``container`` out of ``changes``."""
-    return {
-        "image": "any",
-        "command": ["sh", "-c", script],
-        "environment": pairs(changes.pop("env", {})),
-        "resourceRequirements": [
-            {"type": "VCPU", "value": changes.pop("cpus", "0.1")},
-            {"type": "MEMORY", "value": "16"},
-        ],
-        **changes.pop("container", {}),
-    }
+    base = definitions.container(["sh", "-c", script], changes.pop("cpus", "0.1"), changes.pop("env", {}))
+    return {**base, "image": "any", **changes.pop("container", {})}
 
 
 def pairs(environment: dict[str, str]) -> list[dict[str, str]]:

@@ -66,6 +66,12 @@ def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
         console.close()
 
 
+@pytest.fixture
+def visitor(console: Console) -> Visitor:
+    """A person with the key ``admin``."""
+    return console.visitor()
+
+
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
     """The system's Chromium. Not for longer: while Playwright runs, nothing else on this thread can have an event loop."""

@@ -74,10 +74,16 @@ class Visitor:
         assert answer.status_code == status, answer.text
         return Page(answer.text)
 
-    def submit(self, path: str, of: str = "/", **fields: Any) -> httpx.Response:
-        """Send a form of the page ``of``, as a script would: the answer is JSON."""
-        data = {"form_token": self.page(of).form_token, **fields}
+    def submit(self, path: str, **fields: Any) -> httpx.Response:
+        """Send a form, as a script would: the answer is JSON."""
+        data = {"form_token": self.page("/").form_token, **fields}
         return self.http.post(path, data=data, headers={"Accept": "application/json"})
+
+    def refusal(self, path: str, status: int = 403, **fields: Any) -> str:
+        """What the person is told whose form is refused with this status."""
+        answer = self.submit(path, **fields)
+        assert answer.status_code == status, answer.text
+        return str(answer.json()["message"])
 
     def events(self, path: str, **headers: str) -> Iterator[tuple[str, Any, str]]:
         """Name, data and id of the events of a stream, as they come, until the caller leaves."""

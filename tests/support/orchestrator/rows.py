@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from orchestrator.persistence.models import Job
+from tests.support.definitions import nodes_of
 
-NODES = {
-    "numNodes": 2,
-    "mainNode": 0,
-    "nodeRangeProperties": [{"targetNodes": "0:", "container": {"command": ["true"]}}],
-}
+NODES = nodes_of({"command": ["true"]}, 2)
 
 
 def job(job_id: str, **facts: Any) -> Job:
