@@ -76,7 +76,7 @@ GROUPS = (
     ),
     Group(
         ["worker/learning/ppo/*.py"],
-        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "plain_ppo", "algorithms")],
+        [f"{_UNIT}/worker/test_{name}.py" for name in ("ppo", "ppo_choices", "plain_ppo", "algorithms")],
         sample=200,
         bounds_memory=False,
     ),
