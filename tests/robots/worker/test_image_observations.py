@@ -16,23 +16,19 @@ import torch
 from orchestrator.spec.model import validate
 from orchestrator.spec.settings import effective_problem
 from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.support.worker.ranks import training
-from tests.support.worker.runs import assert_same_bits, last
+from tests.support.worker.runs import assert_same_bits, last, runner, train
 from tests.support.worker.seeing import Seeing, SeeingAlone, SeeingConfig, SeeingDepth
 from tests.support.worker.tasks import put
-from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.export import export
 from worker.learning import algorithms
-from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.rsl.settings import RslRlConfig
 from worker.learning.sac.settings import SACConfig
-from worker.learning.training import Training
 from worker.simulation.sensors.camera import CameraSensor
 from worker.simulation.sensors.imu import Imu
 from worker.tasks.__main__ import describe
@@ -112,13 +108,9 @@ def test_images_go_on_bit_for_bit(depth: SeeingDepth) -> None:
     assert all(torch.equal(one, two) for one, two in zip(straight, go_on(), strict=True))
 
 
-def run(path: Path, name: str, iterations: int, epoch: int = 1, **train: Any) -> Loop:
-    env = training(path, run=name, iterations=iterations, epoch=epoch, worlds=4, task=NAME, algorithm="rsl_rl", **train)
-    job = Job.from_env(env, "train")
-    raise_epoch(job.run, epoch)
-    started = Loop(Training.of(job, Seeing), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
-    assert started.train() == 0
-    return started
+def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Loop:
+    env = training(path, run=name, iterations=iterations, epoch=epoch, worlds=4, task=NAME, algorithm="rsl_rl")
+    return train(env, task=Seeing)
 
 
 def test_rsl_rl_learns_from_both_resumes_with_the_same_bits_and_exports(tmp_path: Path) -> None:
@@ -168,10 +160,7 @@ def test_a_job_with_images_and_numbers_is_accepted_and_its_groups_are_checked_at
 
 def test_ppo_takes_the_numbers_and_refuses_images_that_the_policy_does_not_see(tmp_path: Path) -> None:
     def loop(**ppo: Any) -> Loop:
-        env = training(tmp_path, worlds=4, task=NAME, ppo=ppo)
-        return Loop(
-            Training.of(Job.from_env(env, "train"), Seeing), Gang(Placement(), "cpu", None, ["here"]), StopRequest()
-        )
+        return runner(training(tmp_path, worlds=4, task=NAME, ppo=ppo), task=Seeing)
 
     assert loop().algorithm.rollout.actor.observations.shape[2:] == (1,)
     with pytest.raises(UserError, match="critic_observations: expected 'policy' or 'critic', found 'camera'"):
@@ -188,6 +177,8 @@ def test_a_policy_may_see_an_image_alone() -> None:
     assert alone.config.observation_groups == {"policy": True, "critic": False}
     assert set(tables(alone.plan)) >= {"observations", "observations of critic"}
     assert described(alone)["policy"]["sensor"] == "front"
+    space = TaskVectorEnv("tests.support.worker.seeing:SeeingAlone", 2).single_observation_space
+    assert space == gymnasium.spaces.Box(0, 255, (6, 12, 16), np.uint8)
 
 
 def test_the_list_of_tasks_describes_images() -> None:
@@ -221,9 +212,11 @@ def test_scenes_differ_as_the_configuration_asks() -> None:
     images = Seeing(config, 3, seed=3).groups["camera"].clone()
     assert not torch.equal(images[0], images[1])
     assert torch.equal(images[2:], Seeing(config, 1, seed=3, first_world=2).groups["camera"]), "not the rank's"
-    moved = Seeing(SeeingConfig(spread=0.0, randomize=Randomization(camera_position=0.05)), 2, seed=3)
-    shifts = moved.sensors["front"].arrays.poses.numpy()[:, :3] - [0.15, 0.0, 1.0]
+    moved = Seeing(SeeingConfig(spread=0.0, randomize=Randomization(camera_position=0.05, camera_angle=0.1)), 2, seed=3)
+    poses = moved.sensors["front"].arrays.poses.numpy()
+    shifts = poses[:, :3] - [0.15, 0.0, 1.0]
     assert (np.abs(shifts) <= 0.05).all() and not np.allclose(shifts[0], shifts[1])
+    assert not np.allclose(poses[0, 3:], poses[1, 3:], atol=1e-3), "turned otherwise"
     noisy = SeeingConfig(randomize=Randomization(observation_noise=0.1))
     assert Seeing.sketch(noisy).plan.groups["critic"], "numbers beside images may be noisy"
 

@@ -1,4 +1,4 @@
-"""Tasks on the CPU: rewards and resets by hand, exact resume, the same worlds on any number of ranks."""
+"""Tasks on the CPU: resets by hand, exact resume, the same worlds on any number of ranks. Rewards: tests/unit/worker/test_task_formulas.py."""
 
 from __future__ import annotations
 
@@ -45,18 +45,6 @@ def test_sizes_names_and_types(cartpole: Cartpole, ant: Ant) -> None:
         assert task.rewards.shape == task.dones.shape == task.time_outs.shape == task.episode_length.shape == (8,)
         assert task.dones.dtype == task.time_outs.dtype == torch.bool and task.statistics.dtype == torch.float64
         assert len(task.statistic_names) == len(task.statistics)
-
-
-def test_one_cartpole_reward_by_hand(cartpole: Cartpole) -> None:
-    put(cartpole, joint_q=[[2.0, 0.3], [1.0, -0.1], [-2.5, 0.0]], joint_qd=[[-0.5, 3.0], [0.0, 0.0], [0.0, 0.0]])
-    cartpole.actions[:3, 0] = torch.tensor([0.5, -7.0, 0.0])
-    observe(cartpole)
-    # alive 0.1, minus 0.1 angle^2, minus 0.05 position^2, minus 0.05 velocity^2, minus 0.001 clipped action^2
-    assert cartpole.rewards[0].item() == pytest.approx(0.1 - 0.009 - 0.2 - 0.0125 - 0.00025, abs=1e-6)
-    assert cartpole.rewards[1].item() == pytest.approx(0.1 - 0.001 - 0.05 - 0.0 - 0.001, abs=1e-6)
-    # off the rail: no alive reward, 2 for the fall
-    assert cartpole.rewards[2].item() == pytest.approx(-2.0 - 0.05 * 6.25, abs=1e-6)
-    assert cartpole.dones[:3].tolist() == [False, False, True]
 
 
 def test_time_out_is_not_termination(cartpole: Cartpole) -> None:
@@ -165,25 +153,6 @@ def test_a_world_that_is_nan_is_reset_and_counted_and_touches_no_other(cartpole:
     assert same([tuple(t[1:] for t in step) for step in clean], [tuple(t[1:] for t in step) for step in broken])
     totals = statistics(cartpole)
     assert totals["nan_worlds"] == 1 and totals["episodes"] == sum(int(step[2][1:].sum()) for step in broken)
-
-
-def test_worlds_are_the_same_however_they_are_dealt_out(cartpole: Cartpole) -> None:
-    put(cartpole)
-    cartpole.set_random_episode_length()
-    ages = cartpole.episode_length.clone()
-    whole = play(cartpole, 120, seed=6)
-    parts = []
-    for first in (0, 4):
-        part = Cartpole(CartpoleConfig(), 4, seed=1, first_world=first)
-        part.set_random_episode_length()
-        assert torch.equal(part.episode_length, ages[first : first + 4])
-        parts.append(play(part, 120, seed=6))
-    joined = [tuple(torch.cat(pair) for pair in zip(*steps, strict=True)) for steps in zip(*parts, strict=True)]
-    assert same(whole, joined)
-    assert sum(int(step[2].sum()) for step in whole) > 8, "resets were compared, too"
-    assert len(set(ages.tolist())) > 4 and (ages >= 0).all() and (ages < 300).all()
-    other = Cartpole(CartpoleConfig(), 4, seed=2, first_world=0)
-    assert not torch.equal(other.observations, parts[0][0][0])
 
 
 def test_the_warm_start_belongs_to_the_state(ant: Ant) -> None:

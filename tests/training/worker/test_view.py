@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import subprocess
-import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -148,10 +146,3 @@ def test_without_the_extra_one_line_names_the_installation(monkeypatch: pytest.M
     monkeypatch.setattr("worker.telemetry.page.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'muster\[viz\]'"):
         Page(None, "64MB")
-
-
-def test_neither_the_command_nor_a_training_imports_rerun() -> None:
-    names = "orchestrator.cli orchestrator.cli.viewing worker.learning.loop worker.telemetry.attending worker.tasks.cartpole newton"
-    code = f"import importlib, sys; [importlib.import_module(name) for name in {names.split()}]; print('rerun' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "False"
