@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import torch
 import trimesh
 
 from tests.support.waiting import wait_for
+from tests.support.worker.in_process import call_worker
 from worker.errors import UserError
 from worker.tasks.cartpole import Cartpole
 from worker.tasks.configs.cartpole import CartpoleConfig
@@ -189,38 +191,25 @@ def test_rerun_finds_nothing_wrong_with_the_file(recorded: Recorded, tmp_path: P
     assert (tmp_path / "two.rrd").stat().st_size > 10_000
 
 
-FOR_EVER = """
-import sys
-from pathlib import Path
-import torch
-import warp
-warp.config.log_level = warp.LOG_WARNING
-from tests.training.worker.test_recording import CONFIG, Cartpole, Reading, Recording, Stage, Tap, UserError
-task = Cartpole(CONFIG, 2, seed=3)
-tap = Tap(task, 2)
-tap.open()
-reading = Reading(tap)
-try:
-    recording = Recording(Path(sys.argv[1]), Stage(Cartpole, CONFIG, 2), {}, {})
+def record_for_ever(path: Path) -> None:
+    """Until this process is killed, or there is no space."""
+    task = Cartpole(CONFIG, 2, seed=3)
+    tap = Tap(task, 2)
+    tap.open()
+    reading = Reading(tap)
+    recording = Recording(path, Stage(Cartpole, CONFIG, 2), {}, {})
     while True:
         task.step(torch.zeros(2, 1))
         recording.write(reading.take())
-except UserError as error:
-    print(error)
-"""
-
-
-def recording_process(path: Path, before: str = "") -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", before + FOR_EVER, str(path)], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True
-    )
 
 
 def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     path, partial = tmp_path / "cut.mcap", tmp_path / "cut.mcap.partial"
-    process = recording_process(path)
+    script = "import sys; from pathlib import Path; from tests.training.worker.test_recording import record_for_ever; "
+    command = [sys.executable, "-c", f"{script}record_for_ever(Path(sys.argv[1]))", str(path)]
+    process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
     begun = wait_for(lambda: partial.exists() and partial.stat().st_size, 60, "the recording's begin")
     flushed = wait_for(
         lambda: (size := partial.stat().st_size) > begun + 20_000 and size, 60, "some steps that were flushed"
@@ -232,13 +221,8 @@ def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_
         file.write(b"\x06" + (1 << 20).to_bytes(8, "little") + b"cut")
     cut = partial.read_bytes()
     assert len(cut) > flushed
-    done = subprocess.run(
-        [sys.executable, "-m", "worker.telemetry.live", "--recover", str(partial)],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = call_worker(main, {}, "--recover", str(partial))
+    assert done.returncode == 0, done.stderr
     assert str(path) in done.stdout and partial.read_bytes() == cut
     with path.open("rb") as file:
         reader = make_reader(file)
@@ -254,29 +238,35 @@ def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_
         recover(partial)
 
 
-def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_what_it_has(tmp_path: Path) -> None:
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
-    process = recording_process(tmp_path / "full.mcap", limit)
-    said, _ = process.communicate()
-    assert process.returncode == 0
-    (said,) = [line for line in said.splitlines() if "Warp" not in line]
+def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_what_it_has(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """After another recording, so that no kernel has to be written any more."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(UserError) as refused:
+            record_for_ever(tmp_path / "full.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = str(refused.value)
     assert "full.mcap.partial: it can't be written (File too large)" in said and "muster record --recover" in said
+    assert "\n" not in said
     made = recover(tmp_path / "full.mcap.partial")
     assert made is not None and made[0] == tmp_path / "full.mcap" and made[1] > 20
     assert not os.path.exists(tmp_path / ".full.mcap.tmp")
 
 
 def test_a_whole_recording_and_one_without_a_step_are_not_recovered_and_nothing_is_made(
-    recorded: Recorded, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, tmp_path: Path
 ) -> None:
     whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap.partial"
     whole.write_bytes(recorded.path.read_bytes())
     Recording(tmp_path / "cut.mcap", recorded.stage, {}, {})  # it has its beginning, and is never finished
     for file, code, words in ((whole, 0, "it is whole already"), (cut, 1, "it ends before the first control step")):
-        monkeypatch.setattr(sys, "argv", ["live", "--recover", str(file)])
-        assert main() == code
-        said = capfd.readouterr()
-        (line,) = (said.out + said.err).splitlines()
+        done = call_worker(main, {}, "--recover", str(file))
+        assert done.returncode == code
+        (line,) = (done.stdout + done.stderr).splitlines()
         assert f"{file}: {words}" in line
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap.partial", "whole.mcap"]
 
