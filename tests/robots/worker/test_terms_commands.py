@@ -20,20 +20,12 @@ from tests.support.worker.terms_rig import (
     WORLDS,
     Rig,
     array,
+    terms_of,
 )
 from worker.simulation.sensors.differential_ik import IkArrays
 from worker.simulation.sensors.wrench import WrenchArrays
 from worker.tasks.terms import actions, commands, episode, events, root
 
-MODULES = (actions, commands, episode, events)
-ALL = [
-    each
-    for module in MODULES
-    for each in vars(module).values()
-    if isinstance(each, wp.Function)
-    and each.func.__module__ == module.__name__
-    and each.key not in ("aim", "_draw_wrenches")
-]
 DRAWS = 120
 
 
@@ -44,7 +36,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     wrench.bodies, wrench.left = array([1, 4], wp.int32), array(np.zeros(WORLDS))
     frame.wanted = array(np.zeros((WORLDS, 3)))
     structs = {WrenchArrays: wrench, IkArrays: frame}
-    return Rig([*ALL, root.root_linear_velocity], tmp_path_factory.mktemp("commands"), structs)
+    tested = terms_of(actions, commands, episode, events, without=("aim", "_draw_wrenches"))
+    return Rig([*tested, root.root_linear_velocity], tmp_path_factory.mktemp("commands"), structs)
 
 
 @pytest.fixture

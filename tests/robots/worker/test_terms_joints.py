@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
-from tests.support.worker.terms_rig import JOINTS, WORLDS, Rig
+from tests.support.worker.terms_rig import JOINTS, WORLDS, Rig, terms_of
 from worker.tasks.terms import joints as terms
-
-ALL = [
-    each for each in vars(terms).values() if isinstance(each, wp.Function) and each.func.__module__ == terms.__name__
-]
 
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    return Rig(ALL, tmp_path_factory.mktemp("joints"))
+    return Rig(terms_of(terms), tmp_path_factory.mktemp("joints"))
 
 
 def column(rig: Rig, joint: int) -> dict[str, np.ndarray]:

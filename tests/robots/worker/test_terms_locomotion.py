@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +10,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.support.worker.terms_rig import JOINTS, ROOT, ROOT_DOF, WORLDS, Rig, array, rotations
+from tests.support.worker.terms_rig import (
+    JOINTS,
+    ROOT,
+    ROOT_DOF,
+    WORLDS,
+    Rig,
+    array,
+    close,
+    matrix,
+    rotations,
+    terms_of,
+)
 from worker.simulation.sensors.contact import ContactArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
@@ -19,24 +31,8 @@ from worker.simulation.sensors.rays import RayArrays
 from worker.simulation.terrain_arrays import TerrainArrays
 from worker.tasks.terms import contacts, ground, locomotion, sensing, tolerances
 
-MODULES = (contacts, ground, locomotion, sensing, tolerances)
-SHARED = ("touches", "planar_speed", "above_ground", "posture_within")
 FEET, POINTS, COMMAND = 4, 6, 10
-
-
-def near(found: np.ndarray, wanted: Any, name: str = "") -> None:
-    np.testing.assert_allclose(found, np.asarray(wanted, dtype=float), rtol=2e-4, atol=3e-5, err_msg=name)
-
-
-def matrix(rotation: np.ndarray) -> np.ndarray:
-    """Rotation matrices of quaternions xyzw, shape ``(..., 3, 3)``."""
-    x, y, z, w = np.moveaxis(np.asarray(rotation, dtype=float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+near = partial(close, rtol=2e-4, atol=3e-5)
 
 
 def structs() -> dict[Any, Any]:
@@ -87,12 +83,8 @@ def structs() -> dict[Any, Any]:
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    functions = [
-        each
-        for module in MODULES
-        for each in vars(module).values()
-        if isinstance(each, wp.Function) and each.func.__module__ == module.__name__ and each.key not in SHARED
-    ]
+    shared = ("touches", "planar_speed", "above_ground", "posture_within")
+    functions = terms_of(contacts, ground, locomotion, sensing, tolerances, without=shared)
     made = Rig(functions, tmp_path_factory.mktemp("locomotion"), structs())
     values = made.episodes.memory.numpy()
     values[:, COMMAND : COMMAND + 3] = [[0.3, -0.4, 0.2], [0.0, 0.0, 0.04], [1.2, 0.5, 0.9]]  # walk, nearly stand, run

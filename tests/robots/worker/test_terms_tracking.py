@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,10 @@ from tests.support.worker.terms_rig import (
     WORLDS,
     Rig,
     array,
+    close,
+    matrix,
     rotations,
+    terms_of,
 )
 from worker.simulation.sensors.frames import FrameArrays
 from worker.tasks.terms import following, manipulation, tracking
@@ -41,27 +45,13 @@ SHARED = [
     "body_turn_error",
 ]
 COMMAND, FRAMES, FOLLOWED, ANCHOR = 10, 8, [1, 4, 5], 2
-
-
-def matrix(rotation: Any) -> np.ndarray:
-    """Rotation matrices of quaternions xyzw, shape ``(..., 3, 3)``."""
-    x, y, z, w = np.moveaxis(np.asarray(rotation, dtype=float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+near = partial(close, rtol=5e-4, atol=5e-5)
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Angle between two rotations."""
     trace = np.trace(np.swapaxes(first, -1, -2) @ second, axis1=-2, axis2=-1)
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
-
-
-def near(found: np.ndarray, wanted: Any, name: str = "") -> None:
-    np.testing.assert_allclose(found, np.asarray(wanted, dtype=float), rtol=5e-4, atol=5e-5, err_msg=name)
 
 
 def motion() -> MotionArrays:
@@ -89,12 +79,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     hand = FrameArrays()
     hand.positions = array(random.normal(size=(WORLDS, 2, 3)), wp.vec3)
     hand.rotations = array(rotations(random, WORLDS, 2), wp.quat)
-    functions = [
-        each
-        for module in (manipulation, tracking, following)
-        for each in vars(module).values()
-        if isinstance(each, wp.Function) and each.func.__module__ == module.__name__ and each.key not in SHARED
-    ]
+    functions = terms_of(manipulation, tracking, following, without=SHARED)
     made = Rig(functions, tmp_path_factory.mktemp("tracking"), {FrameArrays: hand, MotionArrays: motion()})
     values = made.episodes.memory.numpy()
     values[:, COMMAND + 3 : COMMAND + 7] = rotations(random, WORLDS)

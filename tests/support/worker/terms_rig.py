@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +33,34 @@ READS = {
 }
 
 
+def terms_of(*modules: Any, without: Sequence[str] = ()) -> list[Any]:
+    """The terms that the modules define, but for those that only other terms call."""
+    found = [(module, each) for module in modules for each in vars(module).values() if isinstance(each, wp.Function)]
+    return [each for module, each in found if each.func.__module__ == module.__name__ and each.key not in without]
+
+
+def close(found: np.ndarray, wanted: Any, name: str = "", *, rtol: float = 1e-4, atol: float = 2e-5) -> None:
+    """Judge numbers in float32."""
+    np.testing.assert_allclose(found, np.asarray(wanted, dtype=float), rtol=rtol, atol=atol, err_msg=name)
+
+
 def rotations(random: np.random.Generator, *shape: int) -> np.ndarray:
     """Unit quaternions, of any rotation and either sign."""
     found = random.normal(size=(*shape, 4))
     units: np.ndarray = found / np.linalg.norm(found, axis=-1, keepdims=True)
     return units
+
+
+def matrix(rotation: Any) -> np.ndarray:
+    """Rotation matrices of quaternions xyzw, shape ``(..., 3, 3)``."""
+    x, y, z, w = np.moveaxis(np.asarray(rotation, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    found: np.ndarray = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return found
 
 
 def array(values: Any, dtype: Any = wp.float32) -> wp.array[Any]:
