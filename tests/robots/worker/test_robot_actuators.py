@@ -34,13 +34,8 @@ INERTIA = 0.02
 
 
 def wheels(*actuators: Actuator, worlds: int = 1, substeps: int = 1, left: str = ""):
-    template, built = build(
-        Robot(WHEELS.format(left=left), actuators=actuators),
-        worlds=worlds,
-        ground=False,
-        timestep=STEP,
-        substeps=substeps,
-    )
+    robot = Robot(WHEELS.format(left=left), actuators=actuators)
+    template, built = build(robot, worlds=worlds, ground=False, timestep=STEP, substeps=substeps)
     built.restore_defaults()
     return RobotView(template), built
 
@@ -92,9 +87,8 @@ def test_a_native_servo_damps_implicitly_and_an_explicit_one_does_not():
 
 def test_a_dc_motor_follows_its_torque_speed_line():
     stall, free, limit = 6.0, 20.0, 4.0
-    _, worlds = wheels(
-        DCMotorActuator("*", 1000.0, 0.0, saturation_effort=stall, velocity_limit=free, effort_limit=limit)
-    )
+    motor = DCMotorActuator("*", 1000.0, 0.0, saturation_effort=stall, velocity_limit=free, effort_limit=limit)
+    _, worlds = wheels(motor)
     for speed in (-30.0, -10.0, 0.0, 5.0, 10.0, 19.0, 20.0, 25.0):
         forward = force_of(worlds, (1.0, 1.0), velocities=(speed, speed))[0, 0]
         back = force_of(worlds, (-1.0, -1.0), velocities=(speed, speed))[0, 0]
@@ -162,10 +156,8 @@ def test_delays_are_part_of_the_state():
 
 
 def test_numbers_by_pattern_of_joints():
-    actuator = PositionActuator(
-        "*", {"left*": 10.0, "*": 20.0}, 0.0, armature={"right*": 0.5, "*": 0.1}, friction_loss=0.01
-    )
-    view, worlds = wheels(actuator)
+    numbers = {"armature": {"right*": 0.5, "*": 0.1}, "friction_loss": 0.01}
+    view, worlds = wheels(PositionActuator("*", {"left*": 10.0, "*": 20.0}, 0.0, **numbers))
     model = worlds.solver.mj_model
     np.testing.assert_allclose(model.actuator_gainprm[:, 0], [10.0, 20.0])
     np.testing.assert_allclose(model.dof_armature, [0.1, 0.5], rtol=1e-6)
@@ -180,10 +172,8 @@ def test_gains_of_the_model_can_be_changed_in_each_world():
 
 
 def test_the_actuators_of_a_file_are_kept_and_follow_the_controls():
-    actuators = (
-        '<actuator><position joint="right_axle" kp="5"/><motor joint="left_axle" gear="2" ctrlrange="-3 3"/></actuator>'
-    )
-    text = WHEELS.format(left="").replace("</mujoco>", f"{actuators}</mujoco>")
+    actuators = '<position joint="right_axle" kp="5"/><motor joint="left_axle" gear="2" ctrlrange="-3 3"/>'
+    text = WHEELS.format(left="").replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
     template, worlds = build(Robot(text), ground=False)
     view = RobotView(template)
     assert view.actuators == [1, 0]

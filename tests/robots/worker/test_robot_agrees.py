@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
 
-from tests.support.worker.robots import G1, GO1, build, need_mjlab, reference
+from tests.support.worker.robots import build, need_mjlab, reference
 from worker.simulation.robot import Robot
 from worker.simulation.robot_view import RobotView
+from worker.tasks import find_task
 
 STEPS = 200
 
 
-@pytest.mark.parametrize("robot", [GO1, G1], ids=["go1", "g1"])
-def test_a_robot_moves_as_in_mujocos_own_engine(robot: Robot):
+@pytest.fixture(params=["Go1Flat", "G1Flat"])
+def robot(request: pytest.FixtureRequest) -> Robot:
+    """Of that task."""
+    return robot_of(request.param)
+
+
+def robot_of(name: str) -> Robot:
     need_mjlab()
+    task: Any = find_task(name)
+    return task.walker.robot()
+
+
+def test_a_robot_moves_as_in_mujocos_own_engine(robot: Robot):
     template, worlds = build(robot)
     view = RobotView(template)
     model = reference(robot)
@@ -47,16 +60,13 @@ def test_a_robot_moves_as_in_mujocos_own_engine(robot: Robot):
     np.testing.assert_allclose(root, data.qpos[:3], atol=0.01)
 
 
-@pytest.mark.parametrize("robot", [GO1, G1], ids=["go1", "g1"])
 def test_the_compiled_model_is_mujocos(robot: Robot):
-    need_mjlab()
     template, worlds = build(robot)
     view = RobotView(template)
     ours, theirs = worlds.solver.mj_model, reference(robot)
     dofs = [int(theirs.joint(name).dofadr[0]) for name in view.joint_names]
-    np.testing.assert_allclose(ours.dof_armature[view.dofs], theirs.dof_armature[dofs], rtol=1e-5)
-    np.testing.assert_allclose(ours.dof_frictionloss[view.dofs], theirs.dof_frictionloss[dofs], rtol=1e-5)
-    np.testing.assert_allclose(ours.dof_damping[view.dofs], theirs.dof_damping[dofs], rtol=1e-5)
+    for field in ("dof_armature", "dof_frictionloss", "dof_damping"):
+        np.testing.assert_allclose(getattr(ours, field)[view.dofs], getattr(theirs, field)[dofs], rtol=1e-5)
     np.testing.assert_allclose(ours.body_subtreemass[0], theirs.body_subtreemass[0], rtol=1e-5)
     inputs = [int(theirs.actuator(name).id) for name in view.joint_names]
     for field in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_ctrllimited"):
@@ -68,34 +78,8 @@ def test_the_compiled_model_is_mujocos(robot: Robot):
         if name not in view.geom_names:
             continue
         its = theirs.geom(name).id
-        for field in (
-            "geom_contype",
-            "geom_conaffinity",
-            "geom_condim",
-            "geom_priority",
-            "geom_friction",
-            "geom_solref",
-        ):
-            mine, wanted = getattr(ours, field)[index], getattr(theirs, field)[its]
+        for field in ("contype", "conaffinity", "condim", "priority", "friction", "solref"):
+            mine, wanted = getattr(ours, f"geom_{field}")[index], getattr(theirs, f"geom_{field}")[its]
             np.testing.assert_allclose(mine, wanted, rtol=1e-5, err_msg=f"{field} of {name}")
         compared += 1
     assert compared == sum(bool(theirs.geom(name).contype[0]) for name in view.geom_names)
-
-
-@pytest.mark.parametrize("height", [0.32, 0.26], ids=["above", "on the ground"])
-def test_only_touching_geoms_are_contacts(height: float):
-    need_mjlab()
-    template, worlds = build(GO1)
-    view = RobotView(template)
-    model = reference(GO1)
-    data = mujoco.MjData(model)
-    data.qpos[:7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
-    data.qpos[[int(model.joint(name).qposadr[0]) for name in view.joint_names]] = view.defaults
-    mujoco.mj_step(model, data)
-    worlds.restore_defaults()
-    row = worlds.arrays.joint_q.numpy()
-    row[0, 2] = height
-    worlds.arrays.joint_q.assign(row)
-    worlds.simulate()
-    assert int(worlds.solver.mjw_data.nacon.numpy()[0]) == data.ncon
-    assert (data.ncon > 0) == (height == 0.26)

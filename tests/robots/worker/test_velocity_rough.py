@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.worker.terms_rig import matrix
 from tests.support.worker.walkers import plain
 from worker.tasks.velocity import Velocity
 
@@ -16,13 +17,6 @@ WORLDS = 4
 @pytest.fixture(scope="module")
 def rough() -> Velocity:
     return plain("Go1Rough", WORLDS)
-
-
-def pose(joint_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place and rotation matrix of a root."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.array([joint_q[6], *joint_q[3:6]], float))
-    return joint_q[:3].astype(float), matrix.reshape(3, 3)
 
 
 def test_it_sees_what_rays_of_mujoco_meet_and_stands_upright_on_it(rough: Velocity) -> None:
@@ -47,33 +41,25 @@ def test_it_sees_what_rays_of_mujoco_meet_and_stands_upright_on_it(rough: Veloci
         state = rough.state_dict()
         for world in range(WORLDS):
             assert not rough.dones[world]
-            place, turn = pose(state["joint_q"].numpy()[world])
+            root = state["joint_q"].numpy()[world].astype(float)
+            place, turn = root[:3], matrix(root[3:7])
             yaw = np.arctan2(turn[1, 0], turn[0, 0])
             points = []
             for y in np.linspace(-0.5, 0.5, 11):
                 for x in np.linspace(-0.8, 0.8, 17):
                     way = np.array((np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y))
                     at = place[:2] + way
-                    down = mujoco.mj_ray(
-                        model,
-                        data,
-                        np.array([*at, 20.0]),
-                        np.array([0.0, 0.0, -1.0]),
-                        None,
-                        1,
-                        -1,
-                        np.zeros(1, np.int32),
-                    )
+                    start, geom = np.array([*at, 20.0]), np.zeros(1, np.int32)
+                    down = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, geom)
                     points.append([*at, 20.0 - down])
             ground = np.array(points)
-            np.testing.assert_allclose(
-                rough.observations[world].numpy()[columns], (place[2] - ground[:, 2]) / 5.0, atol=2e-3
-            )
+            seen = rough.observations[world].numpy()[columns]
+            np.testing.assert_allclose(seen, (place[2] - ground[:, 2]) / 5.0, atol=2e-3)
             some = ground[np.arange(32) * 186 // 31]
             values, vectors = np.linalg.eigh(np.cov(some.T))
-            normal = (
-                vectors[:, 0] * np.sign(vectors[2, 0]) if values[0] < 0.1 * values[1] else np.array([0.0, 0.0, 1.0])
-            )
+            normal = vectors[:, 0] * np.sign(vectors[2, 0])
+            if values[0] >= 0.1 * values[1]:
+                normal = np.array([0.0, 0.0, 1.0])
             bumpy += values[0] > 1e-5
             wanted = np.exp(-np.sum((turn.T @ normal)[:2] ** 2) / 0.2)
             got = (state["episode_sums"].numpy() - before)[world, upright] / 0.02

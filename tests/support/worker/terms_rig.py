@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Self
 
 import numpy as np
 import warp as wp
@@ -129,6 +131,30 @@ class Rig:
         self.structs = {WorldArrays: worlds, EpisodeArrays: episodes, BodyArrays: bodies} | (structs or {})
         self._signatures: dict[str, dict[str, Any]] = {}
         self._kernels = self._compile(terms, folder)
+
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[Self]:
+        """All arrays are afterwards as they were, whatever is written meanwhile."""
+        structs = [*self.structs.items(), (RobotArrays, self.robot)]
+        arrays = [(each, name, getattr(each, name)) for kind, each in structs for name in kind.cls.__annotations__]
+        before = [
+            (*each, each[-1].numpy().copy()) for each in arrays if isinstance(each[-1], wp.array) and each[-1].size
+        ]
+        yield self
+        for struct, name, array_of, values in before:
+            array_of.assign(values)
+            setattr(struct, name, array_of)
+
+    def root(self) -> SimpleNamespace:
+        """What the root is and does, by numpy."""
+        turn = matrix(self.q[:, ROOT + 3 : ROOT + 7])
+        yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+        linear, angular = self.qd[:, ROOT_DOF : ROOT_DOF + 3], self.qd[:, ROOT_DOF + 3 : ROOT_DOF + 6]
+        arm = np.einsum("wij,wj->wi", turn, self.bodies.coms.numpy()[:, ROOT_BODY])
+        origin = linear - np.cross(angular, arm)
+        seen = {"origin": origin, "linear": linear, "angular": angular}
+        own = {f"own_{name}": np.einsum("wji,wj->wi", turn, each) for name, each in seen.items()}
+        return SimpleNamespace(turn=turn, yaw=yaw, **seen, **own)
 
     def call(self, term: Any, element: int = 0, *, robot: RobotArrays | None = None, **numbers: Any) -> np.ndarray:
         """What a term gives in each world, shape ``(worlds,)`` or ``(worlds, numbers)``; a bool is 0 or 1.

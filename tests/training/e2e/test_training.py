@@ -57,14 +57,8 @@ def test_a_stopped_run_goes_on_at_the_next_iteration(server: Serving) -> None:
     steps = records[0]["env_steps"]
     assert [record["env_steps"] for record in records] == [steps * i for i in range(1, target + 1)]
 
-    again = server.muster("resume", job["run"])
-    assert again.returncode == 1 and f"complete at iteration {target}" in again.stderr
     missing = server.muster("resume", job["run"], "--checkpoint", "3")
     assert missing.returncode == 2 and "has no checkpoint of iteration 3" in missing.stderr
-    reseeded = server.muster("resume", job["run"], "--set", "train.seed=9", "--set", "train.iterations=9999")
-    assert reseeded.returncode == 2 and "train.seed" in reseeded.stderr
-    resized = server.muster("resume", job["run"], "--set", "train.worlds=5", "--set", "train.iterations=9999")
-    assert resized.returncode == 2 and "holds 32 worlds" in resized.stderr
     _check_damage(server, job["run"], target)
 
 
@@ -85,7 +79,7 @@ def _check_damage(server: Serving, run: str, target: int) -> None:
     detail = server.wait(json.loads(resumed.stdout)["jobId"], timeout=240)
     assert detail["status"] == "SUCCEEDED", detail["statusReason"]
     log = "\n".join(server.log(detail["id"]))
-    assert newest["name"] in log and "learner.pt has" in log
+    assert newest["name"] in log and "learner.pt has" in log and f"set aside as {newest['name']}.damaged" in log
     assert Path(f"{newest['path']}.damaged").is_dir()
 
 

@@ -140,8 +140,3 @@ def test_misuse_of_the_command_is_one_line(tmp_path: Path, arguments: list[str],
     done = call_muster("verify-resume", *arguments, home=tmp_path / "home")
     assert done.returncode == 2 and part in done.stderr, done.stderr
     assert len(done.stderr.splitlines()) == 1 and not (tmp_path / "home").exists()
-
-
-def test_help_tells_of_the_fault_and_has_an_example(tmp_path: Path) -> None:
-    shown = call_muster("verify-resume", "--help", home=tmp_path).stdout
-    assert "MUSTER_KILL_AT" in shown and "Example:" in shown

@@ -17,6 +17,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from PIL import Image
 
 from tests.support.waiting import wait_for
 from tests.support.worker.in_process import call_worker
@@ -65,9 +68,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 @pytest.fixture(scope="module")
 def messages(recorded: Recorded) -> dict[str, list[Any]]:
     """By topic, decoded by mcap-ros2-support, which shares no code with what wrote them."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
     found: dict[str, list[Any]] = {}
     with recorded.path.open("rb") as file:
         for decoded in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
@@ -112,9 +112,8 @@ def test_every_link_has_its_frame_in_a_world_of_its_own(recorded: Recorded, mess
         where, turn = pole.transform.translation, pole.transform.rotation
         # the pole hangs on the cart, 1 m above the ground, and turns about y
         np.testing.assert_allclose([where.x, where.y, where.z], [slider, 0.0, 1.0], atol=1e-6)
-        np.testing.assert_allclose(
-            [turn.x, turn.y, turn.z, turn.w], [0.0, np.sin(hinge / 2), 0.0, np.cos(hinge / 2)], atol=1e-6
-        )
+        turned = [turn.x, turn.y, turn.z, turn.w]
+        np.testing.assert_allclose(turned, [0.0, np.sin(hinge / 2), 0.0, np.cos(hinge / 2)], atol=1e-6)
 
 
 def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]) -> None:
@@ -129,8 +128,6 @@ def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]
 
 
 def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]]) -> None:
-    from PIL import Image
-
     message, *others = messages["/world_1/eye/image/compressed"]
     assert len(others) == STEPS - 1 and len(messages["/world_0/eye/image/compressed"]) == STEPS
     pixels = np.asarray(Image.open(io.BytesIO(bytes(message.data))))
@@ -139,8 +136,6 @@ def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]
 
 
 def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached(recorded: Recorded) -> None:
-    from mcap.reader import make_reader
-
     with recorded.path.open("rb") as file:
         reader = make_reader(file)
         assert reader.get_header().profile == "ros2"
@@ -157,8 +152,6 @@ def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached
 
 
 def test_an_episode_of_which_the_beginning_was_not_seen_is_not_complete(recorded: Recorded, tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
     recording = Recording(tmp_path / "late.mcap", recorded.stage, {}, {})
     for rows in recorded.rows[11:25]:  # the first of them ends an episode
         recording.write(rows)
@@ -185,9 +178,8 @@ def test_rerun_finds_nothing_wrong_with_the_file(recorded: Recorded, tmp_path: P
         pytest.skip("rerun-sdk (the extra [viz], 170 MB) is not installed: Rerun has not read the recording")
     checked = subprocess.run([rerun, "mcap", "check", recorded.path], capture_output=True, text=True, check=True)
     assert len([line for line in checked.stdout.splitlines() if line.startswith("ok")]) == 11, checked.stdout
-    subprocess.run(
-        [rerun, "mcap", "convert", recorded.path, "-o", tmp_path / "two.rrd"], check=True, capture_output=True
-    )
+    convert = [rerun, "mcap", "convert", recorded.path, "-o", tmp_path / "two.rrd"]
+    subprocess.run(convert, check=True, capture_output=True)
     assert (tmp_path / "two.rrd").stat().st_size > 10_000
 
 
@@ -204,16 +196,13 @@ def record_for_ever(path: Path) -> None:
 
 
 def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
     path, partial = tmp_path / "cut.mcap", tmp_path / "cut.mcap.partial"
     script = "import sys; from pathlib import Path; from tests.training.worker.test_recording import record_for_ever; "
     command = [sys.executable, "-c", f"{script}record_for_ever(Path(sys.argv[1]))", str(path)]
     process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
     begun = wait_for(lambda: partial.exists() and partial.stat().st_size, 60, "the recording's begin")
-    flushed = wait_for(
-        lambda: (size := partial.stat().st_size) > begun + 20_000 and size, 60, "some steps that were flushed"
-    )
+    size = lambda: partial.stat().st_size  # noqa: E731
+    flushed = wait_for(lambda: size() > begun + 20_000 and size(), 60, "some steps that were flushed")
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not path.exists()
@@ -228,9 +217,8 @@ def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
-        topics = {
-            channel.topic: summary.statistics.channel_message_counts[key] for key, channel in summary.channels.items()
-        }
+        counts = summary.statistics.channel_message_counts
+        topics = {channel.topic: counts[key] for key, channel in summary.channels.items()}
         assert len([each for each in reader.iter_metadata()]) > 0
     assert topics["/tf"] > 20 and topics["/tf"] - topics["/world_1/rl/step"] in (0, 1)
     assert topics["/world_0/scene"] == 1

@@ -18,7 +18,7 @@ from worker.tasks import find_task
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.config import TaskConfig
-from worker.tasks.humanoid import Humanoid
+from worker.tasks.humanoid import Humanoid, HumanoidConfig
 from worker.tasks.quadruped import Quadruped
 from worker.tasks.task import Task
 
@@ -229,6 +229,14 @@ def test_an_overflow_counts_in_the_control_step_in_which_it_was(cartpole: Cartpo
     observe(cartpole)
     observe(cartpole)
     assert statistics(cartpole)["solver_overflows"] == 2
+
+
+def test_random_humanoids_fall_and_stay_finite_within_the_solvers_capacity() -> None:
+    task = Humanoid(HumanoidConfig(), 32, seed=1)
+    steps = play(task, 120, seed=2)
+    assert all(step[0].isfinite().all() and step[1].isfinite().all() for step in steps)
+    totals = statistics(task)
+    assert totals["episodes"] > 32 and totals["solver_overflows"] == 0 and totals["nan_worlds"] == 0
 
 
 def test_tasks_are_found_by_name_or_refused_with_the_nearest() -> None:

@@ -79,35 +79,3 @@ def test_training_goes_on_while_the_volume_hangs_and_what_was_written_comes_afte
     told = [each["iteration"] for each in records if "iteration" in each]
     assert told == list(range(1, ITERATIONS + 1)), "every record came, in order"
     assert list_checkpoints(run)[-1].iteration == ITERATIONS
-
-
-def test_a_commit_follows_the_records_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that goes on from a checkpoint has the metrics up to it."""
-    loop = runner(training(tmp_path, iterations=6, every=3))
-    run = Store(tmp_path).run("run")
-    seen: dict[int, int] = {}
-    slow = loop.reporter.do
-
-    def watch() -> None:
-        over = False
-        while not over:
-            over = ended.is_set()  # and once more then
-            for each in list_checkpoints(run):
-                lines = (run.metrics / "metrics-e1.jsonl").read_text().splitlines()
-                seen.setdefault(
-                    each.iteration, max((json.loads(line).get("iteration", 0) for line in lines), default=0)
-                )
-            time.sleep(0.001)
-
-    def late(function, *arguments) -> None:
-        slow(time.sleep, 0.3)
-        slow(function, *arguments)
-
-    monkeypatch.setattr(loop.reporter, "do", late)
-    ended = threading.Event()
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    assert loop.train() == 0
-    ended.set()
-    watcher.join()
-    assert seen.keys() == {3, 6} and all(recorded >= iteration for iteration, recorded in seen.items())
