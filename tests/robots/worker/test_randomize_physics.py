@@ -10,6 +10,7 @@ import pytest
 
 from tests.support.worker.randomized_worlds import ARM, TIMESTEP, WORLDS, build_arm, build_worlds, randomize
 from worker.simulation.actuators import ExplicitPDActuator
+from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot import Robot
 from worker.simulation.worlds import Worlds
 from worker.tasks.randomize import Randomize
@@ -102,6 +103,10 @@ def arm_model(drawn: Callable[[str], float], without: str = "") -> mujoco.MjMode
     return model
 
 
+def drawn_in(randomizations: Randomizations, world: int) -> dict[str, float]:
+    return dict(zip(randomizations.names, randomizations.draws[world].tolist(), strict=True))
+
+
 def test_an_arm_moves_as_in_mujoco_and_every_quantity_has_its_share() -> None:
     worlds, view = build_arm()
     randomizations = randomize(ENTRIES, worlds, view)
@@ -117,8 +122,7 @@ def test_an_arm_moves_as_in_mujoco_and_every_quantity_has_its_share() -> None:
     got = worlds.arrays.joint_q.numpy()
     shares = dict.fromkeys(ENTRIES, 0.0)
     for world in range(WORLDS):
-        row = randomizations.draws[world].tolist()
-        drawn = dict(zip(randomizations.names, row, strict=True)).__getitem__
+        drawn = drawn_in(randomizations, world).__getitem__
         expected = run_reference(arm_model(drawn), worlds, q[world], v[world], controls[world], steps)
         np.testing.assert_allclose(got[world], expected, atol=1e-4)
         for name in ENTRIES:
@@ -131,12 +135,22 @@ def test_what_mujoco_derives_from_masses_follows() -> None:
     worlds, view = build_arm()
     randomizations = randomize(ENTRIES, worlds, view)
     for world in range(WORLDS):
-        drawn = dict(zip(randomizations.names, randomizations.draws[world].tolist(), strict=True)).__getitem__
+        drawn = drawn_in(randomizations, world).__getitem__
         model = arm_model(drawn)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         for name in ("body_subtreemass", "body_invweight0", "dof_invweight0"):
             got = getattr(worlds.solver.mjw_model, name).numpy()[world]
             np.testing.assert_allclose(got, getattr(model, name), rtol=2e-4, err_msg=name)
+
+
+def thrown(worlds: Worlds, start: np.ndarray, velocity: np.ndarray, center: np.ndarray, steps: int) -> np.ndarray:
+    """Where bodies get to, from a place and velocities as MuJoCo has them: Newton's are those of the centre of mass."""
+    joint_q, linear = start[[0, 1, 2, 4, 5, 6, 3]], velocity[:, :3] + np.cross(velocity[:, 3:], center)
+    worlds.arrays.joint_q.assign(np.tile(joint_q, (WORLDS, 1)).astype(np.float32))
+    worlds.arrays.joint_qd.assign(np.hstack([linear, velocity[:, 3:]]).astype(np.float32))
+    for _ in range(steps):
+        worlds.simulate()
+    return worlds.arrays.joint_q.numpy()[:, [0, 1, 2, 6, 3, 4, 5]]
 
 
 FEET = ("left", "right", "rear")
@@ -158,28 +172,19 @@ def test_a_sled_slides_as_in_mujoco(operation: str) -> None:
     changed = worlds.solver.mjw_model.geom_friction.numpy()
     assert changed.shape[1] == len(own) and not np.allclose(changed[0], changed[1])
     velocity = np.array([[1.2, 0.4, 0, 0, 0, 1.5], [0.8, -0.7, 0, 0, 0, -2.0]])
-    steps, moved = 60, []
-    center = worlds.model.body_com.numpy()
-    q = np.tile([0, 0, 0.0199, 1, 0, 0, 0], (WORLDS, 1))
-    joint_q = np.tile([0, 0, 0.0199, 0, 0, 0, 1], (WORLDS, 1))
-    # Newton's velocity is that of the centre of mass, MuJoCo's that of the body's origin.
-    linear = velocity[:, :3] + np.cross(velocity[:, 3:], center[:WORLDS])
-    worlds.arrays.joint_q.assign(joint_q.astype(np.float32))
-    worlds.arrays.joint_qd.assign(np.hstack([linear, velocity[:, 3:]]).astype(np.float32))
-    for _ in range(steps):
-        worlds.simulate()
+    start, steps, moved = np.array([0, 0, 0.0199, 1, 0, 0, 0]), 60, []
+    got = thrown(worlds, start, velocity, worlds.model.body_com.numpy()[:WORLDS], steps)
     for world in range(WORLDS):
-        drawn = dict(zip(randomizations.names, randomizations.draws[world].tolist(), strict=True)).__getitem__
+        drawn = drawn_in(randomizations, world).__getitem__
         model = mujoco.MjModel.from_xml_string(SLED.format(ground=FLOOR, actuator=""))
-        unchanged = run_reference(model, worlds, q[world], velocity[world], np.zeros(0), steps)
+        unchanged = run_reference(model, worlds, start, velocity[world], np.zeros(0), steps)
         model.geom("floor").friction = [drawn("ground/ground_plane/slide"), *own[-1][1:]]
         for foot in FEET:
             numbers = np.array([drawn(f"feet/{foot}/{axis}") for axis in ("slide", "torsion")])
             model.geom(foot).friction[:2] = numbers * (model.geom(foot).friction[:2] if operation == "scale" else 1)
         model.opt.gravity[2] *= drawn("gravity/gravity/z")
-        expected = run_reference(model, worlds, q[world], velocity[world], np.zeros(0), steps)
-        got = worlds.arrays.joint_q.numpy()[world]
-        np.testing.assert_allclose(got[[0, 1, 2, 6, 3, 4, 5]], expected, atol=3e-4)
+        expected = run_reference(model, worlds, start, velocity[world], np.zeros(0), steps)
+        np.testing.assert_allclose(got[world], expected, atol=3e-4)
         moved.append(np.abs(unchanged - expected).max())
     assert min(moved) > 0.01
 
@@ -196,13 +201,8 @@ def test_an_object_alone_on_its_joint_tumbles_about_its_new_center() -> None:
     own = worlds.solver.mjw_model.body_inertia.numpy()[0, 1]
     entry = Randomize("center_of_mass", bodies="cube", range=(-0.04, 0.04), operation="add")
     center = randomize({"center": entry}, worlds, view).draws.double().numpy()
-    velocity = np.array([0.3, -0.2, 2.0, 3.0, -4.0, 5.0])
-    linear = velocity[:3] + np.cross(velocity[3:], center)  # Newton's is that of the centre of mass
-    start = np.tile([0, 0, 1, 0, 0, 0, 1], (WORLDS, 1))
-    worlds.arrays.joint_q.assign(start.astype(np.float32))
-    worlds.arrays.joint_qd.assign(np.hstack([linear, np.tile(velocity[3:], (WORLDS, 1))]).astype(np.float32))
-    for _ in range(60):
-        worlds.simulate()
+    start, velocity = np.array([0, 0, 1, 1, 0, 0, 0]), np.array([0.3, -0.2, 2.0, 3.0, -4.0, 5.0])
+    got = thrown(worlds, start, np.tile(velocity, (WORLDS, 1)), center, 60)
     moments = {"x": 0.07**2 + 0.05**2, "y": 0.1**2 + 0.05**2, "z": 0.1**2 + 0.07**2}  # of a box of 2 kg, times 3 / 2
     diagonal = [2.0 / 3.0 * moment for moment in moments.values()]
     np.testing.assert_allclose(np.sort(own), np.sort(diagonal), rtol=1e-5)
@@ -210,9 +210,8 @@ def test_an_object_alone_on_its_joint_tumbles_about_its_new_center() -> None:
         at, inertia = (" ".join(map(str, values)) for values in (center[world], diagonal))
         inertial = f'<inertial pos="{at}" mass="2" diaginertia="{inertia}"/>'
         model = mujoco.MjModel.from_xml_string(CUBE.format(inertial=inertial, actuator=""))
-        expected = run_reference(model, worlds, np.array([0, 0, 1, 1, 0, 0, 0]), velocity, np.zeros(0), 60)
-        got = worlds.arrays.joint_q.numpy()[world]
-        np.testing.assert_allclose(got[[0, 1, 2, 6, 3, 4, 5]], expected, atol=1e-4)
+        expected = run_reference(model, worlds, start, velocity, np.zeros(0), 60)
+        np.testing.assert_allclose(got[world], expected, atol=1e-4)
 
 
 def test_explicit_motors_have_the_drawn_gains_and_limits() -> None:
@@ -232,7 +231,7 @@ def test_explicit_motors_have_the_drawn_gains_and_limits() -> None:
     for _ in range(steps):
         worlds.simulate()
     for world in range(WORLDS):
-        drawn = dict(zip(randomizations.names, randomizations.draws[world].tolist(), strict=True))
+        drawn = drawn_in(randomizations, world)
         kp = 12.0 * np.array([drawn[f"stiffness/{name}"] for name in JOINTS])
         kd = 0.6 + np.array([drawn[f"damping/{name}"] for name in JOINTS])
         limit, strength = np.array([drawn["limit/shoulder"], 6, 6, 6]), np.array([1, drawn["strength/elbow"], 1, 1])

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from tests.support.worker.robots import build
 from worker.simulation.actuators import (
@@ -165,12 +163,6 @@ def test_numbers_by_pattern_of_joints():
     assert view.efforts == [math.inf, math.inf]
 
 
-def test_gains_of_the_model_can_be_changed_in_each_world():
-    _, worlds = wheels(ExplicitPDActuator("*", 10.0, 0.0), worlds=2)
-    worlds.model.muster.stiffness.assign(np.float32([10.0, 20.0, 30.0, 40.0]))
-    np.testing.assert_allclose(force_of(worlds, (0.1, 0.1)), [[1.0, 2.0], [3.0, 4.0]], rtol=1e-4)
-
-
 def test_the_actuators_of_a_file_are_kept_and_follow_the_controls():
     actuators = '<position joint="right_axle" kp="5"/><motor joint="left_axle" gear="2" ctrlrange="-3 3"/>'
     text = WHEELS.format(left="").replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
@@ -182,14 +174,6 @@ def test_the_actuators_of_a_file_are_kept_and_follow_the_controls():
     worlds.arrays.controls.assign(np.float32([[0.4, 0.5]]))
     worlds.simulate()
     np.testing.assert_allclose(worlds.arrays.drives.numpy()[0], [1.0, 2.0], rtol=1e-5)
-
-
-def test_launches_after_each_physics_step():
-    _, worlds = wheels(EffortActuator("*"), substeps=3)
-    seen = []
-    worlds.after_substep.append(lambda: seen.append(float(worlds.solver.mjw_data.time.numpy()[0])))
-    worlds.simulate()
-    np.testing.assert_allclose(seen, [STEP, 2 * STEP, 3 * STEP], rtol=1e-5)
 
 
 def test_a_step_with_motors_and_delays_is_recorded_once_and_replayed():
@@ -211,16 +195,3 @@ def test_a_step_with_motors_and_delays_is_recorded_once_and_replayed():
         direct.simulate()
         wp.capture_launch(capture.graph)
     np.testing.assert_array_equal(replayed.arrays.joint_q.numpy(), direct.arrays.joint_q.numpy())
-
-
-def test_a_builder_whose_actuators_were_not_declared_here_has_no_drives():
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
-    text = WHEELS.format(left="").replace("</mujoco>", '<actuator><motor joint="left_axle"/></actuator></mujoco>')
-    builder.add_mjcf(text, ctrl_direct=True)
-
-    class Plain:
-        def add_to(self, template):
-            template.add_builder(builder)
-
-    assert build(Plain(), ground=False)[1].drives is None

@@ -204,15 +204,6 @@ def test_an_impossible_configuration_is_refused_in_one_line(build: Any, parts: l
     assert all(part in said for part in parts), said
 
 
-def test_a_field_outside_memory_is_refused_before_it_is_built() -> None:
-    terrain = Terrain(resolution=0.0005)
-    said = r"10 x 7 patches at 0\.0005 m have 17,920,\d\d\d,001 heights, .*GiB.* use a resolution of at least"
-    with pytest.raises(ValueError, match=said):
-        terrain.check_memory("cpu")
-    assert "heights" not in vars(terrain), "nothing was computed"
-    Terrain().check_memory("cpu")
-
-
 def test_shapes_are_one_a_kind_and_boxes_where_the_ground_is_level() -> None:
     scene = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(scene)

@@ -80,20 +80,13 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        ("train.task=Ant", ["train.task is 'Cartpole' and can't become 'Ant'"]),
         ("train.seed=9", ["train.seed is 1 and can't become 9"]),
-        ("train.config={cart_limit: 5.0}", ["train.config is {} and can't become {'cart_limit': 5.0}"]),
-        ("train.config={cart_limt: 5.0}", ["train.config.cart_limt: CartpoleConfig has no such key; did you mean"]),
         ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is not set and can't become [8]", "has learnt"]),
-        ("train.ppo.activation=relu", ["train.ppo.activation is not set and can't become 'relu'"]),
-        ("train.ppo.init_std=0.5", ["train.ppo.init_std is not set and can't become 0.5", "has learnt"]),
         ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 node × 1 rank × 9)", "leave train.worlds"]),
         ("nodes=9", ["8 worlds can't be distributed over 9 ranks; use fewer nodes"]),
     ],
 )
-def test_another_task_seed_network_or_number_of_worlds(
-    served: tuple[Serving, str], change: str, parts: list[str]
-) -> None:
+def test_another_seed_network_or_number_of_worlds(served: tuple[Serving, str], change: str, parts: list[str]) -> None:
     said = refused(served, 2, "--set", change)
     assert all(part in said for part in (served[1], *parts)), said
 
@@ -104,10 +97,9 @@ def test_a_learning_rate_that_the_checkpoint_s_job_had_and_that_has_adapted_sinc
     rate = newest.manifest["learning_rate"]
     edit_manifest(newest, learning_rate=4e-4)
     try:
-        for form in ("train.ppo.learning_rate=1.0e-3", "train.ppo={learning_rate: 0.001}"):
-            said = refused(served, 2, "--set", form)
-            assert "train.ppo.learning_rate is 0.001 already" in said and "which is 0.0004 now" in said, said
-            assert "or train.ppo.schedule=fixed" in said
+        said = refused(served, 2, "--set", "train.ppo.learning_rate=1.0e-3")
+        assert "train.ppo.learning_rate is 0.001 already" in said and "which is 0.0004 now" in said, said
+        assert "or train.ppo.schedule=fixed" in said
     finally:
         edit_manifest(newest, learning_rate=rate)
 
