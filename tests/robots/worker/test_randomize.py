@@ -32,19 +32,25 @@ MIXED = {
     "strength": Randomize("motor_strength", actuators="*", range=(0.8, 1.2), shared=True, when="reset"),
     "weaker": Randomize("motor_strength", actuators="wrist", range=(0.4, 0.6), when="reset"),
 }
-FIELDS = (
+FIELDS = [
     "body_mass",
     "body_inertia",
     "body_ipos",
-    "dof_armature",
-    "actuator_gainprm",
-    "dof_invweight0",
     "body_invweight0",
-)
+    "dof_armature",
+    "dof_invweight0",
+    "actuator_gainprm",
+]
 
 
 def fields(worlds: Worlds) -> dict[str, np.ndarray]:
     return {name: getattr(worlds.solver.mjw_model, name).numpy().copy() for name in FIELDS}
+
+
+def mixed(count: int = 2, **keys: int) -> tuple[Worlds, EpisodeArrays, Randomizations]:
+    """Arms with all of :data:`MIXED`."""
+    (worlds, view), episodes = build_arm(count), build_episodes(count, **keys)
+    return worlds, episodes, randomize(MIXED, worlds, view, episodes)
 
 
 def set_ages(episodes: EpisodeArrays, ages: list[int]) -> None:
@@ -73,42 +79,35 @@ def test_draws_fill_their_ranges_and_follow_their_distributions() -> None:
     for drawn, low, high in ((mass, 0.5, 2.0), (damping, 1.0, 3.0)):
         assert low <= drawn.min() < low + 0.02 * (high - low) and high - 0.02 * (high - low) < drawn.max() <= high
     # 4 standard deviations of each statistic
-    assert abs(np.log(mass).mean()) < 4 * np.log(4) / np.sqrt(12 * 400) and abs(damping.mean() - 2) < 4 * 2 / np.sqrt(
-        12 * 400
-    )
+    assert abs(np.log(mass).mean()) < 4 * np.log(4) / np.sqrt(12 * 400)
+    assert abs(damping.mean() - 2) < 4 * 2 / np.sqrt(12 * 400)
     assert abs(bias.mean() - 0.2) < 4 * 0.05 / 20 and abs(bias.std() - 0.05) < 4 * 0.05 / np.sqrt(800)
     assert abs(np.corrcoef([mass, damping, bias])[np.triu_indices(3, 1)]).max() < 0.2
 
 
 def test_what_a_world_draws_does_not_depend_on_how_many_there_are_or_on_later_entries() -> None:
-    worlds, view = build_arm(4)
-    whole_episodes = build_episodes(4)
-    whole = randomize(MIXED, worlds, view, whole_episodes)
+    _, whole_episodes, whole = mixed(4)
     set_ages(whole_episodes, [0, 1, 0, 0])
     whole.settle()
-    part_worlds, part_view = build_arm(2)
-    part_episodes = build_episodes(2, first_world=2)
-    part = randomize(MIXED, part_worlds, part_view, part_episodes)
+    _, part_episodes, part = mixed(2, first_world=2)
     set_ages(part_episodes, [0, 0])
     part.settle()
     assert torch.equal(whole.draws[2:], part.draws)
     assert len(set(whole.draws[:, 0].tolist())) == 4
-    alone = randomize({"mass": MIXED["mass"]}, part_worlds, part_view, build_episodes(2, first_world=2))
+    alone = randomize({"mass": MIXED["mass"]}, *build_arm(2), build_episodes(2, first_world=2))
     assert torch.equal(alone.draws, part.draws[:, columns(part, "mass")])
 
 
 def test_entries_apply_in_order_to_the_models_own_values_and_never_compound() -> None:
     worlds, view = build_arm()
     own = fields(worlds)
-    episodes = build_episodes()
     entries = {
         "more": Randomize("mass", bodies="fore", range=(1.0, 2.0), when="reset"),
         "load": Randomize("mass", bodies="fore", range=(0.1, 0.2), operation="add", when="reset"),
         "strength": MIXED["strength"],
         "weaker": MIXED["weaker"],
     }
-    robot = view.arrays(worlds)
-    randomizations = randomize(entries, worlds, view, episodes, robot)
+    randomizations = randomize(entries, worlds, view)
     seen = set()
     for _ in range(5):
         randomizations.settle()
@@ -156,18 +155,14 @@ def test_a_startup_stays_a_reset_comes_with_an_episode_and_an_interval_in_its_ti
 
 
 def test_a_resumed_run_goes_on_bit_for_bit() -> None:
-    worlds, view = build_arm()
-    episodes = build_episodes()
-    randomizations = randomize(MIXED, worlds, view, episodes)
+    worlds, episodes, randomizations = mixed()
     play(randomizations, episodes, range(7))
     saved = {name: tensor.clone() for name, tensor in randomizations.state_tensors().items()}
     random = episodes.random.numpy().copy()
     assert all(len(tensor) == 2 for tensor in saved.values())
     play(randomizations, episodes, range(7, 30))
 
-    other_worlds, other_view = build_arm()
-    other_episodes = build_episodes(seed=99)
-    other = randomize(MIXED, other_worlds, other_view, other_episodes)
+    other_worlds, other_episodes, other = mixed(seed=99)
     other_episodes.random.assign(random)
     for name, tensor in other.state_tensors().items():
         tensor.copy_(saved[name])
@@ -183,9 +178,7 @@ def test_a_resumed_run_goes_on_bit_for_bit() -> None:
 def test_a_captured_step_equals_its_launches() -> None:
     results = []
     for captured in (False, True):
-        worlds, view = build_arm()
-        episodes = build_episodes()
-        randomizations = randomize(MIXED, worlds, view, episodes)
+        worlds, episodes, randomizations = mixed()
         settle = randomizations.settle
         if captured:
             settle()
@@ -201,9 +194,7 @@ def test_a_captured_step_equals_its_launches() -> None:
 
 
 def test_ranges_are_numbers_that_may_change_while_worlds_run() -> None:
-    worlds, view = build_arm()
-    episodes = build_episodes()
-    randomizations = randomize(MIXED, worlds, view, episodes)
+    _, _, randomizations = mixed()
     numbers = randomizations.numbers()
     assert {name: tuple(tensor.shape) for name, tensor in numbers.items()} == {
         "mass.range": (1, 2),
@@ -299,9 +290,8 @@ def test_inverse_weights_follow_the_masses_as_in_mujoco(kind: str) -> None:
         with open(newton.examples.get_asset("nv_humanoid.xml")) as file:
             text = re.sub("<sensor>.*</sensor>", "", file.read(), flags=re.DOTALL)  # MuJoCo refuses the file's own
     worlds, view = build_worlds(text, njmax=120, nconmax=60)
-    episodes = build_episodes()
     entries = {"mass": Randomize("mass", bodies="*", range=(0.3, 3.0), when="reset")}
-    randomizations = randomize(entries, worlds, view, episodes)
+    randomizations = randomize(entries, worlds, view)
     step = CapturedStep(randomizations.settle, "cpu")
     for _ in range(2):
         step.launch()

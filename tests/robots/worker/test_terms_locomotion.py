@@ -12,17 +12,7 @@ import pytest
 import warp as wp
 
 from tests.support.refusals import refusal
-from tests.support.worker.terms_rig import (
-    JOINTS,
-    ROOT,
-    WORLDS,
-    Rig,
-    array,
-    close,
-    matrix,
-    rotations,
-    terms_of,
-)
+from tests.support.worker.terms_rig import JOINTS, ROOT, WORLDS, Rig, array, close, matrix, rotations, terms_of
 from worker.simulation.sensors.contact import ContactArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays

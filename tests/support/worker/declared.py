@@ -101,7 +101,7 @@ class SmallConfig(TaskConfig):
 class Small(DeclaredTask):
     """A robot that is asked for nothing; a subclass names its file, and the sections of the declaration that matter."""
 
-    config_type: type[SmallConfig] = SmallConfig
+    config_type = SmallConfig
     text = MODEL
 
     def robot(self, config: SmallConfig) -> Robot:

@@ -35,18 +35,6 @@ def ant() -> Ant:
     return Ant(AntConfig(episode_seconds=0.5), 8, seed=1)
 
 
-def test_sizes_names_and_types(cartpole: Cartpole, ant: Ant) -> None:
-    assert (cartpole.observation_shape, cartpole.action_size, cartpole.max_episode_length) == ((4,), 1, 300)
-    assert (ant.observation_shape, ant.action_size) == ((35,), 8)
-    assert Ant.config_type().episode_seconds * Ant.config_type().control_hz == 960
-    for task in (cartpole, ant):
-        assert task.captured
-        assert task.observations.shape == task.terminal_observations.shape == (8, *task.observation_shape)
-        assert task.rewards.shape == task.dones.shape == task.time_outs.shape == task.episode_length.shape == (8,)
-        assert task.dones.dtype == task.time_outs.dtype == torch.bool and task.statistics.dtype == torch.float64
-        assert len(task.statistic_names) == len(task.statistics)
-
-
 def test_time_out_is_not_termination(cartpole: Cartpole) -> None:
     """World 0 falls, 1 times out, 2 falls in its last step, 3 goes on; the rest are young."""
     put(
