@@ -66,7 +66,7 @@ JOINTS = ("shoulder", "elbow", "wrist", "slide")
 
 
 def arm_model(drawn: Callable[[str], float], without: str = "") -> mujoco.MjModel:
-    """The arm as MuJoCo compiles it, edited by hand, but for one entry: payload and stretched hand are geoms in its file."""
+    """The arm as MuJoCo compiles it, edited by hand but for one entry; payload and stretched hand are geoms of its file."""
 
     def of(place: str, own: float = 1.0) -> float:
         return own if place.partition("/")[0] == without else drawn(place)

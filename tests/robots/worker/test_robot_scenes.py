@@ -1,4 +1,4 @@
-"""Robots of other formats, several with objects in one world, who touches whom; real robots move as in MuJoCo's own engine."""
+"""Robots of other formats, several with objects in one world, who touches whom; real robots move as in MuJoCo itself."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def _collide(geom: mujoco.MjsGeom) -> None:
 
 
 def touching_pairs(model: mujoco.MjModel, names: list[str]) -> set[frozenset[str]]:
-    """Pairs of geoms that MuJoCo lets collide: masks, bodies that move, are not welded together or parent and child, excluded pairs."""
+    """Pairs of geoms that MuJoCo lets collide: what masks, welds, parents and excluded pairs leave of bodies that move."""
     excluded = {int(signature) for signature in model.exclude_signature}
     pairs = set()
     for first in range(model.ngeom):

@@ -1,4 +1,4 @@
-"""A volume that hangs, and a stop in an iteration that takes longer than a stopped job has: what is lost is that iteration alone."""
+"""A volume that hangs, and a stop in an iteration that takes longer than a stopped job has: that iteration alone is lost."""
 
 from __future__ import annotations
 
