@@ -18,8 +18,8 @@ from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, tensors, train
 from worker.errors import UserError
-from worker.learning import loop as loops
 from worker.learning.algorithms import installed
+from worker.learning.loop import Loop
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO
 
@@ -140,15 +140,8 @@ class Renamed(Point):
     observation_names = ("place", "speed")
 
 
-def begin(store: Path, task: Any = Point, **settings: Any) -> loops.Loop:
-    from shared_store.epoch import raise_epoch
-    from worker.distributed import Gang, Placement
-    from worker.learning.job import Job, StopRequest
-    from worker.learning.training import Training
-
-    job = Job.from_env(training(store, run="clone", **settings), "train")
-    raise_epoch(job.run, 1)
-    return loops.Loop(Training.of(job, task), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
+def begin(store: Path, task: Any = Point, **settings: Any) -> Loop:
+    return runner(training(store, run="clone", **settings), task=task)
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,13 @@ def go_on(store: Path, run: str, settings: dict[str, Any], **changes: Any) -> Lo
     return loop
 
 
+@pytest.fixture(scope="module")
+def unchanged(store: Path) -> dict[str, Any]:
+    """The learner of each run that goes on with its own settings."""
+    own = {"sac": SAC_RUN, "rsl": PPO_RUN, "pupil": PUPIL_RUN}
+    return {run: go_on(store, run, settings).algorithm for run, settings in own.items()}
+
+
 # -- sac --------------------------------------------------------------------------------------------------------------
 
 
@@ -104,9 +111,11 @@ def test_every_setting_of_sac_is_in_one_of_the_two_tables() -> None:
 
 
 @pytest.mark.parametrize("name", SAC_APPLIED)
-def test_a_setting_of_sac_that_is_accepted_is_what_the_learner_uses(store: Path, name: str) -> None:
+def test_a_setting_of_sac_that_is_accepted_is_what_the_learner_uses(
+    store: Path, unchanged: dict[str, Any], name: str
+) -> None:
     value, used = SAC_APPLIED[name]
-    before, after = go_on(store, "sac", SAC_RUN).algorithm, go_on(store, "sac", {**SAC_RUN, name: value}).algorithm
+    before, after = unchanged["sac"], go_on(store, "sac", {**SAC_RUN, name: value}).algorithm
     assert isinstance(before, SAC) and isinstance(after, SAC)
     assert used(before) != pytest.approx(value) and used(after) == pytest.approx(value)
 
@@ -207,10 +216,12 @@ def test_every_setting_of_rsl_rl_is_in_one_of_the_tables() -> None:
 @pytest.mark.parametrize(
     ("run", "key"), [*(("rsl", key) for key in RSL_APPLIED), *(("pupil", key) for key in PUPIL_APPLIED)]
 )
-def test_a_setting_of_rsl_rl_that_is_accepted_is_what_the_learner_uses(store: Path, run: str, key: str) -> None:
+def test_a_setting_of_rsl_rl_that_is_accepted_is_what_the_learner_uses(
+    store: Path, unchanged: dict[str, Any], run: str, key: str
+) -> None:
     value, used = (RSL_APPLIED if run == "rsl" else PUPIL_APPLIED)[key]
-    settings = PPO_RUN if run == "rsl" else PUPIL_RUN
-    before, after = (go_on(store, run, each).algorithm for each in (settings, with_value(settings, key, value)))
+    settings = with_value(PPO_RUN if run == "rsl" else PUPIL_RUN, key, value)
+    before, after = unchanged[run], go_on(store, run, settings).algorithm
     assert isinstance(before, RslRl) and isinstance(after, RslRl)
     assert used(before) != value and used(after) == value
 

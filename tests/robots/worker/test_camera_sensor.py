@@ -12,6 +12,7 @@ import pytest
 import torch
 import warp as wp
 
+from tests.support.refusals import refusal
 from tests.support.worker.sensing import Reference, scene
 from worker.simulation.sensors.camera import Camera, CameraSensor
 from worker.simulation.sensors.sensor import SensorContext
@@ -50,9 +51,7 @@ def turn(context: SensorContext, *joints: tuple[float, float]) -> None:
     context.worlds.arrays.joint_q.assign(positions)
 
 
-def camera(
-    context: SensorContext, name: str = "front", randomize: Randomization | None = None, **options: Any
-) -> Camera:
+def camera(context: SensorContext, name: str = "front", randomize: Any = None, **options: Any) -> Camera:
     """A camera whose streams are drawn, and its first picture."""
     built = CameraSensor(**SIZE | options).build(dataclasses.replace(context, name=name))
     built.begin(randomize or Randomization())
@@ -98,11 +97,9 @@ def test_depth_and_names_are_those_of_mujocos_rays_from_a_site_that_moves(contex
     depth = camera(context, **options, kind="depth", near=0.0)
     names = camera(context, **options, kind="segmentation")
     assert names.names == ("robot", "cube", "ground")
-    reference = Reference(
-        ARM.replace("<worldbody>", '<worldbody><geom name="plane" type="plane" size="0 0 1"/>').replace(
-            "</worldbody>", CUBE.partition("<worldbody>")[2].partition("</worldbody>")[0] + "</worldbody>"
-        )
-    )
+    cube = CUBE.partition("<worldbody>")[2].partition("</worldbody>")[0]
+    ground = '<worldbody><geom name="plane" type="plane" size="0 0 1"/>'
+    reference = Reference(ARM.replace("<worldbody>", ground).replace("</worldbody>", f"{cube}</worldbody>"))
     for world, joints in enumerate(((0.2, 0.1), (-0.3, 0.35))):
         reference.data.qpos[:2] = joints
         mujoco.mj_kinematics(reference.model, reference.data)
@@ -175,9 +172,8 @@ def test_an_episodes_first_image_stands_for_those_before_it(context: SensorConte
         before = stacked.images.clone()
         turn(context, (0.1 * step, 0.0), (0.1 * step, 0.0))
         take(context, stacked, ages=(step, 0 if step == 3 else step))
-        assert torch.equal(stacked.images[0, 3:], before[0, :6]) and not torch.equal(
-            stacked.images[0, :3], before[0, :3]
-        )
+        assert torch.equal(stacked.images[0, 3:], before[0, :6])
+        assert not torch.equal(stacked.images[0, :3], before[0, :3])
     assert all(torch.equal(stacked.images[1, :3], stacked.images[1, part : part + 3]) for part in (3, 6))
 
 
@@ -187,12 +183,7 @@ def test_mounts_differ_from_world_to_world_within_their_limits(context: SensorCo
     plain = camera(context, body="arm").arrays.poses.numpy()
     found = camera(context, body="arm", **ranges).arrays.poses.numpy()
     shift = np.abs(found - plain)[:, :3]
-    assert (
-        (shift[:, 0] <= 0.1).all()
-        and (shift[:, 1] < 1e-6).all()
-        and (shift[:, 2] <= 0.05).all()
-        and (shift[:, 0] > 0).all()
-    )
+    assert (shift <= (0.1, 1e-6, 0.05)).all() and (shift[:, 0] > 0).all()
     turned = 2 * np.arccos(np.clip(np.abs((found[:, 3:] * plain[:, 3:]).sum(1)), 0, 1))
     assert (turned > 1e-3).all() and (turned <= 0.2 * math.sqrt(3) + 1e-3).all()
     assert not np.allclose(found[0], found[1])
@@ -227,26 +218,21 @@ def test_each_episode_may_draw_a_new_mount(context: SensorContext) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"body": "amr"}, "no body of robot matches 'amr'; did you mean arm\\?"),
-        ({"body": "arm", "robot": "robt"}, "CameraSensor.robot: there is no robot 'robt'; did you mean robot\\?"),
+        ({"body": "amr"}, "no body of robot matches 'amr'; did you mean arm?"),
+        ({"body": "arm", "robot": "robt"}, "CameraSensor.robot: there is no robot 'robt'; did you mean robot?"),
         ({"site": "*e", "body": "arm"}, "CameraSensor: give either body or site, and not both"),
-        ({"kind": "gray"}, "CameraSensor.kind: there is no kind 'gray'; did you mean grey\\?"),
+        ({"kind": "gray"}, "CameraSensor.kind: there is no kind 'gray'; did you mean grey?"),
         ({"width": 0}, "CameraSensor.width: expected a whole number from 1 to 1024, found 0"),
-        ({"fov": 180.0}, r"CameraSensor.fov: expected an angle between 0 and pi \[rad\], found 180.0"),
+        ({"fov": 180.0}, "CameraSensor.fov: expected an angle between 0 and pi [rad], found 180.0"),
         ({"kind": "depth", "near": 2.0, "far": 1.0}, "CameraSensor.near and far: expected 0 <= near < far"),
         ({"kind": "depth", "samples": 4}, "CameraSensor.samples: depth takes one ray per pixel"),
-        (
-            {"kind": "segmentation", "of": ("cub",)},
-            "CameraSensor.of: there is no robot or object 'cub'; did you mean cube\\?",
-        ),
+        ({"kind": "segmentation", "of": ("cub",)}, "of: there is no robot or object 'cub'; did you mean cube?"),
         ({"of": ("cube",)}, "CameraSensor.of: only a segmentation takes it, and kind is color"),
-        ({"target": (0.0, 0.0, 0.0)}, r"CameraSensor.target: the camera stands there, at \[0.0, 0.0, 0.0\]"),
+        ({"target": (0.0, 0.0, 0.0)}, "CameraSensor.target: the camera stands there, at [0.0, 0.0, 0.0]"),
         ({"target": (1.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0)}, "give either target or rotation"),
         ({"rotation": (0.0, 0.0, 0.0, 0.0)}, "CameraSensor.rotation: expected a quaternion xyzw"),
         ({"angle_range": -0.1}, "CameraSensor.angle_range: expected 0 or more, found -0.1"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_in_one_line(context: SensorContext, options: dict, words: str) -> None:
-    with pytest.raises(ValueError, match=words) as refusal:
-        CameraSensor(**options).build(context)
-    assert "\n" not in str(refusal.value)
+    assert words in refusal(lambda: CameraSensor(**options).build(context))

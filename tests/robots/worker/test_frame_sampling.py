@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,59 +10,28 @@ import pytest
 import torch
 import warp as wp
 
-from worker.tasks import (
-    Action,
-    Command,
-    Declaration,
-    DeclaredTask,
-    EpisodeArrays,
-    Metric,
-    Observation,
-    Reward,
-    Robot,
-    TaskConfig,
-    Term,
-    Termination,
-    reward_weights,
-    terms,
-)
+from tests.support.worker.declared import Small, SmallConfig
+from worker.tasks import Command, EpisodeArrays, Metric, Observation, Term, Termination, terms
 
 ROBOT = """<mujoco><option gravity="0 0 0"/><worldbody><body name="base" pos="0 0 1"><freejoint/>
   <geom type="sphere" size="0.1" mass="1" contype="0" conaffinity="0"/>
   <body name="arm" pos="0.2 0 0"><joint name="hinge" axis="0 0 1"/>
     <geom type="sphere" size="0.1" mass="1" contype="0" conaffinity="0"/></body></body></worldbody>
 <actuator><motor joint="hinge"/></actuator></mujoco>"""
-HZ, SECONDS, WORLDS = 10, 4, 64
+HZ, SECONDS, WORLDS = int(SmallConfig.control_hz), 4, 64
 
 
-@pytest.fixture(scope="module")
-def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("motion") / "turning.npz"
+def motion(path: Path) -> Path:
+    """A file in which the hinge turns and nothing else moves."""
     frames = HZ * SECONDS
     still = np.zeros((frames, 2, 3), np.float32)
     places = np.tile(np.array([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0]], np.float32), (frames, 1, 1))
     angles = np.linspace(0.0, 1.0, frames, dtype=np.float32)[:, None]
     upright = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (frames, 2, 1))
-    np.savez(
-        path,
-        fps=np.array([HZ]),
-        joint_pos=angles,
-        joint_vel=np.zeros_like(angles),
-        body_pos_w=places,
-        body_quat_w=upright,
-        body_lin_vel_w=still,
-        body_ang_vel_w=still,
-    )
+    joints = {"joint_pos": angles, "joint_vel": np.zeros_like(angles)}
+    bodies = {"body_pos_w": places, "body_quat_w": upright, "body_lin_vel_w": still, "body_ang_vel_w": still}
+    np.savez(path, fps=np.array([HZ]), **joints, **bodies)
     return path
-
-
-@dataclass(frozen=True)
-class TurningConfig(TaskConfig):
-    control_hz: float = float(HZ)
-    substeps: int = 1
-    episode_seconds: float = 10.0
-    motion: str = ""
-    rewards: Mapping[str, float] = reward_weights(alive=1.0)
 
 
 @wp.func
@@ -74,28 +41,23 @@ def hard_part(world: int, episodes: EpisodeArrays, command: int) -> bool:
     return frame >= 25.0 and frame < 30.0
 
 
-class Turning(DeclaredTask):
-    config_type = TurningConfig
+class Turning(Small):
+    text = ROBOT
+    motion: Path
 
-    def robot(self, config: TurningConfig) -> Robot:
-        return Robot(ROBOT)
-
-    def declare(self, config: TurningConfig) -> Declaration:
-        sampling = terms.AdaptiveSampling(even=0.5, rate=0.05)
-        return Declaration(
-            actions={"force": Action(terms.effort)},
-            sensors={"motion": terms.Motion(config.motion, bodies="*", anchor="base", sampling=sampling)},
-            commands={
-                "frame": Command(terms.motion_command, names=["frame"], seconds=99.0, update=Term(terms.advance_motion))
-            },
-            observations={"wanted": Observation(terms.wanted_joint_position, command="frame")},
-            rewards={"alive": Reward(terms.alive)},
-            terminations={
+    def sections(self) -> dict[str, Any]:
+        sampling, advance = terms.AdaptiveSampling(even=0.5, rate=0.05), Term(terms.advance_motion)
+        return {
+            "sensors": {"motion": terms.Motion(self.motion, bodies="*", anchor="base", sampling=sampling)},
+            "commands": {"frame": Command(terms.motion_command, names=["frame"], seconds=99.0, update=advance)},
+            "observations": {"wanted": Observation(terms.wanted_joint_position, command="frame")},
+            "events": {},
+            "terminations": {
                 "hard": Termination(hard_part, command="frame"),
                 "over": Termination(terms.motion_over, command="frame", time_out=True),
             },
-            metrics={"evenness": Metric(terms.evenness_of_frames)},
-        )
+            "metrics": {"evenness": Metric(terms.evenness_of_frames)},
+        }
 
 
 def begun(task: Any, steps: int) -> np.ndarray:
@@ -108,9 +70,11 @@ def begun(task: Any, steps: int) -> np.ndarray:
     return np.array(found)
 
 
-def test_episodes_begin_where_they_failed_and_a_checkpoint_goes_on(motion: Path) -> None:
-    config = TurningConfig(motion=str(motion))
-    task, other = Turning(config, WORLDS, seed=1), Turning(config, WORLDS, seed=1)
+def test_episodes_begin_where_they_failed_and_a_checkpoint_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Turning, "motion", motion(tmp_path / "turning.npz"), raising=False)
+    task, other = (Turning(SmallConfig(episode_seconds=10.0), WORLDS, seed=1) for _ in range(2))
     task.reset()
     first = begun(task, 20)
     later = begun(task, 150)

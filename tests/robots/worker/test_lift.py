@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.refusals import refusal
 from tests.support.worker.lift_reference import GAINS, HOME, TIPS, reference, stiffness, to_mujoco, touching_pairs
-from tests.support.worker.robots import need_mjlab
+from tests.support.worker.robots import needs_mjlab
 from tests.support.worker.tasks import observe, play, played_twice, plays_like_its_part, put, same, statistics
 from worker.errors import UserError
 from worker.learning.job import configure
@@ -19,14 +20,10 @@ from worker.tasks import find_task
 from worker.tasks.configs.lift import LiftCubeConfig
 from worker.tasks.lift import LiftCube
 
+pytestmark = needs_mjlab
 WORLDS = 4
 AWAY = [0.3, 0.15, 0.02, 0.0, 0.0, 0.0, 1.0]
 """A cube that lies on the ground beside the gripper."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _files() -> None:
-    need_mjlab()
 
 
 @pytest.fixture(scope="module")
@@ -302,6 +299,4 @@ def test_random_ones_stay_finite_within_the_solvers_capacity(lift: LiftCube) -> 
     ],
 )
 def test_impossible_settings_are_refused_in_one_line(config: dict, message: str) -> None:
-    with pytest.raises(UserError) as refusal:
-        configure(LiftCube, {"config": config})
-    assert str(refusal.value) == message
+    assert refusal(configure, LiftCube, {"config": config}, error=UserError) == message

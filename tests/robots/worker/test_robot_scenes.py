@@ -1,19 +1,22 @@
-"""Robots of other formats, several of them with objects in one world, what is where in the arrays, and who touches whom."""
+"""Robots of other formats, several with objects in one world, who touches whom; real robots move as in MuJoCo itself."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
-from tests.support.worker.robots import build
+from tests.support.worker.lift_reference import touching_pairs
+from tests.support.worker.robots import build, need_mjlab, reference
 from worker.simulation.actuators import EffortActuator, PositionActuator
 from worker.simulation.collisions import Collision
 from worker.simulation.objects import Box, Capsule, Sphere
 from worker.simulation.robot import Robot
 from worker.simulation.robot_view import RobotView, body_arrays
+from worker.tasks import find_task
 
 SERVO = PositionActuator("*", 60.0, 3.0, armature=0.01)
 # An arm on a mount that is a geom of the world, its two hinges between one pair of bodies: Newton makes them one joint.
@@ -26,34 +29,25 @@ ARM = """<mujoco model="arm"><option integrator="implicitfast"/><worldbody>
 </worldbody></mujoco>"""
 
 
-def reached(robot: Robot, targets, steps: int = 400, **options) -> np.ndarray:
-    """Joint positions after so many physics steps at these targets."""
-    template, worlds = build(robot, ground=False, timestep=0.002, substeps=10, disable_contacts=True, **options)
+@pytest.mark.parametrize(
+    ("file", "targets"),
+    [
+        ("newton:quadruped.urdf", np.tile([0.2, 0.4, -0.5], 4)),
+        ("newton:ant.usda", np.tile([0.1, 0.9], 4) * [1, 1, 1, -1, 1, -1, 1, 1]),
+    ],
+    ids=["URDF", "USD"],
+)
+def test_a_robot_of_another_format_reaches_its_targets(file: str, targets: np.ndarray):
+    robot = Robot(file, fixed=True, actuators=(PositionActuator("*", 400.0, 20.0, armature=0.05),), visuals=False)
+    template, worlds = build(robot, ground=False, timestep=0.002, substeps=10, disable_contacts=True)
     view = RobotView(template)
     worlds.restore_defaults()
     controls = np.zeros(worlds.arrays.controls.shape, np.float32)
     controls[:, view.actuators] = targets
     worlds.arrays.controls.assign(controls)
-    for _ in range(steps // 10):
+    for _ in range(40):
         worlds.simulate()
-    return worlds.arrays.joint_q.numpy()[0, view.coordinates]
-
-
-def test_a_urdf_robot_reaches_its_targets():
-    targets = np.tile([0.2, 0.4, -0.5], 4)
-    robot = Robot(
-        "newton:quadruped.urdf",
-        fixed=True,
-        actuators=(PositionActuator("*", 400.0, 20.0, armature=0.05),),
-        visuals=False,
-    )
-    np.testing.assert_allclose(reached(robot, targets), targets, atol=0.02)
-
-
-def test_a_usd_robot_reaches_its_targets():
-    robot = Robot("newton:ant.usda", fixed=True, actuators=(PositionActuator("*", 400.0, 20.0),))
-    targets = np.tile([0.1, 0.9], 4) * [1, 1, 1, -1, 1, -1, 1, 1]
-    np.testing.assert_allclose(reached(robot, targets), targets, atol=0.02)
+    np.testing.assert_allclose(worlds.arrays.joint_q.numpy()[0, view.coordinates], targets, atol=0.02)
 
 
 def test_a_usd_cart_is_driven_by_name_and_its_poles_are_not():
@@ -66,14 +60,8 @@ def test_a_usd_cart_is_driven_by_name_and_its_poles_are_not():
 
 def test_floating_and_fixed_bases_and_their_start():
     for fixed, coordinate in ((False, 0), (True, -1)):
-        robot = Robot(
-            "newton:quadruped.urdf",
-            fixed=fixed,
-            position=(1.0, 2.0, 3.0),
-            rotation=(0.0, 0.0, 1.0, 1.0),
-            actuators=(SERVO,),
-        )
-        template, worlds = build(robot)
+        placed = {"fixed": fixed, "position": (1.0, 2.0, 3.0), "rotation": (0.0, 0.0, 1.0, 1.0)}
+        template, worlds = build(Robot("newton:quadruped.urdf", actuators=(SERVO,), **placed))
         view = RobotView(template)
         assert (view.root_coordinate, view.root_dof, view.root_body) == (coordinate, coordinate, 0)
         half = math.sqrt(0.5)
@@ -113,11 +101,8 @@ def test_joints_between_one_pair_of_bodies_keep_their_names():
     worlds.update_bodies()
     hand = body_arrays(worlds).poses.numpy()[1, view.bodies[view.find_bodies("hand")[0]]]
     along = 0.5 + 0.05
-    expected = [
-        math.cos(0.05) * math.cos(0.3) * along,
-        math.sin(0.05) * math.cos(0.3) * along,
-        0.5 - math.sin(0.3) * along,
-    ]
+    ahead = math.cos(0.3) * along
+    expected = [math.cos(0.05) * ahead, math.sin(0.05) * ahead, 0.5 - math.sin(0.3) * along]
     np.testing.assert_allclose(hand[:3], expected, atol=1e-5)
 
 
@@ -194,21 +179,10 @@ def test_a_fixed_object_stays():
 
 
 def pairs_that_touch(*things) -> set[frozenset[str]]:
-    """Pairs of geoms of different bodies that MuJoCo's rule lets touch in the compiled model."""
-    _, worlds = build(*things)
-    model = worlds.solver.mj_model
+    """Names of the geoms of different bodies that MuJoCo's rule lets touch in the compiled model."""
+    model = build(*things)[1].solver.mj_model
     names = [model.geom(index).name.rpartition("_")[0].replace("/worldbody", "") for index in range(model.ngeom)]
-    excluded = {int(signature) for signature in model.exclude_signature}
-    touching = set()
-    for first in range(model.ngeom):
-        for second in range(first + 1, model.ngeom):
-            a, b = sorted((int(model.geom_bodyid[first]), int(model.geom_bodyid[second])))
-            meet = model.geom_contype[first] & model.geom_conaffinity[second]
-            meet |= model.geom_contype[second] & model.geom_conaffinity[first]
-            movable = any(model.body_dofnum[model.body_weldid[body]] for body in (a, b))
-            if movable and meet and (a << 16) + b not in excluded:
-                touching.add(frozenset((names[first].rpartition("/")[2], names[second].rpartition("/")[2])))
-    return touching
+    return touching_pairs(model, [name.rpartition("/")[2] for name in names])
 
 
 FINGERS = """<mujoco model="fingers"><worldbody><body name="palm" pos="0 0 1"><freejoint/><geom name="palm" size=".1"/>
@@ -274,3 +248,68 @@ def test_ground_and_objects_need_no_shape_of_the_builder_to_be_marked():
     arm = Robot(ARM, actuators=(SERVO,))
     _, worlds = build(arm, ByHand())
     assert worlds.solver.mj_model.ngeom == 5
+
+
+@pytest.fixture(params=["Go1Flat", "G1Flat"])
+def robot(request: pytest.FixtureRequest) -> Robot:
+    """Of that task."""
+    need_mjlab()
+    task: Any = find_task(request.param)
+    return task.walker.robot()
+
+
+def test_a_robot_moves_as_in_mujocos_own_engine(robot: Robot):
+    template, worlds = build(robot)
+    view = RobotView(template)
+    model = reference(robot)
+    data = mujoco.MjData(model)
+
+    joints = [model.joint(name) for name in view.joint_names]
+    places = [int(joint.qposadr[0]) for joint in joints]
+    controls = [int(model.actuator(name).id) for name in view.joint_names]
+    default = np.array(view.defaults)
+    data.qpos[:3] = robot.position
+    data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)
+    data.qpos[places] = default
+    worlds.restore_defaults()
+    reached, wanted = [], []
+    inputs = np.zeros(worlds.arrays.controls.shape, np.float32)
+    for step in range(200):
+        # every joint moves about its default position, no two alike
+        targets = default + 0.15 * np.sin(0.05 * step + np.arange(len(default)))
+        data.ctrl[controls] = targets
+        inputs[0, view.actuators] = targets
+        worlds.arrays.controls.assign(inputs)
+        mujoco.mj_step(model, data)
+        worlds.simulate()
+        reached.append(worlds.arrays.joint_q.numpy()[0, view.coordinates])
+        wanted.append(data.qpos[places].copy())
+    assert np.ptp(np.array(wanted), axis=0).min() > 0.05, "every joint moves"
+    np.testing.assert_allclose(np.array(reached), np.array(wanted), atol=0.01)
+    root = worlds.arrays.joint_q.numpy()[0, :3]
+    np.testing.assert_allclose(root, data.qpos[:3], atol=0.01)
+
+
+def test_the_compiled_model_is_mujocos(robot: Robot):
+    template, worlds = build(robot)
+    view = RobotView(template)
+    ours, theirs = worlds.solver.mj_model, reference(robot)
+    dofs = [int(theirs.joint(name).dofadr[0]) for name in view.joint_names]
+    for field in ("dof_armature", "dof_frictionloss", "dof_damping"):
+        np.testing.assert_allclose(getattr(ours, field)[view.dofs], getattr(theirs, field)[dofs], rtol=1e-5)
+    np.testing.assert_allclose(ours.body_subtreemass[0], theirs.body_subtreemass[0], rtol=1e-5)
+    inputs = [int(theirs.actuator(name).id) for name in view.joint_names]
+    for field in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_ctrllimited"):
+        mine, its = getattr(ours, field)[view.actuators], getattr(theirs, field)[inputs]
+        np.testing.assert_allclose(mine, its, rtol=1e-5, err_msg=field)
+    geoms = {ours.geom(index).name.rpartition("/")[2].rpartition("_")[0]: index for index in range(ours.ngeom)}
+    compared = 0
+    for name, index in geoms.items():
+        if name not in view.geom_names:
+            continue
+        its = theirs.geom(name).id
+        for field in ("contype", "conaffinity", "condim", "priority", "friction", "solref"):
+            mine, wanted = getattr(ours, f"geom_{field}")[index], getattr(theirs, f"geom_{field}")[its]
+            np.testing.assert_allclose(mine, wanted, rtol=1e-5, err_msg=f"{field} of {name}")
+        compared += 1
+    assert compared == sum(bool(theirs.geom(name).contype[0]) for name in view.geom_names)

@@ -12,16 +12,12 @@ import pytest
 import yaml
 
 from tests.conftest import REPOSITORY
-from tests.support.worker.robots import need_mjlab
+from tests.support.worker.robots import needs_mjlab
 from worker.tasks import BUILT_IN
 from worker.tasks.settings_page import FAMILIES, MJLAB, page, sketch
 
+pytestmark = needs_mjlab
 LIMITS = ("iterations", "ls_iterations", "nconmax", "njmax")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _files() -> None:
-    need_mjlab()
 
 
 def test_the_page_is_up_to_date() -> None:

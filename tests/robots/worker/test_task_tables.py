@@ -11,18 +11,14 @@ import pytest
 
 from orchestrator.cli.tasks import _numbers, _terms
 from orchestrator.cli.terminal import Console
-from tests.support.worker.robots import need_mjlab
+from tests.support.worker.robots import needs_mjlab
 from worker.tasks import BUILT_IN, find_task
-from worker.tasks.__main__ import describe, main
+from worker.tasks.__main__ import describe
 from worker.tasks.declaration import Image
 
+pytestmark = needs_mjlab
 DECLARED = sorted({*BUILT_IN} - {"CartpolePixels"})
 """Its policy sees an image; its terms are Cartpole's."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _files() -> None:
-    need_mjlab()
 
 
 @functools.cache
@@ -105,13 +101,3 @@ def test_changes_during_training_are_told_by_iteration() -> None:
 def test_a_setting_of_several_parts_has_a_row_for_each() -> None:
     rows = told("RacerPixels")["tables"]["configuration"]
     assert {"name": "front.width", "value": "160"} in rows and {"name": "front.kind", "value": '"grey"'} in rows
-
-
-def test_an_unknown_task_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["LiftCub"]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1
-    assert "no task is called 'LiftCub'; did you mean LiftCube" in captured.err
-    assert main(["LiftCubes"]) == 0
-    (found,) = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert found["class"] == "worker.tasks.lift_cubes:LiftCubes" and found["tables"]["rewards"]

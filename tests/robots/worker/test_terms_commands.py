@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from tests.support.worker.terms_rig import (
     ACTIONS,
@@ -20,20 +21,14 @@ from tests.support.worker.terms_rig import (
     WORLDS,
     Rig,
     array,
+    close,
+    matrix,
+    terms_of,
 )
 from worker.simulation.sensors.differential_ik import IkArrays
 from worker.simulation.sensors.wrench import WrenchArrays
 from worker.tasks.terms import actions, commands, episode, events, root
 
-MODULES = (actions, commands, episode, events)
-ALL = [
-    each
-    for module in MODULES
-    for each in vars(module).values()
-    if isinstance(each, wp.Function)
-    and each.func.__module__ == module.__name__
-    and each.key not in ("aim", "_draw_wrenches")
-]
 DRAWS = 120
 
 
@@ -44,28 +39,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     wrench.bodies, wrench.left = array([1, 4], wp.int32), array(np.zeros(WORLDS))
     frame.wanted = array(np.zeros((WORLDS, 3)))
     structs = {WrenchArrays: wrench, IkArrays: frame}
-    return Rig([*ALL, root.root_linear_velocity], tmp_path_factory.mktemp("commands"), structs)
+    tested = terms_of(actions, commands, episode, events, without=("aim", "_draw_wrenches"))
+    return Rig([*tested, root.root_linear_velocity], tmp_path_factory.mktemp("commands"), structs)
 
 
 @pytest.fixture
 def rig(made: Rig) -> Iterator[Rig]:
-    """The worlds as they were made, whatever a test writes."""
-    written = (
-        made.worlds.joint_q,
-        made.worlds.joint_qd,
-        made.worlds.controls,
-        made.episodes.memory,
-        made.robot.encoder_bias,
-    )
-    before = [each.numpy().copy() for each in written]
-    yield made
-    for each, values in zip(written, before, strict=True):
-        each.assign(values)
+    with made.kept():
+        yield made
 
 
-def draws(rig: Rig, read: object, term: object, **numbers: object) -> np.ndarray:
+def draws(rig: Rig, read: Callable[[], np.ndarray], term: object, **numbers: object) -> np.ndarray:
     """What a term writes with many seeds, shape ``(seeds * worlds, ...)``."""
-    assert callable(read)
     found = []
     for seed in range(DRAWS):
         rig.call(term, stream=seed, **numbers)
@@ -86,8 +71,8 @@ def memory(rig: Rig, first: int, count: int) -> np.ndarray:
 
 
 def heading(rig: Rig) -> np.ndarray:
-    x, y, z, w = rig.worlds.joint_q.numpy()[:, ROOT + 3 : ROOT + 7].T.astype(float)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    turn = matrix(rig.worlds.joint_q.numpy()[:, ROOT + 3 : ROOT + 7])
+    return np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
 
 
 def test_actions_write_the_input_of_their_joints_actuator(rig: Rig) -> None:
@@ -130,9 +115,8 @@ def test_a_smoothed_target_begins_where_the_joint_is(rig: Rig) -> None:
 
 
 def test_terms_of_actions_are_their_formulas(rig: Rig) -> None:
-    now, last, earlier = (
-        getattr(rig.episodes, name).numpy() for name in ("actions", "last_actions", "earlier_actions")
-    )
+    names = ("actions", "last_actions", "earlier_actions")
+    now, last, earlier = (getattr(rig.episodes, name).numpy() for name in names)
     jerk = now - 2 * last + earlier
     for action in range(ACTIONS):
         for name, wanted in {
@@ -146,9 +130,7 @@ def test_terms_of_actions_are_their_formulas(rig: Rig) -> None:
             "action_acceleration_squared": jerk**2,
             "mean_action_acceleration": np.abs(jerk) / ACTIONS,
         }.items():
-            np.testing.assert_allclose(
-                rig.call(getattr(actions, name), action), wanted[:, action], rtol=1e-5, atol=1e-6
-            )
+            close(rig.call(getattr(actions, name), action), wanted[:, action], name, rtol=1e-5, atol=1e-6)
 
 
 def test_velocity_commands_come_evenly_from_their_ranges_and_shares(rig: Rig) -> None:
@@ -199,14 +181,11 @@ def test_a_heading_command_turns_the_robot_and_a_world_command_keeps_its_directi
         np.testing.assert_allclose(steered[:, 2], wanted, atol=1e-5)
         seen = (drawn[:, 0] + 1j * drawn[:, 1]) * (np.exp(-1j * yaw) if shares.get("world_share") else 1.0)
         np.testing.assert_allclose(steered[:, 0] + 1j * steered[:, 1], seen, atol=1e-5)
-    found = draws(
-        rig, lambda: memory(rig, 5, 9), commands.heading_velocity_command, command=5, heading_share=0.25, **ranges
-    )
+    term = commands.heading_velocity_command
+    found = draws(rig, lambda: memory(rig, 5, 9), term, command=5, heading_share=0.25, **ranges)
     evenly(found[:, 3], -3.0, 3.0)
     assert abs(found[:, 4].mean() - 0.25) < 0.06
-    straight = draws(
-        rig, lambda: memory(rig, 5, 3), commands.heading_velocity_command, command=5, forward_share=1.0, **ranges
-    )
+    straight = draws(rig, lambda: memory(rig, 5, 3), term, command=5, forward_share=1.0, **ranges)
     assert straight[:, 0].min() >= 0.3 - 1e-6 and not straight[:, 1:].any()
 
 
@@ -223,10 +202,8 @@ def test_commands_of_numbers_and_places(rig: Rig) -> None:
 
     places = {f"object_{axis}": bounds for axis, bounds in box.items()} | {"object_yaw": (-1.0, 1.0)}
     rig.call(commands.lift_command, command=3, stream=9, robot=rig.other, **box, **places)
-    pose, velocity = (
-        rig.worlds.joint_q.numpy()[:, OBJECT : OBJECT + 7],
-        rig.worlds.joint_qd.numpy()[:, OBJECT_DOF : OBJECT_DOF + 6],
-    )
+    pose = rig.worlds.joint_q.numpy()[:, OBJECT : OBJECT + 7]
+    velocity = rig.worlds.joint_qd.numpy()[:, OBJECT_DOF : OBJECT_DOF + 6]
     assert not velocity.any() and np.abs(2 * np.arctan2(pose[:, 5], pose[:, 6])).max() <= 1.0
     for axis, (low, high) in enumerate(box.values()):
         assert (pose[:, axis] >= low).all() and (pose[:, axis] <= high).all()
@@ -271,12 +248,11 @@ def test_a_root_is_placed_around_its_start(rig: Rig) -> None:
     evenly(found[:, 0] - start[0], -1.0, 2.0)
     np.testing.assert_allclose(found[:, 1], start[1], atol=1e-6)
     evenly(found[:, 2] - start[2], 0.1, 0.2)
-    x, y, z, w = start[3:]
-    inverse = np.array([-x, -y, -z, w])
-    turned = np.stack([_product(inverse, each) for each in found[:, 3:7]])
+    turns = Rotation.from_quat(found[:, 3:7])
+    turned = (Rotation.from_quat(start[3:]).inv() * turns).as_rotvec()
     np.testing.assert_allclose(turned[:, :2], 0.0, atol=1e-5)
-    evenly(2 * np.arctan2(turned[:, 2] * np.sign(turned[:, 3]), np.abs(turned[:, 3])), -3.0, 3.0)
-    evenly(np.stack([_rotated(q, v) for q, v in zip(found[:, 3:7], found[:, 7:10], strict=True)])[:, 1], -0.5, 1.0)
+    evenly(turned[:, 2], -3.0, 3.0)
+    evenly(turns.apply(found[:, 7:10])[:, 1], -0.5, 1.0)
     evenly(found[:, 10], -2.0, 1.0)
     assert not found[:, 11:].any()
     np.testing.assert_array_equal(rig.worlds.joint_q.numpy()[:, :ROOT], untouched)
@@ -287,16 +263,6 @@ def test_a_root_is_placed_around_its_start(rig: Rig) -> None:
     assert np.abs(found[:, 7:]).max() < 1e-6
 
 
-def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    vector = first[3] * second[:3] + second[3] * first[:3] + np.cross(first[:3], second[:3])
-    return np.array([*vector, first[3] * second[3] - first[:3] @ second[:3]])
-
-
-def _rotated(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    inverse = rotation * [-1, -1, -1, 1]
-    return _product(_product(rotation, np.array([*vector, 0.0])), inverse)[:3]
-
-
 def test_joints_are_placed_within_their_ranges(rig: Rig) -> None:
     for joint in (0, JOINTS - 1):
         coordinate, dof = rig.robot.coordinates.numpy()[joint], rig.robot.dofs.numpy()[joint]
@@ -304,22 +270,16 @@ def test_joints_are_placed_within_their_ranges(rig: Rig) -> None:
         middle, half = (0.5 * low + 0.5 * high, 0.45 * (high - low)) if joint == 0 else (0.0, 0.0)
 
         def read(columns: tuple[int, int] = (coordinate, dof)) -> np.ndarray:
-            return np.stack(
-                [rig.worlds.joint_q.numpy()[:, columns[0]], rig.worlds.joint_qd.numpy()[:, columns[1]]], axis=1
-            )
+            q, qd = rig.worlds.joint_q.numpy(), rig.worlds.joint_qd.numpy()
+            return np.stack([q[:, columns[0]], qd[:, columns[1]]], axis=1)
 
         numbers = {"position": (-9.0, 9.0), "velocity": (-1.0, 3.0), "element": joint}
         found = draws(rig, read, events.reset_joints_by_offset, soft_factor=0.9, **numbers)
         evenly(found[:, 1], -1.0, 3.0)
         if joint == 0:
-            assert np.isclose(found[:, 0].min(), middle - half) and np.isclose(
-                found[:, 0].max(), middle + half, atol=1e-5
-            )
-            evenly(
-                draws(rig, read, events.reset_joints_between_limits, soft_factor=0.9, element=joint)[:, 0],
-                middle - half,
-                middle + half,
-            )
+            close(np.array([found[:, 0].min(), found[:, 0].max()]), [middle - half, middle + half], atol=1e-5)
+            found = draws(rig, read, events.reset_joints_between_limits, soft_factor=0.9, element=joint)
+            evenly(found[:, 0], middle - half, middle + half)
         else:
             evenly(found[:, 0] - default, -9.0, 9.0)
             found = draws(rig, read, events.reset_joints_between_limits, element=joint)
@@ -344,9 +304,8 @@ def test_a_reset_to_the_default_and_a_push(rig: Rig) -> None:
     before = rig.call(root.root_linear_velocity)
     rig.call(events.push, stream=5, velocity_x=(0.5, 0.5), turning_z=(1.0, 1.0))
     after = rig.call(root.root_linear_velocity)
-    for world in range(WORLDS):
-        rotation = rig.worlds.joint_q.numpy()[world, ROOT + 3 : ROOT + 7]
-        np.testing.assert_allclose(_rotated(rotation, after[world] - before[world]), [0.5, 0, 0], atol=1e-5)
+    turns = Rotation.from_quat(rig.worlds.joint_q.numpy()[:, ROOT + 3 : ROOT + 7])
+    np.testing.assert_allclose(turns.apply(after - before), np.tile([0.5, 0, 0], (WORLDS, 1)), atol=1e-5)
     turning = rig.worlds.joint_qd.numpy()[:, ROOT_DOF + 3 : ROOT_DOF + 6] - rig.qd[:, ROOT_DOF + 3 : ROOT_DOF + 6]
     np.testing.assert_allclose(turning, np.tile([0, 0, 1.0], (WORLDS, 1)), atol=1e-6)
 
@@ -356,18 +315,13 @@ def test_terms_of_the_episode(rig: Rig) -> None:
     np.testing.assert_allclose(rig.call(episode.elapsed), ages * SECONDS, rtol=1e-6)
     np.testing.assert_allclose(rig.call(episode.time_left, limit=3.0), 3.0 - ages * SECONDS, rtol=1e-6)
     phase = 2 * np.pi * ages * SECONDS / 0.7
-    np.testing.assert_allclose(
-        rig.call(episode.gait_clock, period=0.7), np.stack([np.sin(phase), np.cos(phase)], 1), atol=1e-4
-    )
+    close(rig.call(episode.gait_clock, period=0.7), np.stack([np.sin(phase), np.cos(phase)], 1), atol=1e-4)
     assert (rig.call(episode.level) == 0.5).all()
     assert rig.call(episode.older_than, limit=0.16).tolist() == [0, 1, 1]  # 8 steps of 0.02 s with the one that ends
     assert rig.call(episode.older_than, limit=0.18).tolist() == [0, 0, 1]
-    assert (rig.call(episode.alive, terminated=True) == 0).all() and (
-        rig.call(episode.alive, terminated=False) == 1
-    ).all()
-    assert (rig.call(episode.ended, terminated=True) == 1).all() and (
-        rig.call(episode.ended, terminated=False) == 0
-    ).all()
+    for terminated in (True, False):
+        assert (rig.call(episode.alive, terminated=terminated) == (not terminated)).all()
+        assert (rig.call(episode.ended, terminated=terminated) == terminated).all()
     assert not rig.call(episode.not_finite).any()
     broken = rig.qd.copy()
     broken[1, 3] = np.nan

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
-from tests.support.worker.terms_rig import JOINTS, WORLDS, Rig
+from tests.support.worker.terms_rig import JOINTS, WORLDS, Rig, terms_of
 from worker.tasks.terms import joints as terms
-
-ALL = [
-    each for each in vars(terms).values() if isinstance(each, wp.Function) and each.func.__module__ == terms.__name__
-]
 
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    return Rig(ALL, tmp_path_factory.mktemp("joints"))
+    return Rig(terms_of(terms), tmp_path_factory.mktemp("joints"))
 
 
 def column(rig: Rig, joint: int) -> dict[str, np.ndarray]:
@@ -43,13 +38,7 @@ def test_every_term_of_a_joint_is_its_formula(rig: Rig) -> None:
         "measured_joint_offset": lambda c: c["q"] + c["bias"] - c["default"],
         "joint_velocity": lambda c: c["qd"],
         "joint_share_of_range": lambda c: (
-            np.interp(
-                c["q"],
-                [c["low"] - 9, c["high"] + 9],
-                [-1 - 18 / (c["high"] - c["low"]), 1 + 18 / (c["high"] - c["low"])],
-            )
-            if np.isfinite(c["low"])
-            else 0 * c["q"]
+            2 * (c["q"] - c["low"]) / (c["high"] - c["low"]) - 1 if np.isfinite(c["low"]) else 0 * c["q"]
         ),
         "joint_acceleration": lambda c: c["acceleration"],
         "joint_effort": lambda c: c["force"],
@@ -79,9 +68,8 @@ def test_terms_with_numbers(rig: Rig) -> None:
         beyond = np.maximum(c["low"] + span - c["q"], 0) + np.maximum(c["q"] - c["high"] + span, 0)
         np.testing.assert_allclose(rig.call(terms.joint_limit_excess, joint, soft_factor=0.8), beyond, atol=2e-6)
         speed, force = np.abs(c["qd"]), np.abs(c["force"])
-        np.testing.assert_allclose(
-            rig.call(terms.joint_velocity_excess, joint, limit=0.5), np.clip(speed - 0.5, 0, 1), atol=1e-6
-        )
+        excess = np.clip(speed - 0.5, 0, 1)
+        np.testing.assert_allclose(rig.call(terms.joint_velocity_excess, joint, limit=0.5), excess, atol=1e-6)
         hinge = np.maximum(speed - 0.5, 0) ** 2
         np.testing.assert_allclose(rig.call(terms.joint_velocity_excess_squared, joint, limit=0.5), hinge, atol=1e-5)
         excess = np.maximum(force - 0.5 * c["effort"], 0)

@@ -181,77 +181,45 @@ ALONE = {
 }
 """Paths that a gang of one takes alone, and why."""
 TESTS = {
-    function: test
-    for test, functions in {
-        "test_a_training_is_the_same_on_all_ranks_to_its_end": (
-            "distributed.py:Gang.broadcast",
-            "distributed.py:Gang.build_in_turn",
-            "distributed.py:Gang.greatest",
-            "distributed.py:Gang.sum",
-            "distributed.py:Gang.tell",
-            "distributed.py:connect",
-            "evaluation/evaluation.py:evaluate",
-            "learning/exchange.py:Exchange.gather",
-            "learning/leaving.py:train",
-            "learning/loop.py:Loop.__init__",
-            "learning/loop.py:Loop._begin_run",
-            "learning/loop.py:Loop._build",
-            "learning/loop.py:Loop._finish",
-            "learning/loop.py:Loop._iterate",
-            "learning/loop.py:Loop.train",
-            "learning/ppo/fused.py:PPO.__init__",
-            "learning/ppo/fused.py:PPO._learn",
-            "learning/ppo/fused.py:PPO.learn",
-            "learning/setup.py:build_algorithm",
-            "learning/setup.py:build_task",
-            "learning/setup.py:load_kernels",
-            "learning/state.py:TrainingState.finish",
-            "train.py:_train",
-            "train.py:main",
-        ),
-        "test_an_evaluation_has_the_episodes_of_all_ranks_in_every_round": (
-            "evaluate.py:main",
-            "evaluate.py:main.<locals>.build",
-            "evaluation/episodes.py:_gather",
-            "evaluation/episodes.py:play",
-            "learning/trained.py:choose_checkpoint",
-        ),
-        "test_episodes_are_played_until_the_last_one_of_any_rank_has_ended": ("evaluation/episodes.py:_one_round",),
-        "test_a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint": ("learning/loop.py:Loop._handle",),
-        "test_a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read": (
-            "learning/state.py:TrainingState.restore",
-        ),
-        "test_a_clone_begins_with_the_same_weights_on_all_ranks": ("learning/adoption.py:adopt",),
-        "test_all_ranks_have_the_teacher_whether_it_was_copied_or_not": (
-            "learning/teacher.py:_learnt",
-            "learning/teacher.py:give_teacher",
-        ),
-        "test_worlds_that_do_not_fit_are_refused_by_all_ranks": (
-            "learning/memory.py:_taken",
-            "learning/memory.py:measure",
-            "learning/memory.py:within_memory",
-        ),
-        "test_worlds_drawn_at_random_are_built_anew_for_the_evaluation": ("learning/loop.py:Loop.held_out_worlds",),
-        "test_a_loss_that_is_not_finite_ends_all_ranks_after_their_saves": ("learning/loop.py:Loop._failure",),
-        "test_too_many_resets_on_one_rank_end_all_after_it_has_written_why": ("learning/loop.py:Loop._judge_resets",),
-        "test_plain_ppo_learns_on_two_ranks_what_it_learns_on_one": (
-            "learning/plain_ppo.py:Network.update_normalizer",
-            "learning/plain_ppo.py:PlainPPO.__init__",
-            "learning/plain_ppo.py:PlainPPO._estimate",
-            "learning/plain_ppo.py:PlainPPO.learn",
-        ),
-        "test_sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds": (
-            "learning/sac/learner.py:Learner.__init__",
-            "learning/sac/sac.py:SAC.__init__",
-            "learning/sac/sac.py:SAC._observe",
-            "learning/sac/sac.py:SAC._update",
-        ),
-        "test_rsl_rl_has_the_same_weights_normalizers_and_metrics_on_all_ranks": (
-            "learning/rsl/algorithm.py:RslRl.__init__",
-            "learning/rsl/algorithm.py:RslRl._share_statistics",
-            "learning/rsl/algorithm.py:RslRl.learn",
-        ),
+    f"{file}:{function}": f"test_{case}"
+    for case, files in {
+        "a_training_is_the_same_on_all_ranks_to_its_end": {
+            "distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
+            "evaluation/evaluation.py": "evaluate",
+            "learning/exchange.py": "Exchange.gather",
+            "learning/leaving.py": "train",
+            "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._build Loop._finish Loop._iterate Loop.train",
+            "learning/ppo/fused.py": "PPO.__init__ PPO._learn PPO.learn",
+            "learning/setup.py": "build_algorithm build_task load_kernels",
+            "learning/state.py": "TrainingState.finish",
+            "train.py": "_train main",
+        },
+        "an_evaluation_has_the_episodes_of_all_ranks_in_every_round": {
+            "evaluate.py": "main main.<locals>.build",
+            "evaluation/episodes.py": "_gather play",
+            "learning/trained.py": "choose_checkpoint",
+        },
+        "episodes_are_played_until_the_last_one_of_any_rank_has_ended": {"evaluation/episodes.py": "_one_round"},
+        "a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint": {"learning/loop.py": "Loop._handle"},
+        "a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read": {"learning/state.py": "TrainingState.restore"},
+        "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/adoption.py": "adopt"},
+        "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/teacher.py": "_learnt give_teacher"},
+        "worlds_that_do_not_fit_are_refused_by_all_ranks": {"learning/memory.py": "_taken measure within_memory"},
+        "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {"learning/loop.py": "Loop.held_out_worlds"},
+        "a_loss_that_is_not_finite_ends_all_ranks_after_their_saves": {"learning/loop.py": "Loop._failure"},
+        "too_many_resets_on_one_rank_end_all_after_it_has_written_why": {"learning/loop.py": "Loop._judge_resets"},
+        "plain_ppo_learns_on_two_ranks_what_it_learns_on_one": {
+            "learning/plain_ppo.py": "Network.update_normalizer PlainPPO.__init__ PlainPPO._estimate PlainPPO.learn"
+        },
+        "sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds": {
+            "learning/sac/learner.py": "Learner.__init__",
+            "learning/sac/sac.py": "SAC.__init__ SAC._observe SAC._update",
+        },
+        "rsl_rl_has_the_same_weights_normalizers_and_metrics_on_all_ranks": {
+            "learning/rsl/algorithm.py": "RslRl.__init__ RslRl._share_statistics RslRl.learn"
+        },
     }.items()
-    for function in functions
+    for file, functions in files.items()
+    for function in functions.split()
 }
 """By the path, the test of ``tests/training/worker/test_gangs.py`` in which two ranks take it."""

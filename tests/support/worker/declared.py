@@ -91,6 +91,36 @@ def no_actions(task: DeclaredTask) -> torch.Tensor:
     return (task.actions[:, 0] == 0.0).float()
 
 
+@dataclass(frozen=True)
+class SmallConfig(TaskConfig):
+    control_hz: float = 10.0
+    substeps: int = 1
+    rewards: Mapping[str, float] = reward_weights(alive=1.0)
+
+
+class Small(DeclaredTask):
+    """A robot that is asked for nothing; a subclass names its file, and the sections of the declaration that matter."""
+
+    config_type = SmallConfig
+    text = MODEL
+
+    def robot(self, config: SmallConfig) -> Robot:
+        return Robot(self.text)
+
+    def sections(self) -> dict[str, Any]:
+        """In place of those that every task has."""
+        return {}
+
+    def declare(self, config: SmallConfig) -> Declaration:
+        usual: dict[str, Any] = {
+            "actions": {"force": Action(terms.effort)},
+            "observations": {"place": Observation(terms.joint_position)},
+            "rewards": {"alive": Reward(terms.alive)},
+            "events": {"place": Event(terms.reset_to_default)},
+        }
+        return Declaration(**{**usual, **self.sections()})
+
+
 class Sliders(DeclaredTask):
     """Two sliders: every kind of term once."""
 

@@ -66,7 +66,7 @@ def _collide(geom: mujoco.MjsGeom) -> None:
 
 
 def touching_pairs(model: mujoco.MjModel, names: list[str]) -> set[frozenset[str]]:
-    """Pairs of geoms that MuJoCo lets collide: masks, bodies that are welded together or parent and child, excluded pairs."""
+    """Pairs of geoms that MuJoCo lets collide: what masks, welds, parents and excluded pairs leave of bodies that move."""
     excluded = {int(signature) for signature in model.exclude_signature}
     pairs = set()
     for first in range(model.ngeom):
@@ -77,9 +77,9 @@ def touching_pairs(model: mujoco.MjModel, names: list[str]) -> set[frozenset[str
             welds = [int(model.body_weldid[body]) for body in bodies]
             parents = [int(model.body_weldid[model.body_parentid[weld]]) for weld in welds]
             related = 0 not in welds and (welds[0] == parents[1] or welds[1] == parents[0])
-            if not masks or welds[0] == welds[1] or related or (bodies[0] << 16) + bodies[1] in excluded:
-                continue
-            pairs.add(frozenset((names[first], names[second])))
+            apart = welds[0] == welds[1] or related or (bodies[0] << 16) + bodies[1] in excluded
+            if masks and not apart and any(model.body_dofnum[welds]):
+                pairs.add(frozenset((names[first], names[second])))
     return pairs
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
+from tests.support.worker.sensing import template_of
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.randomizations import Randomizations
+from worker.simulation.robot import Robot
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
@@ -37,12 +37,11 @@ def build_arm(count: int = WORLDS) -> tuple[Worlds, RobotView]:
     return build_worlds(ARM.format(load="", hand=0.04), count, njmax=20, nconmax=0, disable_contacts=True)
 
 
-def build_worlds(xml: str, count: int = WORLDS, ground: bool = False, **options: object) -> tuple[Worlds, RobotView]:
-    robot, template = newton.ModelBuilder(), newton.ModelBuilder()
-    for builder in (robot, template):
-        SolverMuJoCo.register_custom_attributes(builder)
-    robot.add_mjcf(xml, ctrl_direct=True)
-    template.add_builder(robot, label_prefix="robot")
+def build_worlds(
+    robot: str | Robot, count: int = WORLDS, ground: bool = False, **options: object
+) -> tuple[Worlds, RobotView]:
+    """Worlds of a robot, declared or from an MJCF text."""
+    template = template_of({"robot": robot})
     options = {"iterations": 50, "ls_iterations": 50, "tolerance": 1e-8, **options}
     worlds = Worlds(
         template, count, "cpu", timestep=TIMESTEP, substeps=1, fastest=1e3, ground=ground, solver_options=options

@@ -1,10 +1,9 @@
-"""Robots of the mjlab package (Apache-2.0), whose files it brings along: as declared here, and as MuJoCo itself builds them."""
+"""Worlds of robots, and those of the mjlab package (Apache-2.0), whose files it brings along, as MuJoCo itself builds them."""
 
 from __future__ import annotations
 
 import fnmatch
 import importlib.util
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,65 +19,14 @@ from worker.simulation.collisions import Collision
 from worker.simulation.robot import Robot
 from worker.simulation.worlds import Worlds
 
-NATURAL = 20 * math.pi
-"""Natural frequency of the servos [rad/s]."""
-
-
-def _servo(joints: tuple[str, ...] | str, armature: float, effort: float) -> PositionActuator:
-    """mjlab's choice of gains: 10 Hz, twice critically damped."""
-    return PositionActuator(
-        joints, armature * NATURAL**2, 4 * armature * NATURAL, effort_limit=effort, armature=armature
-    )
-
-
-GO1 = Robot(
-    "package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml",
-    position=(0.0, 0.0, 0.278),
-    joint_positions={"*thigh_joint": 0.9, "*calf_joint": -1.8, "*R_hip_joint": 0.1, "*L_hip_joint": -0.1},
-    actuators=(
-        _servo(("*_hip_joint", "*_thigh_joint"), 0.000111842 * 36, 23.7),
-        _servo("*_calf_joint", 0.000111842 * 81, 35.55),
-    ),
-    collisions=(
-        Collision(
-            "*_collision*",
-            condim={"*_foot_collision": 6, "*": 1},
-            priority={"*_foot_collision": 1, "*": 0},
-            friction={"*_foot_collision": (1.0, 5e-3, 5e-4)},
-            solref=(0.01, 1.0),
-        ),
-    ),
-    visuals=False,
-)
-FOOT = "*_foot[1-7]_collision"
-G1 = Robot(
-    "package:mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml",
-    position=(0.0, 0.0, 0.76),
-    joint_positions={
-        "*_hip_pitch_joint": -0.312,
-        "*_knee_joint": 0.669,
-        "*_ankle_pitch_joint": -0.363,
-        "*_elbow_joint": 0.6,
-        "left_shoulder_roll_joint": 0.2,
-        "right_shoulder_roll_joint": -0.2,
-        "*_shoulder_pitch_joint": 0.2,
-    },
-    actuators=(
-        _servo(("*_elbow_joint", "*_shoulder_*_joint", "*_wrist_roll_joint"), 0.0036, 25.0),
-        _servo(("*_hip_pitch_joint", "*_hip_yaw_joint", "waist_yaw_joint"), 0.0102, 88.0),
-        _servo(("*_hip_roll_joint", "*_knee_joint"), 0.0251, 139.0),
-        _servo(("*_wrist_pitch_joint", "*_wrist_yaw_joint"), 0.00425, 5.0),
-        _servo(("waist_pitch_joint", "waist_roll_joint", "*_ankle_*_joint"), 0.0072, 50.0),
-    ),
-    collisions=(Collision("*_collision", condim={FOOT: 3, "*": 1}, priority={FOOT: 1, "*": 0}, friction={FOOT: 0.6}),),
-    visuals=False,
-)
+_WITHOUT_MJLAB = "the mjlab package, which has the robots' files, is not installed: make env installs it"
+needs_mjlab = pytest.mark.skipif(importlib.util.find_spec("mjlab") is None, reason=_WITHOUT_MJLAB)
 
 
 def need_mjlab() -> None:
     """Skip the test where the package with the robots' files is not installed."""
     if importlib.util.find_spec("mjlab") is None:
-        pytest.skip("the mjlab package, which has the robots' files, is not installed: make env installs it")
+        pytest.skip(_WITHOUT_MJLAB)
 
 
 def build(

@@ -15,6 +15,7 @@ from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot import Robot
 from worker.simulation.robot_view import RobotView, body_arrays
 from worker.simulation.sensors.sensor import Sensor, SensorContext
+from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
 
 WALKER = """<mujoco><option timestep="0.004"/><worldbody>
@@ -43,16 +44,8 @@ def walker(height: float = 0.36, sensors: str = "") -> str:
     return WALKER.format(height=height, sensors=f"<sensor>{sensors}</sensor>")
 
 
-def scene(
-    files: Mapping[str, str | Robot],
-    world_count: int = 2,
-    *,
-    substeps: int = 1,
-    timestep: float = 0.004,
-    ground: bool = False,
-    **options: Any,
-) -> SensorContext:
-    """Worlds of robots and objects, declared or from MJCF texts, by name, ready for sensors."""
+def template_of(files: Mapping[str, str | Robot]) -> newton.ModelBuilder:
+    """A world of robots and objects, declared or from MJCF texts, by name."""
     template = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(template)
     for name, text in files.items():
@@ -63,6 +56,20 @@ def scene(
         SolverMuJoCo.register_custom_attributes(part)
         part.add_mjcf(text, ctrl_direct=True)
         template.add_builder(part, label_prefix=name)
+    return template
+
+
+def scene(
+    files: Mapping[str, str | Robot],
+    world_count: int = 2,
+    *,
+    substeps: int = 1,
+    timestep: float = 0.004,
+    ground: bool | Terrain = False,
+    **options: Any,
+) -> SensorContext:
+    """Worlds of :func:`template_of`, ready for sensors."""
+    template = template_of(files)
     views = {name: RobotView(template, name) for name in files}
     worlds = Worlds(
         template,
@@ -82,7 +89,7 @@ def scene(
         robots={name: view.arrays(worlds) for name, view in views.items()},
         bodies=body_arrays(worlds),
         episodes=episodes,
-        terrain=None,
+        terrain=ground if isinstance(ground, Terrain) else None,
         control_hz=1.0 / (substeps * timestep),
     )
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
 import typing
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Self
 
 import numpy as np
 import warp as wp
@@ -32,11 +35,34 @@ READS = {
 }
 
 
+def terms_of(*modules: Any, without: Sequence[str] = ()) -> list[Any]:
+    """The terms that the modules define, but for those that only other terms call."""
+    found = [(module, each) for module in modules for each in vars(module).values() if isinstance(each, wp.Function)]
+    return [each for module, each in found if each.func.__module__ == module.__name__ and each.key not in without]
+
+
+def close(found: np.ndarray, wanted: Any, name: str = "", *, rtol: float = 1e-4, atol: float = 2e-5) -> None:
+    """Judge numbers in float32."""
+    np.testing.assert_allclose(found, np.asarray(wanted, dtype=float), rtol=rtol, atol=atol, err_msg=name)
+
+
 def rotations(random: np.random.Generator, *shape: int) -> np.ndarray:
     """Unit quaternions, of any rotation and either sign."""
     found = random.normal(size=(*shape, 4))
     units: np.ndarray = found / np.linalg.norm(found, axis=-1, keepdims=True)
     return units
+
+
+def matrix(rotation: Any) -> np.ndarray:
+    """Rotation matrices of quaternions xyzw, shape ``(..., 3, 3)``."""
+    x, y, z, w = np.moveaxis(np.asarray(rotation, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    found: np.ndarray = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return found
 
 
 def array(values: Any, dtype: Any = wp.float32) -> wp.array[Any]:
@@ -105,6 +131,30 @@ class Rig:
         self.structs = {WorldArrays: worlds, EpisodeArrays: episodes, BodyArrays: bodies} | (structs or {})
         self._signatures: dict[str, dict[str, Any]] = {}
         self._kernels = self._compile(terms, folder)
+
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[Self]:
+        """All arrays are afterwards as they were, whatever is written meanwhile."""
+        structs = [*self.structs.items(), (RobotArrays, self.robot)]
+        arrays = [(each, name, getattr(each, name)) for kind, each in structs for name in kind.cls.__annotations__]
+        before = [
+            (*each, each[-1].numpy().copy()) for each in arrays if isinstance(each[-1], wp.array) and each[-1].size
+        ]
+        yield self
+        for struct, name, array_of, values in before:
+            array_of.assign(values)
+            setattr(struct, name, array_of)
+
+    def root(self) -> SimpleNamespace:
+        """What the root is and does, by numpy."""
+        turn = matrix(self.q[:, ROOT + 3 : ROOT + 7])
+        yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+        linear, angular = self.qd[:, ROOT_DOF : ROOT_DOF + 3], self.qd[:, ROOT_DOF + 3 : ROOT_DOF + 6]
+        arm = np.einsum("wij,wj->wi", turn, self.bodies.coms.numpy()[:, ROOT_BODY])
+        origin = linear - np.cross(angular, arm)
+        seen = {"origin": origin, "linear": linear, "angular": angular}
+        own = {f"own_{name}": np.einsum("wji,wj->wi", turn, each) for name, each in seen.items()}
+        return SimpleNamespace(turn=turn, yaw=yaw, **seen, **own)
 
     def call(self, term: Any, element: int = 0, *, robot: RobotArrays | None = None, **numbers: Any) -> np.ndarray:
         """What a term gives in each world, shape ``(worlds,)`` or ``(worlds, numbers)``; a bool is 0 or 1.

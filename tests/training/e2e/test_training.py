@@ -1,22 +1,16 @@
-"""Training through the real command: from YAML to a policy that balances, stopped and resumed, killed and restarted."""
+"""Training through the real command: from YAML to a policy that balances, stopped and resumed, with a damaged checkpoint."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
 from pathlib import Path
-
-import pytest
 
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import Serving, run_muster, wait_for
-from tests.support.processes import gang_members, processes_of
+from tests.conftest import Serving, run_muster
+from tests.support.processes import processes_of
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
-
-long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="a minute: MUSTER_LONG=1, in make bits")
 
 
 def test_one_command_trains_a_gang_of_three_that_balances_the_pole(tmp_path: Path) -> None:
@@ -57,14 +51,8 @@ def test_a_stopped_run_goes_on_at_the_next_iteration(server: Serving) -> None:
     steps = records[0]["env_steps"]
     assert [record["env_steps"] for record in records] == [steps * i for i in range(1, target + 1)]
 
-    again = server.muster("resume", job["run"])
-    assert again.returncode == 1 and f"complete at iteration {target}" in again.stderr
     missing = server.muster("resume", job["run"], "--checkpoint", "3")
     assert missing.returncode == 2 and "has no checkpoint of iteration 3" in missing.stderr
-    reseeded = server.muster("resume", job["run"], "--set", "train.seed=9", "--set", "train.iterations=9999")
-    assert reseeded.returncode == 2 and "train.seed" in reseeded.stderr
-    resized = server.muster("resume", job["run"], "--set", "train.worlds=5", "--set", "train.iterations=9999")
-    assert resized.returncode == 2 and "holds 32 worlds" in resized.stderr
     _check_damage(server, job["run"], target)
 
 
@@ -85,38 +73,5 @@ def _check_damage(server: Serving, run: str, target: int) -> None:
     detail = server.wait(json.loads(resumed.stdout)["jobId"], timeout=240)
     assert detail["status"] == "SUCCEEDED", detail["statusReason"]
     log = "\n".join(server.log(detail["id"]))
-    assert newest["name"] in log and "learner.pt has" in log
+    assert newest["name"] in log and "learner.pt has" in log and f"set aside as {newest['name']}.damaged" in log
     assert Path(f"{newest['path']}.damaged").is_dir()
-
-
-@long
-def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Serving) -> None:
-    job = submit(server, "train.iterations=4000", "retry.attempts=2")
-    wait_for_iteration(server, job["run"], 6)
-    [victim] = gang_members(server.home, "rank", 1)
-    victim.strike(signal.SIGKILL)
-    wait_for(lambda: len(server.detail(job["id"])["attempts"]) == 2, 60, "a second attempt")
-    reached = raw_iterations(server, job["run"])[-1]
-    wait_for(lambda: raw_iterations(server, job["run"])[-1] > reached + 6, 120, "progress after the restart")
-    assert server.muster("stop", job["id"]).returncode == 0
-    detail = server.detail(job["id"])
-    first, second = detail["attempts"]
-    # under load the main node's broken collective may be seen before the end that broke it
-    reasons = [str(node.get("reason")) for node in first["nodes"]]
-    assert any("rank 1 was killed by SIGKILL" in reason for reason in reasons) and first["spent"]
-    assert second["number"] == 2 and second["epoch"] == first["epoch"] + 1
-    log = "\n".join(server.log(job["id"], attempt=2))
-    start = int(re.search(r"resumed from checkpoint (\d{8})-e\d+", log)[1])
-    assert start >= 5 and start % 5 == 0
-    records = server.client.get(f"/api/runs/{job['run']}/metrics")
-    assert [record["iteration"] for record in records] == list(range(1, len(records) + 1))
-    assert not processes_of(server.home)
-
-
-@long
-def test_ant_trains_on_two_nodes(server: Serving) -> None:
-    done = server.muster_process(
-        "submit", "job_specs/ant.yaml", "-f", "--set", "train.iterations=2", "--set", "train.worlds=8", timeout=500
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "SUCCEEDED" in done.stdout

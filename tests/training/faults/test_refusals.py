@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ import torch
 from shared_store.checkpoints import FORMAT, Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.layout import Store
 from tests.conftest import Serving
+from tests.support.refusals import refusal
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from tests.support.worker.trained import run_in
@@ -78,20 +80,13 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        ("train.task=Ant", ["train.task is 'Cartpole' and can't become 'Ant'"]),
         ("train.seed=9", ["train.seed is 1 and can't become 9"]),
-        ("train.config={cart_limit: 5.0}", ["train.config is {} and can't become {'cart_limit': 5.0}"]),
-        ("train.config={cart_limt: 5.0}", ["train.config.cart_limt: CartpoleConfig has no such key; did you mean"]),
         ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is not set and can't become [8]", "has learnt"]),
-        ("train.ppo.activation=relu", ["train.ppo.activation is not set and can't become 'relu'"]),
-        ("train.ppo.init_std=0.5", ["train.ppo.init_std is not set and can't become 0.5", "has learnt"]),
         ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 node × 1 rank × 9)", "leave train.worlds"]),
         ("nodes=9", ["8 worlds can't be distributed over 9 ranks; use fewer nodes"]),
     ],
 )
-def test_another_task_seed_network_or_number_of_worlds(
-    served: tuple[Serving, str], change: str, parts: list[str]
-) -> None:
+def test_another_seed_network_or_number_of_worlds(served: tuple[Serving, str], change: str, parts: list[str]) -> None:
     said = refused(served, 2, "--set", change)
     assert all(part in said for part in (served[1], *parts)), said
 
@@ -102,10 +97,9 @@ def test_a_learning_rate_that_the_checkpoint_s_job_had_and_that_has_adapted_sinc
     rate = newest.manifest["learning_rate"]
     edit_manifest(newest, learning_rate=4e-4)
     try:
-        for form in ("train.ppo.learning_rate=1.0e-3", "train.ppo={learning_rate: 0.001}"):
-            said = refused(served, 2, "--set", form)
-            assert "train.ppo.learning_rate is 0.001 already" in said and "which is 0.0004 now" in said, said
-            assert "or train.ppo.schedule=fixed" in said
+        said = refused(served, 2, "--set", "train.ppo.learning_rate=1.0e-3")
+        assert "train.ppo.learning_rate is 0.001 already" in said and "which is 0.0004 now" in said, said
+        assert "or train.ppo.schedule=fixed" in said
     finally:
         edit_manifest(newest, learning_rate=rate)
 
@@ -168,7 +162,7 @@ def go_on(store: Path, **changes: Any) -> Loop:
         ({"config": {"limit": 2.0}}, "train.config is None there and {'limit': 2.0} here"),
         ({"ppo": {"hidden_sizes": [8]}}, r"ppo.hidden_sizes is \[16, 16\] there and \[8\] here"),
         ({"ppo": {"normalize_observations": False}}, "ppo.normalize_observations is True there and False here"),
-        ({"worlds": 9}, r"holds 8 worlds \(1 rank of 8\), this job has 9"),
+        ({"worlds": 9}, r"holds 8 worlds \(1 rank of 8\), this job has 9 \(1 rank of 9\).*product is 8"),
     ],
 )
 def test_the_worker_refuses_what_differs(trained: Path, changes: dict[str, Any], difference: str) -> None:
@@ -188,9 +182,8 @@ def test_the_worker_never_sets_a_newer_format_aside(store: Path) -> None:
 def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, name: str) -> None:
     (newest,) = list_checkpoints(Store(store).run("run"))
     poison(newest, name, tmp_path / "executed")
-    with pytest.raises(UserError, match=rf"{name} asks for \w+\.mkdir: only tensors and plain values") as error:
-        go_on(store)
-    assert "\n" not in str(error.value)
+    said = refusal(go_on, store, error=UserError)
+    assert re.search(rf"{name} asks for \w+\.mkdir: only tensors and plain values", said)
     if name == "learner.pt":
         with pytest.raises(UserError, match="asks for"):  # as `muster export` and `evaluate` read it
             load_learner(newest)
@@ -215,6 +208,4 @@ def test_a_file_of_something_else_is_named(store: Path, content: Any, said: str)
         torch.save(content, path)
     entry = {"size": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     edit_manifest(newest, files={**newest.manifest["files"], "learner.pt": entry})
-    with pytest.raises(UserError, match=said) as error:
-        go_on(store)
-    assert "\n" not in str(error.value)
+    assert said in refusal(go_on, store, error=UserError)

@@ -17,9 +17,13 @@ import torch.distributed as dist
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.conftest import PATIENCE
+from tests.support.worker.loop import iterate, setting_of
+from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
 from worker.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
 from worker.errors import GangError
+from worker.learning.algorithm import Share
+from worker.learning.ppo.fused import PPO
 
 WORLDS = 7  # two ranks get 3 and 4
 
@@ -35,26 +39,14 @@ def learn() -> int:
 
 def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
     """Three iterations, each of several passes over several minibatches."""
-    from tests.support.worker.point_task import Point, PointConfig, PointPPO
-    from worker.learning.algorithm import Setting, Share
-    from worker.learning.ppo.fused import PPO
-    from worker.learning.setup import observed, spaces_of, transition
-
     share = Share.of(gang.rank, gang.size, WORLDS)
     config = PointPPO(epochs=3, minibatches=4)
     task = Point(PointConfig(ppo=config), share.count, seed=2, first_world=share.first)
     task.set_random_episode_length()
     torch.manual_seed(7)
-    ppo = PPO(config, Setting(spaces_of(task), share, gang, 4))
-    observations = observed(task)
-    step = transition(task, observations)
-    found = []
+    ppo, found = PPO(config, setting_of(task, 4, gang, share)), []
     for iteration in range(3):
-        ppo.begin(iteration)
-        for _ in range(config.steps):
-            task.step(ppo.act(observations))
-            ppo.record(step)
-        metrics = ppo.learn(observations)
+        metrics = iterate(ppo, task, iteration, iteration + 1)
         norm = ppo.actor.obs_normalizer
         found.append(
             {
@@ -115,9 +107,8 @@ def report() -> int:
 
 def test_a_missing_main_rank_is_named() -> None:
     placement = Placement(rank=1, world_size=2, master_port=free_port())
-    with pytest.raises(
-        GangError, match=r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
-    ):
+    said = r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
+    with pytest.raises(GangError, match=said):
         connect(placement, report_seconds=1.0)
 
 
@@ -229,7 +220,6 @@ def test_a_malformed_placement_is_refused(env: dict[str, str], message: str) -> 
 def test_a_rank_whose_gpu_pytorch_cannot_use_does_not_train_on_the_cpu_in_silence() -> None:
     for none in ("", "-1", "NoDevFiles"):
         require_gpus(none, 0)
-    with pytest.raises(
-        ValueError, match=r"this node has GPU 0,1, and PyTorch .* can use none of them; install a PyTorch"
-    ):
+    said = r"this node has GPU 0,1, and PyTorch .* can use none of them; install a PyTorch"
+    with pytest.raises(ValueError, match=said):
         require_gpus("0,1", 1)

@@ -313,9 +313,10 @@ def a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(gang: Gang, store
     runner(training(store, run="poisoned", every=1, config=config), gang).train()
 
 
-def test_a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(told: list[Any]) -> None:
+def test_a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(told: list[Any], store: Path) -> None:
     assert told[0].startswith("TrainingError: iteration 2: the loss is not finite")
     assert "; checkpoint 00000001-e1 stands." in told[0] and "; there is no checkpoint yet." in told[1]
+    assert [each.name for each in list_checkpoints(Store(store).run("poisoned"))] == ["00000001-e1"]
 
 
 class Tripping(Point):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import threading
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import pytest
 import torch
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 
 from shared_store.files import write_json
@@ -74,9 +76,6 @@ def running(task: CartpolePixels, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_recorded_training_has_the_images_of_each_step(running: Running, tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
     made = record(running.run, "job", 2, 2, tmp_path / "pixels.mcap", 60.0)
     found: dict[str, list[np.ndarray]] = {"0": [], "1": []}
     steps: list[int] = []
@@ -96,7 +95,7 @@ def test_a_recorded_training_has_the_images_of_each_step(running: Running, tmp_p
     assert len({image.tobytes() for image in found["0"]}) > 5, "the camera sees the cart move"
 
 
-class File:
+class File(AbstractContextManager):
     """In place of the page: Rerun's stream goes into a file; after some frames the user ends the view."""
 
     def __init__(self, server: Path, stop: list[int]) -> None:
@@ -107,12 +106,7 @@ class File:
         if not self._left:
             self._stop.append(2)
 
-    def __enter__(self) -> File:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         pass
 
 
@@ -129,9 +123,8 @@ def test_the_live_view_of_a_training_shows_them_beside_each_other(running: Runni
             blobs = chunk.to_record_batch()["EncodedImage:blob"].to_pylist()
             shown += [np.asarray(Image.open(io.BytesIO(bytes(blob[0])))) for blob in blobs]
     assert len(shown) == view.frames
-    both = {
-        np.hstack([running.newest(step, 0), running.newest(step, 1)]).tobytes() for step in range(len(running.seen))
-    }
+    steps = range(len(running.seen))
+    both = {np.hstack([running.newest(step, world) for world in (0, 1)]).tobytes() for step in steps}
     assert all(picture.shape == (8, 24, 3) and picture.tobytes() in both for picture in shown)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -16,8 +17,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from PIL import Image
 
 from tests.support.waiting import wait_for
+from tests.support.worker.in_process import call_worker
 from worker.errors import UserError
 from worker.tasks.cartpole import Cartpole
 from worker.tasks.configs.cartpole import CartpoleConfig
@@ -63,9 +68,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 @pytest.fixture(scope="module")
 def messages(recorded: Recorded) -> dict[str, list[Any]]:
     """By topic, decoded by mcap-ros2-support, which shares no code with what wrote them."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
     found: dict[str, list[Any]] = {}
     with recorded.path.open("rb") as file:
         for decoded in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
@@ -110,9 +112,8 @@ def test_every_link_has_its_frame_in_a_world_of_its_own(recorded: Recorded, mess
         where, turn = pole.transform.translation, pole.transform.rotation
         # the pole hangs on the cart, 1 m above the ground, and turns about y
         np.testing.assert_allclose([where.x, where.y, where.z], [slider, 0.0, 1.0], atol=1e-6)
-        np.testing.assert_allclose(
-            [turn.x, turn.y, turn.z, turn.w], [0.0, np.sin(hinge / 2), 0.0, np.cos(hinge / 2)], atol=1e-6
-        )
+        turned = [turn.x, turn.y, turn.z, turn.w]
+        np.testing.assert_allclose(turned, [0.0, np.sin(hinge / 2), 0.0, np.cos(hinge / 2)], atol=1e-6)
 
 
 def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]) -> None:
@@ -127,8 +128,6 @@ def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]
 
 
 def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]]) -> None:
-    from PIL import Image
-
     message, *others = messages["/world_1/eye/image/compressed"]
     assert len(others) == STEPS - 1 and len(messages["/world_0/eye/image/compressed"]) == STEPS
     pixels = np.asarray(Image.open(io.BytesIO(bytes(message.data))))
@@ -137,8 +136,6 @@ def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]
 
 
 def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached(recorded: Recorded) -> None:
-    from mcap.reader import make_reader
-
     with recorded.path.open("rb") as file:
         reader = make_reader(file)
         assert reader.get_header().profile == "ros2"
@@ -155,8 +152,6 @@ def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached
 
 
 def test_an_episode_of_which_the_beginning_was_not_seen_is_not_complete(recorded: Recorded, tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
     recording = Recording(tmp_path / "late.mcap", recorded.stage, {}, {})
     for rows in recorded.rows[11:25]:  # the first of them ends an episode
         recording.write(rows)
@@ -183,48 +178,31 @@ def test_rerun_finds_nothing_wrong_with_the_file(recorded: Recorded, tmp_path: P
         pytest.skip("rerun-sdk (the extra [viz], 170 MB) is not installed: Rerun has not read the recording")
     checked = subprocess.run([rerun, "mcap", "check", recorded.path], capture_output=True, text=True, check=True)
     assert len([line for line in checked.stdout.splitlines() if line.startswith("ok")]) == 11, checked.stdout
-    subprocess.run(
-        [rerun, "mcap", "convert", recorded.path, "-o", tmp_path / "two.rrd"], check=True, capture_output=True
-    )
+    convert = [rerun, "mcap", "convert", recorded.path, "-o", tmp_path / "two.rrd"]
+    subprocess.run(convert, check=True, capture_output=True)
     assert (tmp_path / "two.rrd").stat().st_size > 10_000
 
 
-FOR_EVER = """
-import sys
-from pathlib import Path
-import torch
-import warp
-warp.config.log_level = warp.LOG_WARNING
-from tests.training.worker.test_recording import CONFIG, Cartpole, Reading, Recording, Stage, Tap, UserError
-task = Cartpole(CONFIG, 2, seed=3)
-tap = Tap(task, 2)
-tap.open()
-reading = Reading(tap)
-try:
-    recording = Recording(Path(sys.argv[1]), Stage(Cartpole, CONFIG, 2), {}, {})
+def record_for_ever(path: Path) -> None:
+    """Until this process is killed, or there is no space."""
+    task = Cartpole(CONFIG, 2, seed=3)
+    tap = Tap(task, 2)
+    tap.open()
+    reading = Reading(tap)
+    recording = Recording(path, Stage(Cartpole, CONFIG, 2), {}, {})
     while True:
         task.step(torch.zeros(2, 1))
         recording.write(reading.take())
-except UserError as error:
-    print(error)
-"""
-
-
-def recording_process(path: Path, before: str = "") -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", before + FOR_EVER, str(path)], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True
-    )
 
 
 def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
     path, partial = tmp_path / "cut.mcap", tmp_path / "cut.mcap.partial"
-    process = recording_process(path)
+    script = "import sys; from pathlib import Path; from tests.training.worker.test_recording import record_for_ever; "
+    command = [sys.executable, "-c", f"{script}record_for_ever(Path(sys.argv[1]))", str(path)]
+    process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
     begun = wait_for(lambda: partial.exists() and partial.stat().st_size, 60, "the recording's begin")
-    flushed = wait_for(
-        lambda: (size := partial.stat().st_size) > begun + 20_000 and size, 60, "some steps that were flushed"
-    )
+    size = lambda: partial.stat().st_size  # noqa: E731
+    flushed = wait_for(lambda: size() > begun + 20_000 and size(), 60, "some steps that were flushed")
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not path.exists()
@@ -232,21 +210,15 @@ def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_
         file.write(b"\x06" + (1 << 20).to_bytes(8, "little") + b"cut")
     cut = partial.read_bytes()
     assert len(cut) > flushed
-    done = subprocess.run(
-        [sys.executable, "-m", "worker.telemetry.live", "--recover", str(partial)],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = call_worker(main, {}, "--recover", str(partial))
+    assert done.returncode == 0, done.stderr
     assert str(path) in done.stdout and partial.read_bytes() == cut
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
-        topics = {
-            channel.topic: summary.statistics.channel_message_counts[key] for key, channel in summary.channels.items()
-        }
+        counts = summary.statistics.channel_message_counts
+        topics = {channel.topic: counts[key] for key, channel in summary.channels.items()}
         assert len([each for each in reader.iter_metadata()]) > 0
     assert topics["/tf"] > 20 and topics["/tf"] - topics["/world_1/rl/step"] in (0, 1)
     assert topics["/world_0/scene"] == 1
@@ -254,29 +226,35 @@ def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_
         recover(partial)
 
 
-def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_what_it_has(tmp_path: Path) -> None:
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
-    process = recording_process(tmp_path / "full.mcap", limit)
-    said, _ = process.communicate()
-    assert process.returncode == 0
-    (said,) = [line for line in said.splitlines() if "Warp" not in line]
+def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_what_it_has(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """After another recording, so that no kernel has to be written any more."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(UserError) as refused:
+            record_for_ever(tmp_path / "full.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = str(refused.value)
     assert "full.mcap.partial: it can't be written (File too large)" in said and "muster record --recover" in said
+    assert "\n" not in said
     made = recover(tmp_path / "full.mcap.partial")
     assert made is not None and made[0] == tmp_path / "full.mcap" and made[1] > 20
     assert not os.path.exists(tmp_path / ".full.mcap.tmp")
 
 
 def test_a_whole_recording_and_one_without_a_step_are_not_recovered_and_nothing_is_made(
-    recorded: Recorded, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, tmp_path: Path
 ) -> None:
     whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap.partial"
     whole.write_bytes(recorded.path.read_bytes())
     Recording(tmp_path / "cut.mcap", recorded.stage, {}, {})  # it has its beginning, and is never finished
     for file, code, words in ((whole, 0, "it is whole already"), (cut, 1, "it ends before the first control step")):
-        monkeypatch.setattr(sys, "argv", ["live", "--recover", str(file)])
-        assert main() == code
-        said = capfd.readouterr()
-        (line,) = (said.out + said.err).splitlines()
+        done = call_worker(main, {}, "--recover", str(file))
+        assert done.returncode == code
+        (line,) = (done.stdout + done.stderr).splitlines()
         assert f"{file}: {words}" in line
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap.partial", "whole.mcap"]
 

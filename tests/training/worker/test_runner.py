@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,10 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import PATIENCE
+from tests.support.refusals import refusal
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.point_task import Point
-from tests.support.worker.ranks import free_port, run_ranks, start_rank, training
+from tests.support.worker.ranks import run_ranks, training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.distributed import Placement
 from worker.errors import TrainingError, UserError
@@ -29,6 +28,7 @@ from worker.learning import algorithms
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import configure
 from worker.learning.loop import Loop
+from worker.learning.ppo.fused import PPO
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
@@ -88,34 +88,6 @@ def test_worlds_are_dealt_out_again_to_another_number_of_ranks(two_ranks: Path) 
     assert alone.train() == 0
 
 
-def test_another_number_of_worlds_is_refused(two_ranks: Path) -> None:
-    with pytest.raises(
-        UserError, match=r"holds 16 worlds \(2 ranks of 8\), this job has 5 \(1 rank of 5\).*product is 16"
-    ):
-        runner(training(two_ranks, run="stopped", worlds=5, epoch=4))
-
-
-def test_another_network_is_refused(two_ranks: Path) -> None:
-    with pytest.raises(UserError, match="does not fit this job's task and algorithm"):
-        runner(training(two_ranks, run="stopped", worlds=16, epoch=4, ppo={"hidden_sizes": [8]}))
-
-
-def test_a_damaged_checkpoint_is_named_set_aside_and_the_one_before_is_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    train(training(tmp_path, iterations=4, every=2))
-    path = last(tmp_path, "run") / "learner.pt"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    resumed = runner(training(tmp_path, iterations=6, epoch=2))
-    assert resumed.resumed is not None and resumed.resumed.name == "00000002-e1"
-    output = capsys.readouterr().out
-    assert "warning: checkpoint 00000004-e1: the content of learner.pt was altered" in output
-    assert "set aside as 00000004-e1.damaged" in output
-    assert [c.name for c in list_checkpoints(Store(tmp_path).run("run"))] == ["00000002-e1"]
-
-
 def test_what_is_ordered_while_a_device_works_is_the_state_before_that_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,18 +128,8 @@ def test_a_chosen_checkpoint_is_gone_on_from(tmp_path: Path) -> None:
     chosen = {"MUSTER_CHECKPOINT": "00000002-e1", "MUSTER_JOB_EPOCH": "2"}
     assert runner(training(tmp_path, iterations=6, epoch=2) | chosen).state.progress.iteration == 2
     train(training(tmp_path, iterations=6, epoch=2) | chosen)
-    assert runner(training(tmp_path, iterations=6, epoch=3) | chosen).state.progress.iteration == 6, (
-        "its own progress is newer"
-    )
-
-
-def test_a_finished_run_is_only_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    train(training(tmp_path, iterations=2))
-    capsys.readouterr()
-    train(training(tmp_path, iterations=2, epoch=2))
-    output = capsys.readouterr().out
-    assert "evaluation: mean episode length" in output and "iteration 1/" not in output
-    assert [c.name for c in list_checkpoints(Store(tmp_path).run("run"))] == ["00000002-e1"]
+    newer = runner(training(tmp_path, iterations=6, epoch=3) | chosen)
+    assert newer.state.progress.iteration == 6, "its own progress is newer"
 
 
 def test_a_finished_run_has_all_its_files(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -203,14 +165,6 @@ def test_evaluation_leaves_the_worlds_as_they_were(tmp_path: Path) -> None:
     assert all(torch.equal(tensor, before[name]) for name, tensor in started.task.state_dict().items())
 
 
-def test_nan_stops_training_and_keeps_the_last_checkpoint(tmp_path: Path) -> None:
-    env = training(tmp_path, iterations=9, every=1, config={"poison_at": 20})  # in the third iteration of 8 steps
-    started = runner(env)
-    with pytest.raises(TrainingError, match=r"iteration 3: the loss is not finite .*checkpoint 00000002-e1 stands"):
-        started.train()
-    assert [c.iteration for c in list_checkpoints(started.job.run)] == [1, 2]
-
-
 def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,57 +195,25 @@ def test_a_newer_attempt_stops_this_one(tmp_path: Path) -> None:
     assert list_checkpoints(started.job.run) == []
 
 
-def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> None:
-    env = training(tmp_path, iterations=100000, config={"sleep": 0.002})
-    port = free_port()
-    ranks = [start_rank("train", rank, 2, port, env) for rank in (0, 1)]
-    try:
-        assert ranks[0].stdout
-        seen = next(line for line in ranks[0].stdout if line.startswith("iteration") and " 3/" in line)
-        assert seen
-        ranks[1].send_signal(signal.SIGTERM)
-        outputs = [rank.communicate(timeout=30 * PATIENCE) for rank in ranks]
-    finally:
-        for rank in ranks:
-            rank.kill()
-    assert [rank.returncode for rank in ranks] == [75, 75], outputs
-    (checkpoint,) = list_checkpoints(Store(tmp_path).run("run"))
-    checkpoint.verify()
-    assert checkpoint.iteration >= 3
-    assert f"asked to stop: left after iteration {checkpoint.iteration} of 100000" in outputs[0][0]
-
-
 @pytest.mark.parametrize(
     ("section", "message"),
     [
         ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
         ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; algorithm rsl_rl has it"),
-        ({"config": {"ppo": {}}}, "train.config.ppo: not a key of PointConfig; settings of ppo stand under train.ppo"),
         ({"ppo": {"steps": 1.5}}, "train.ppo.steps: expected a whole number, found a number (1.5)"),
         ({"ppo": {"normalize_observations": 1}}, "train.ppo.normalize_observations: expected true or false, found a "),
         ({"ppo": {"hidden_sizes": []}}, "train.ppo.hidden_sizes: expected at least one number, found []"),
-        (
-            {"ppo": {"minibatches": 9}},
-            "train.ppo: minibatches: 9 minibatches need as many steps of each world, there are 8",
-        ),
         ({"ppo": {"learning_rate": "fast"}}, "train.ppo.learning_rate: expected a number, found a text ('fast')"),
-        (
-            {"algorithm": "pppo"},
-            "train.algorithm: no algorithm is called 'pppo'; known: ppo, rsl_rl, sac, and module:Class",
-        ),
-        ({"algorithm": f"{Point.__module__}:Point"}, "is no algorithm: it lacks captures_rollout, begin, act"),
     ],
 )
 def test_wrong_overrides_are_refused(section: dict, message: str) -> None:
-    with pytest.raises(UserError) as error:
-        configured(section)
-    assert message in str(error.value)
+    assert message in refusal(configured, section, error=UserError)
 
 
 def configured(section: dict[str, Any]) -> tuple[Any, Any]:
-    """The task's configuration and the algorithm's settings of a job."""
-    config, name = configure(Point, section), section.get("algorithm", "ppo")
-    return config, algorithms.settings(algorithms.find_algorithm(name), name, config, section)
+    """The task's configuration and PPO's settings of a job."""
+    config = configure(Point, section)
+    return config, algorithms.settings(PPO, "ppo", config, section)
 
 
 def test_right_overrides_are_taken() -> None:
@@ -313,11 +235,8 @@ def test_user_errors_are_one_line_and_reach_the_supervisor(
     tmp_path: Path, command: str, spec: dict | None, message: str, code: int
 ) -> None:
     errors = tmp_path / "error.json"
-    env = {
-        **training(tmp_path),
-        "TORCHELASTIC_ERROR_FILE": str(errors),
-        "MUSTER_SPEC": json.dumps(spec) if spec else "",
-    }
+    given = {"TORCHELASTIC_ERROR_FILE": str(errors), "MUSTER_SPEC": json.dumps(spec) if spec else ""}
+    env = {**training(tmp_path), **given}
     done = call_worker({"train": worker.train.main, "export": worker.export.main}[command], env)
     assert done.returncode == code
     (line,) = done.stderr.strip().splitlines()

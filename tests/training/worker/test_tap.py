@@ -38,11 +38,16 @@ def drawn(step: int, worlds: int = 6) -> torch.Tensor:
     return torch.rand(worlds, 1, generator=torch.Generator().manual_seed(step)) * 2.0 - 1.0
 
 
+def opened(task: Cartpole, worlds: int) -> tuple[Tap, Reading]:
+    tap = Tap(task, worlds, rows=16)
+    tap.open()
+    return tap, Reading(tap)
+
+
 def test_a_row_holds_the_result_of_the_step(task: Cartpole) -> None:
     task.reset()
-    tap = Tap(task, 4, rows=16)
-    tap.open()
-    reading, ended = Reading(tap), np.zeros(4, int)
+    tap, reading = opened(task, 4)
+    ended = np.zeros(4, int)
     assert len(reading.take()) == 0
     for number in range(40):  # over the end of the ring twice, and over the ends of episodes
         task.step(drawn(number))
@@ -67,9 +72,7 @@ def test_a_row_holds_the_result_of_the_step(task: Cartpole) -> None:
 
 def test_the_terms_of_the_step_that_ends_an_episode_are_kept(task: Cartpole) -> None:
     task.reset()
-    tap = Tap(task, 2, rows=16)
-    tap.open()
-    reading = Reading(tap)
+    tap, reading = opened(task, 2)
     wp.to_torch(task.worlds.arrays.joint_q)[0, 1] = 1.0  # beyond angle_limit, 0.4
     task.step(torch.zeros(6, 1))
     rows = reading.take()
@@ -81,9 +84,7 @@ def test_the_terms_of_the_step_that_ends_an_episode_are_kept(task: Cartpole) -> 
 
 
 def test_rows_beyond_the_ring_are_counted_as_lost(task: Cartpole) -> None:
-    tap = Tap(task, 1, rows=16)
-    tap.open()
-    reading = Reading(tap)
+    tap, reading = opened(task, 1)
     for number in range(40):
         task.step(drawn(number))
     rows = reading.take()

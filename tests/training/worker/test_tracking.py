@@ -57,6 +57,17 @@ def train(run: Run, epoch: int, track: dict[str, Any], **env: str) -> tuple[int,
     return done.returncode, done.stdout + done.stderr
 
 
+def killed_and_gone_on(run: Run, track: dict[str, Any]) -> list[dict[str, Any]]:
+    """The records of a training that was killed on its way and went on; every iteration is there once."""
+    code, output = train(run, 1, track, MUSTER_KILL_AT="33")
+    assert code == -9, output
+    code, output = train(run, 2, track)
+    assert code == 0 and "resumed from checkpoint 000000" in output and ": warning" not in output, output
+    records = read_metrics(run)
+    assert [each["iteration"] for each in records] == list(range(1, 41))
+    return records
+
+
 def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_every_iteration_once(run: Run) -> None:
     pytest.importorskip("wandb", reason="pip install 'muster[wandb]', or make services")
     mlflow = pytest.importorskip("mlflow", reason="pip install 'muster[mlflow]', or make services")
@@ -65,14 +76,7 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
         "wandb": {"mode": "offline", "project": "poles", "tags": ["a"]},
         "mlflow": {"uri": uri, "tags": {"b": "c"}},
     }
-    code, output = train(run, 1, track, MUSTER_KILL_AT="33")
-    assert code == -9, output
-    code, output = train(run, 2, track)
-    assert code == 0, output
-    assert "resumed from checkpoint 000000" in output and ": warning" not in output
-
-    expected = read_metrics(run)
-    assert [each["iteration"] for each in expected] == list(range(1, 41))
+    expected = killed_and_gone_on(run, track)
     client = mlflow.MlflowClient(uri)
     [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
     assert there.info.status == "FINISHED" and there.info.run_name == "taught" and there.data.tags["b"] == "c"
@@ -106,12 +110,7 @@ def server(tmp_path: Path) -> Iterator[str]:
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    places = [
-        "--backend-store-uri",
-        f"sqlite:///{tmp_path}/served.db",
-        "--artifacts-destination",
-        str(tmp_path / "artifacts"),
-    ]
+    places = [f"--backend-store-uri=sqlite:///{tmp_path}/served.db", f"--artifacts-destination={tmp_path}/artifacts"]
     with open(tmp_path / "server.log", "wb") as log:
         process = subprocess.Popen(
             command + places,
@@ -139,19 +138,13 @@ def server(tmp_path: Path) -> Iterator[str]:
 
 
 def test_over_http_a_training_that_was_killed_and_goes_on_is_one_run_of_mlflow_s_server(run: Run, server: str) -> None:
-    track = {"mlflow": {"uri": server, "experiment": "poles"}}
-    code, output = train(run, 1, track, MUSTER_KILL_AT="33")
-    assert code == -9, output
-    code, output = train(run, 2, track)
-    assert code == 0 and "resumed from checkpoint 000000" in output and ": warning" not in output, output
+    expected = killed_and_gone_on(run, {"mlflow": {"uri": server, "experiment": "poles"}})
     client = importlib.import_module("mlflow").MlflowClient(server)
     [there] = client.search_runs([client.get_experiment_by_name("poles").experiment_id])
     assert there.info.status == "FINISHED" and there.info.run_name == "taught"
-    expected = read_metrics(run)
     for name, key in (("train/env_steps", "env_steps"), ("train/kl", "kl")):
         told = client.get_metric_history(there.info.run_id, name)
         assert [(each.step, each.value) for each in told] == [(each["iteration"], each[key]) for each in expected]
-    assert [each["iteration"] for each in expected] == list(range(1, 41))
     assert {each.path for each in client.list_artifacts(there.info.run_id)} == {"reward.png", "00000040-e2.json"}
     assert len(list((run.path.parent.parent.parent / "artifacts").rglob("reward.png"))) == 1, "sent through the server"
 
