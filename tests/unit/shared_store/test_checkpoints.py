@@ -116,18 +116,6 @@ def test_a_checkpoint_is_durable_before_it_gets_its_name(run: Run, monkeypatch: 
     assert ("rename", str(run.checkpoints / "LATEST")) in after
 
 
-def test_all_ranks_write_into_one_folder_whose_notes_and_older_manifest_are_no_part_of_it(run: Run) -> None:
-    first, second = CheckpointWriter(run, 25, 1), CheckpointWriter(run, 25, 1)
-    for name in ("rank-0.pt", ".rank-0.json", "manifest.json"):
-        (second.path / name).write_text("{}")
-    found = first.commit({})
-    found.verify()
-    assert list(found.manifest["files"]) == ["rank-0.pt"]
-    assert sorted(os.listdir(found.path)) == ["manifest.json", "rank-0.pt"]
-    digests = {"rank-0.pt": {"size": 1, "sha256": "its writer's"}}
-    assert CheckpointWriter(run, 26, 1).commit({}, digests=digests).manifest["files"] == digests
-
-
 def test_a_name_is_never_written_twice(run: Run) -> None:
     first = commit(run, 25)
     before = (first.path / "rank-0.pt").read_bytes()
@@ -198,18 +186,6 @@ def test_a_choice_that_is_missing_or_damaged_is_never_replaced_by_a_guess(run: R
         newest_checkpoint(run, chosen="00000025-e1", chosen_since=2)
 
 
-def test_a_run_whose_folder_of_checkpoints_is_a_file_has_none(run: Run) -> None:
-    run.checkpoints.write_text("")
-    assert list_checkpoints(run) == [] and newest(run) == ""
-
-
-def test_a_checkpoint_says_whether_the_job_asked_for_it(run: Run) -> None:
-    asked, early, damaged = commit(run, 1), commit(run, 2, scheduled=False), commit(run, 3, scheduled=False)
-    delete("manifest.json")(damaged.path)
-    said = [Checkpoint(each.path, each.iteration, each.epoch).is_scheduled for each in (asked, early, damaged)]
-    assert said == [True, False, True]
-
-
 # -- damage -----------------------------------------------------------------------------------------------------------
 
 
@@ -243,10 +219,6 @@ def replace_by_pipe(path: Path) -> None:
     os.mkfifo(path / "rank-0.pt")
 
 
-def link_to_itself(name: str) -> Callable[[Path], Any]:
-    return lambda path: (delete(name)(path), (path / name).symlink_to(name))
-
-
 def replace_by_directory(path: Path) -> None:
     (path / "manifest.json").unlink()
     (path / "manifest.json").mkdir()
@@ -275,21 +247,10 @@ DAMAGES = {
     ),
     "a zero byte in a name": (edit(files={"a\0b": ONE}), r"manifest.json names 'a\x00b', which is no file of it"),
     "a size that is a text": (edit(files={"rank-0.pt": {"size": "x", "sha256": "0"}}), ENTRY),
-    **{
-        f"a size of {size}": (edit(files={"rank-0.pt": {"size": size, "sha256": "0"}}), ENTRY)
-        for size in (True, -1, 2**63)
-    },
     "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
     "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
     "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
-    "a manifest that leads in a circle": (link_to_itself("manifest.json"), UNREADABLE),
-    "a file that leads in a circle": (link_to_itself("rank-0.pt"), "rank-0.pt is not a regular file"),
-    "no format": (edit(format=None), "manifest.json has no format"),
-    **{
-        f"a {key} that is a list": (edit(**{key: [1]}), f"manifest.json: {key} is not a number")
-        for key in ("created", "reward", "score", "score_error", "worlds", "world_size")
-    },
-    "two files that are gone": (lambda path: (delete("rank-1.pt")(path), delete("learner.pt")(path)), "learner.pt is"),
+    "a reward that is a list": (edit(reward=[1]), "manifest.json: reward is not a number"),
     "a newer format": (
         edit(format=FORMAT + 1),
         f"has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster",
@@ -309,15 +270,11 @@ def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: 
     assert message.startswith(f"checkpoint 00000050-e1: {said}")
 
 
-def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(run: Run) -> None:
     for expected in ("00000050-e1.damaged", "00000050-e1.damaged-2", "00000050-e1.damaged-3"):
         moved = set_aside(commit(run, 50))
         assert moved.name == expected and (moved / "rank-0.pt").exists() and list_checkpoints(run) == []
-    seen, left = durable_operations(monkeypatch), commit(run, 50)
-    left.verify()
-    assert seen.index(("rename", str(set_aside(left)))) == len(seen) - 2 and seen[-1] == ("fsync", str(run.checkpoints))
+    commit(run, 50).verify()
 
 
 def test_setting_aside_killed_at_any_step_loses_nothing(run: Run, tmp_path: Path) -> None:
@@ -342,15 +299,7 @@ def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
     (run.checkpoints / ".nfs0001").write_text("the file system's own")
     assert sorted(sweep(run)) == [".00000005-e1.0a1b2c3d.trash", ".00000075-e1.tmp", ".LATEST.0a1b2c3d.tmp"]
     assert sorted(os.listdir(run.checkpoints)) == [".nfs0001", "00000025-e1", "00000050-e1.damaged", "LATEST"]
-    (run.checkpoints / "made-by-somebody.tmp").write_text("")
     assert sweep(run) == []
-
-
-def test_sweeping_up_to_a_checkpoint_spares_what_is_made_after_it(run: Run) -> None:
-    for iteration, epoch in ((80, 1), (70, 2), (75, 2), (80, 2), (5, 3)):
-        CheckpointWriter(run, iteration, epoch)
-    assert sorted(sweep(run, up_to=(2, 75))) == [".00000070-e2.tmp", ".00000075-e2.tmp", ".00000080-e1.tmp"]
-    assert sorted(os.listdir(run.checkpoints)) == [".00000005-e3.tmp", ".00000080-e2.tmp"]
 
 
 def test_sweeping_killed_at_any_step_spares_committed_checkpoints(run: Run, tmp_path: Path) -> None:
@@ -399,30 +348,6 @@ def test_retention_never_deletes_the_newest(run: Run) -> None:
     commit(run, 10)
     commit(run, 20)
     assert retain(run, 0) == ["00000010-e1"] and names(run) == ["00000020-e1"]
-
-
-def test_a_commit_keeps_what_is_exported_and_sweeps_what_was_never_finished(run: Run) -> None:
-    commit(run, 10)
-    (run.exports / "00000010-e1").mkdir(parents=True)
-    CheckpointWriter(run, 20, 1)
-    for iteration in (30, 40):
-        commit(run, iteration, keep=1)
-    assert sorted(os.listdir(run.checkpoints)) == ["00000010-e1", "00000040-e1", "LATEST"]
-
-
-def test_an_attempt_that_was_frozen_in_its_commit_deletes_nothing_of_its_successor(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    commit(run, 10)
-    rename = os.rename
-
-    def frozen(old: Path, new: Path) -> None:
-        rename(old, new)
-        raise_epoch(run, 2)
-
-    monkeypatch.setattr(os, "rename", frozen)
-    commit(run, 20, keep=1)
-    assert names(run) == ["00000010-e1", "00000020-e1"]
 
 
 def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: Run) -> None:

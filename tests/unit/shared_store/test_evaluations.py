@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -80,27 +79,6 @@ def test_the_best_checkpoint_is_that_of_two_evaluated_ones_and_else_that_of_the_
     assert best() == 9, "of equals the later one"
     evaluate(run, "00000003-e1-d", 101.0, episodes=300)
     assert best() == 3
-
-
-@pytest.mark.parametrize(
-    ("scores", "best"),
-    [
-        ([1.0, 3.0, 2.0], 2),
-        ([3.0, 1.0, 3.0], 3),  # of equals the later
-        ([-5.0, None, -7.0], 1),
-        ([1.0, math.inf, math.nan], 1),
-        ([None, None, None], None),
-    ],
-)
-def test_the_best_checkpoint_without_evaluations_has_the_greatest_score(
-    tmp_path: Path, scores: list[float | None], best: int | None
-) -> None:
-    store = Store(tmp_path).open()
-    add_run(store, "scored")
-    for iteration, score in enumerate(scores, 1):
-        add_checkpoint(store, "scored", iteration, score=score)
-    found = best_checkpoint(store.run("scored"))
-    assert (found and found.iteration) == best
 
 
 def test_retention_keeps_checkpoints_that_a_job_evaluated(run: Run) -> None:
