@@ -17,12 +17,24 @@ from tests.conftest import wait_for
 from tests.support.engines.every_engine import WAIT_FOR_ALL, EveryEngine, await_job_end
 from tests.support.engines.fixtures import sites
 from tests.support.engines.sites import SITES, Site
-from tests.support.processes import freeze
+from tests.support.processes import freeze, processes_of_job
 
 site = sites("ray")
 ON_THE_BUS = [name for name in SITES if name != "aws-batch"]
 
 
+@pytest.fixture(scope="module")
+def orphan(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A job on Ray that ended when its controller had been killed."""
+    with SITES["ray"](tmp_path_factory.mktemp("orphan"), request) as site:
+        job = site.submit("echo ready; while [ ! -e $MUSTER_STORE/go ]; do sleep 0.05; done", nodes=1)
+        site.ready(job, 1, 1)
+        site.serving.kill()
+        (site.volume / "go").touch()
+        yield job
+
+
+@pytest.mark.usefixtures("orphan")
 class TestEveryEngine(EveryEngine):
     pass
 
@@ -62,3 +74,7 @@ def test_a_frozen_node_is_noticed_by_its_silence_and_its_gang_runs_again(
     assert detail["status"] == "SUCCEEDED", (detail["statusReason"], site.serving.log(job)[-20:])
     assert "node 1 gives no sign of life for" in detail["attempts"][0]["statusReason"], detail["attempts"]
     await_job_end(job)
+
+
+def test_what_keeps_a_place_on_ray_leaves_when_no_controller_asks_any_more(orphan: str) -> None:
+    wait_for(lambda: not processes_of_job(orphan), 100, "the driver's end")

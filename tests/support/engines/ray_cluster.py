@@ -37,6 +37,7 @@ class RayCluster:
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_enable_worker_prestart": "0",  # two cores have other things to do
             "RAY_prestart_worker_first_driver": "0",
+            "RAY_worker_niceness": "0",  # 15 is Ray's own: other tests of the machine would go first
             "RAY_raylet_start_wait_time_s": "120",
         }
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
