@@ -72,8 +72,7 @@ engines: $(READY) kernels
 coverage: $(READY) kernels
 	rm -rf build/coverage
 	$(BIN)/coverage run -m pytest -q $(or $(TESTS),tests/unit) || echo "tests failed: the figures are of what ran"
-	$(BIN)/coverage combine -q && $(BIN)/coverage json -q -o build/coverage/branches.json
-	$(BIN)/python -m tests.support.suite.branches build/coverage/branches.json
+	$(BIN)/coverage combine -q && $(BIN)/coverage report --show-missing --skip-covered
 
 # kept in the user's cache, for other clones and later runs
 kernels: $(READY)

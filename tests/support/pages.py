@@ -19,13 +19,14 @@ PORT = 8080
 """The controller's, on the pages."""
 
 
-def run_page(page: str, directory: Path, then: str = "") -> str:
+def run_page(page: str, directory: Path, then: str = "", without: str = "make test") -> str:
     """What the ``sh`` blocks of a page print, run in their order by one shell in a copy of the repository below ``directory``.
 
-    The copy has this environment, and a home directory of its own; ``make test`` is left out, since it would run this test.
+    The copy has this environment, and a home directory of its own.
 
     Args:
         then: Commands for the same shell, after the page's.
+        without: A command that is left out; ``make test`` would run this test.
     """
     if taken():
         pytest.skip(f"PORT {PORT}, WHICH THE PAGE USES, IS TAKEN ON THIS MACHINE")
@@ -43,7 +44,7 @@ def run_page(page: str, directory: Path, then: str = "") -> str:
             (environment / entry.name).symlink_to(entry)
     (environment / ".ready").touch()  # newer than all: `make run` installs nothing, which would change this environment
     found = re.findall(r"^```sh\n(.*?)^```", (REPOSITORY / page).read_text(), re.MULTILINE | re.DOTALL)
-    script = "\n".join([*found, then]).replace("make test ", ": make test ")
+    script = re.sub(rf"^{without}\b", f": {without}", "\n".join([*found, then]), flags=re.MULTILINE)
     hidden = ("MUSTER_HOME", "MUSTER_URL", "MUSTER_TOKEN", "VIRTUAL_ENV")
     env = {name: value for name, value in os.environ.items() if name not in hidden}
     ending = "trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT"

@@ -11,9 +11,12 @@ import onnx
 import pytest
 from onnx.reference import ReferenceEvaluator
 
+import worker.train
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import run_muster
+from tests.support.worker.in_process import call_worker
+from tests.support.worker.ranks import training
 from worker.tasks.gym import TaskVectorEnv
 
 TASK = '''
@@ -78,9 +81,10 @@ def test_ppo_learns_to_choose_is_killed_and_exports_what_it_learnt(directory: Pa
     ("algorithm", "said"), [("sac", "this task's are choices; use ppo"), ("rsl_rl", "are choices")]
 )
 def test_who_can_not_choose_says_so_in_one_line(directory: Path, algorithm: str, said: str) -> None:
-    options = ("--set", f"train.algorithm={algorithm}", "--set", "retry.attempts=1")
-    done = run_muster("run", "job.yaml", *options, home=directory / "home", cwd=directory, timeout=300)
-    assert done.returncode != 0 and said in done.stdout + done.stderr and "Traceback" not in done.stdout
+    told = training(directory / "store", task="pushed:Pushed", algorithm=algorithm)
+    done = call_worker(worker.train.main, told)
+    (line,) = done.stderr.strip().splitlines()
+    assert done.returncode == 2 and line.startswith("error: ") and said in line
 
 
 def test_gymnasium_sees_choices(directory: Path) -> None:

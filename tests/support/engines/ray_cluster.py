@@ -15,6 +15,9 @@ from tests.support.worker.ranks import free_port
 RAY = str(Path(sys.executable).parent / "ray")
 _SMALL = ["--object-store-memory=80000000", "--min-worker-port=0", "--max-worker-port=0", "--include-log-monitor=false"]
 
+IMPATIENT = {"RAY_health_check_period_ms": "1000", "RAY_health_check_timeout_ms": "3000"}
+"""Of a head: a node that five times in a row does not answer is given up after 20 s, not after 65."""
+
 
 class RayCluster:
     """Processes are ended by their session, never with ``ray stop``, which ends everybody's."""
@@ -34,6 +37,7 @@ class RayCluster:
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_enable_worker_prestart": "0",  # two cores have other things to do
             "RAY_prestart_worker_first_driver": "0",
+            "RAY_worker_niceness": "0",  # 15 is Ray's own: other tests of the machine would go first
             "RAY_raylet_start_wait_time_s": "120",
         }
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
@@ -62,7 +66,12 @@ class RayCluster:
                 ),
                 *(f"--ray-client-server-port={free_port()}", f"--node-ip-address={self.network()}.1"),
             ],
-            {"RAY_gcs_storage": "rocksdb", "RAY_gcs_storage_path": str(self.home / "gcs"), **self.head_env},
+            {
+                "RAY_gcs_storage": "rocksdb",
+                "RAY_gcs_storage_path": str(self.home / "gcs"),
+                **IMPATIENT,
+                **self.head_env,
+            },
         )
 
     def add(self, *names: str, cpus: int = 2, gpus: int = 2, **env: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,7 +95,10 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
                 "endpoint_url": aws.url,
             }
             config = AwsConfig(**told, store=str(home / "volume"), store_is_shared=False, poll=0.1, quiet=1.0)
-            (home / "home").mkdir()
+            for name in ("home", "volume"):
+                (home / name).mkdir()
+            # nothing is compiled again for a volume that was never used before
+            (home / "volume" / "kernels").symlink_to(os.environ["WARP_CACHE_PATH"])
             save_config(home / "home", config)
             yield from _served("aws-batch", home / "home", volume=home / "volume")
 

@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY, Serving
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 from tests.support.waiting import PATIENCE
 
-SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
+SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5", "train.config.episode_seconds=0.5")
 
 
 def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str) -> str:
@@ -23,7 +23,7 @@ def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str)
     queue = serving.client.get("/api/capacity")["engines"][engine]
     request = compile_definition(spec, str(REPOSITORY))
     container = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
-    container["environment"].append({"name": "MUSTER_RUN", "value": run})
+    container["environment"] += [{"name": "MUSTER_RUN", "value": run}, {"name": "MUSTER_PICTURE", "value": "0"}]
     if engine == "docker":
         container |= {"image": SUPERVISED, **host_files()}
         container["environment"].append({"name": "PATH", "value": PATH})

@@ -9,7 +9,6 @@ import sqlite3
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,9 +17,11 @@ from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from tests.conftest import submit_gang
 from tests.support.faults.home import Home
+from tests.support.orchestrator.jobs import await_status, detail
 from tests.support.processes import end_all, processes_of_job
 from tests.support.waiting import wait_for
 
+OVER = ("SUCCEEDED", "FAILED")
 VOLUME = 48 << 20
 MOST_LOG = 1 << 20
 STEADY = "import time\nfor number in range(6000):\n    print(number, flush=True)\n    time.sleep(0.1)"
@@ -65,12 +66,12 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
             home.serve()
             with Client(home.url) as client:
                 steady = submit_gang(client, STEADY, name="steady")
-                wait_for(lambda: _status(client, steady) == "RUNNING", 60, "the steady job runs")
+                await_status(client, steady, "RUNNING")
                 taken = [steady]
                 if rng.random() < 0.5:
                     taken.append(submit_gang(client, FLOOD, name="flood"))
                     done["floods"] += 1
-                    wait_for(lambda: _status(client, taken[-1]) not in ("SUBMITTED", "RUNNABLE"), 60, "the flood")
+                    await_status(client, taken[-1], "STARTING", "RUNNING", *OVER)
                 filler = fill(volume)
                 done["disks filled"] += 1
                 taken += _submit(client, rng.randrange(1, 5), done)
@@ -87,12 +88,11 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
             filler.unlink()
             home.serve()
             with Client(home.url) as client:
-                if not _has_ended(client, steady):
+                if detail(client, steady)["status"] not in OVER:
                     client.batch("TerminateJob", jobId=steady, reason="the disk was full")
                 for job in taken:
-                    wait_for(partial(_has_ended, client, job), 90, f"job {job} ends")
-                last = submit_gang(client, "print('again')", name="last")
-                wait_for(lambda: _status(client, last) == "SUCCEEDED", 60, "a job runs when there is room")
+                    await_status(client, job, *OVER)
+                await_status(client, submit_gang(client, "print('again')", name="last"), "SUCCEEDED")
                 done["jobs"] += len(taken) + 1
             if (said := home.errors.stat().st_size) > MOST_LOG:
                 wrong.append(f"the controllers wrote {said} bytes of errors")
@@ -119,11 +119,3 @@ def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
             assert error.status != 500, error
             done["submissions refused"] += 1
     return taken
-
-
-def _has_ended(client: Client, job: str) -> bool:
-    return _status(client, job) in ("SUCCEEDED", "FAILED")
-
-
-def _status(client: Client, job: str) -> str:
-    return str(client.get(f"/api/jobs/{job}")["status"])

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.layout import Run, Store
-from tests.conftest import MUSTER, REPOSITORY
+from tests.conftest import MUSTER, REPOSITORY, run_muster
 from tests.support.waiting import PATIENCE
 
 _START_SECONDS = 60.0
@@ -104,14 +104,7 @@ class Home:
     def command(self, *arguments: str) -> tuple[dict[str, Any] | None, str]:
         """``muster ARGUMENTS --json``: what it printed (None where it refused) and what it said on stderr."""
         self.serve()
-        done = subprocess.run(
-            [MUSTER, *arguments, "--json"],
-            env={**os.environ, "MUSTER_HOME": str(self.path)},
-            cwd=REPOSITORY,
-            capture_output=True,
-            text=True,
-            timeout=60 * PATIENCE,
-        )
+        done = run_muster(*arguments, "--json", home=self.path, timeout=60)
         return (json.loads(done.stdout) if done.returncode == 0 else None), done.stderr.strip()
 
     # -- the truths ---------------------------------------------------------------------------------------------------

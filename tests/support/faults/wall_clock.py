@@ -9,14 +9,15 @@ import subprocess
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrator.client import Client
 from tests.conftest import MAIN_LAST, submit_gang
 from tests.support.faults.home import Home
+from tests.support.orchestrator.jobs import await_status
 from tests.support.processes import end_all
-from tests.support.waiting import wait_for
 
 JUMPS = (7200.0, -86400.0, 30.0, -5.0, 90 * 86400.0)
 """Seconds, to choose from."""
@@ -60,7 +61,7 @@ def wall_clock_round(directory: Path, seed: int) -> tuple[Counter[str], list[str
         home.serve()
         with Client(home.url) as client:
             job = submit_gang(client, SCRIPT, 2, name="steady", timeout=3600, attempts=2)
-            wait_for(lambda: client.get(f"/api/jobs/{job}")["status"] == "RUNNING", 60, "the job runs")
+            await_status(client, job, "RUNNING")
         for _ in range(rng.choice((1, 2, 3))):
             time.sleep(rng.uniform(0.3, 1.5))
             clock.set(rng.choice(JUMPS))
@@ -70,8 +71,7 @@ def wall_clock_round(directory: Path, seed: int) -> tuple[Counter[str], list[str
                 home.serve()
                 done["controllers killed"] += 1
         with Client(home.url) as client:
-            detail = wait_for(lambda: _ended(client, job), 90, "the job ends")
-            wrong += _check(detail, [line for line in client.logs(job)])
+            wrong += _check(await_status(client, job, "SUCCEEDED", "FAILED"), list(client.logs(job)))
         done["jobs"] += 1
     finally:
         home.close()
@@ -79,19 +79,13 @@ def wall_clock_round(directory: Path, seed: int) -> tuple[Counter[str], list[str
     return done, wrong
 
 
-def _ended(client: Client, job: str) -> dict[str, object] | None:
-    detail: dict[str, object] = client.get(f"/api/jobs/{job}")
-    return detail if detail["status"] in ("SUCCEEDED", "FAILED") else None
-
-
-def _check(detail: dict[str, object], lines: list[dict[str, object]]) -> list[str]:
+def _check(detail: dict[str, Any], lines: list[dict[str, Any]]) -> list[str]:
     wrong = []
     attempts = detail["attempts"]
-    assert isinstance(attempts, list)
     if detail["status"] != "SUCCEEDED" or len(attempts) != 1:
         wrong.append(f"the job is {detail['status']} after {len(attempts)} attempts: {detail.get('statusReason')}")
     for node in (0, 1):
-        numbers = [int(str(each["text"])) for each in lines if each["node"] == node and str(each["text"]).isdigit()]
+        numbers = [int(each["text"]) for each in lines if each["node"] == node and each["text"].isdigit()]
         if numbers != list(range(LINES)):
             wrong.append(f"the log of node {node} is not in order: {numbers}")
     return wrong
