@@ -28,7 +28,7 @@ import rerun as rr
 from benchmarks.load import Watch, add_option, machine, told
 from benchmarks.training import build
 from shared_store.layout import Run
-from tests.support.browser import Browser
+from tests.support.browser import empty_page
 from worker.telemetry import screen
 from worker.telemetry.page import Page
 from worker.telemetry.progress import Activity
@@ -123,23 +123,18 @@ class Marked(screen.Screen):
         self.frames_sent[word] = int(steps[-1]), read, time.time_ns()
 
 
-def look_on(url: str, seconds: float, home: Path, stop: list[int], found: dict[str, Any]) -> None:
+def look_on(url: str, seconds: float, stop: list[int], found: dict[str, Any]) -> None:
     """Open the page and return its script's observations; then the view ends."""
     try:
-        browser = Browser("about:blank", home)
-        browser.call("Page.addScriptToEvaluateOnNewDocument", source=SCRIPT)
-        browser.call("Page.navigate", url=url)
-
-        def asked(expression: str) -> Any:
-            return browser.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"]["value"]
-
-        time.sleep(WARM)
-        found["from"], before = time.time_ns(), asked("window.frames")
-        time.sleep(seconds)
-        found["rate"], found["to"] = (asked("window.frames") - before) / seconds, time.time_ns()
-        time.sleep(LATE)
-        found["arrived"] = asked("window.arrived")
-        browser.close()
+        with empty_page() as page:
+            page.add_init_script(SCRIPT)
+            page.goto(url, timeout=120_000)
+            time.sleep(WARM)
+            found["from"], before = time.time_ns(), page.evaluate("window.frames")
+            time.sleep(seconds)
+            found["rate"], found["to"] = (page.evaluate("window.frames") - before) / seconds, time.time_ns()
+            time.sleep(LATE)
+            found["arrived"] = page.evaluate("window.arrived")
     finally:
         stop.append(signal.SIGINT)
 
@@ -168,8 +163,7 @@ def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, A
 
         def start() -> Page:
             page = Page(None, "256MB")
-            given = page.url, seconds, folder / "browser", stop, found
-            threading.Thread(target=look_on, args=given).start()
+            threading.Thread(target=look_on, args=(page.url, seconds, stop, found)).start()
             return page
 
         with mock.patch.object(screen, "Screen", Marked):

@@ -1,38 +1,88 @@
-"""A racer is trained briefly, its policy is entered in a league twice, and one of the races is driven again."""
+"""A racer is trained briefly and races: twice the same, with step logs; in a league, where one of its races is driven again."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
 
 from shared_store import leagues
 from shared_store.layout import Store
 from tests.conftest import Serving
 
-SMALL = ("train.iterations=30", "checkpoint.every=30", "train.config.track=oval", "train.worlds=64")
+SMALL = ("train.iterations=30", "checkpoint.every=15", "train.config.track=oval", "train.worlds=64")
 
 
-def test_a_racer_is_trained_registered_raced_ranked_and_verified(server: Serving) -> None:
-    def done(*arguments: str) -> str:
-        ended = server.muster_process(*arguments, timeout=300)
-        assert ended.returncode == 0, ended.stdout + ended.stderr
-        return ended.stdout
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    with Serving(tmp_path_factory.mktemp("home"), "--cpus", "2") as server:
+        yield server
 
+
+def done(server: Serving, *arguments: str) -> str:
+    """What a command prints."""
+    ended = server.muster(*arguments)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
+
+
+@pytest.fixture(scope="module")
+def run(server: Serving) -> str:
     options = [f"--set={each}" for each in SMALL]
-    job = json.loads(done("submit", "job_specs/racer.yaml", "--json", *options))["jobId"]
+    job = json.loads(done(server, "submit", "job_specs/racer.yaml", "--json", *options))["jobId"]
     trained = server.wait(job, timeout=300)
     assert trained["status"] == "SUCCEEDED", trained["statusReason"]
-    done("export", trained["run"], "--episodes", "0")
-    for _ in range(2):
-        done("models", "register", trained["run"], "--name", "fast", "--again")
+    return str(trained["run"])
 
-    done("league", "create", "cup", "--track", "oval", "--laps", "2", "--continuous")
-    told = done("league", "submit", "cup", "fast@1", "--as", "ada")
-    assert "race: 2 laps of Racer on oval" in told and told.splitlines()[-1].startswith(
-        "entry 1 of cup: ada with fast@1"
-    )
-    later = json.loads(done("league", "submit", "cup", "fast", "--as", "bob", "--json"))
+
+def test_a_race_has_the_same_lap_times_again_and_its_step_logs_are_copied(
+    server: Serving, run: str, tmp_path: Path
+) -> None:
+    race = ("evaluate", run, "--race", "--trials", "2", "--continuous", "--penalty", "5", "--track", "chicane")
+    options = (*race, "--set", "race.seconds=30", "--json")
+    first = json.loads(done(server, *options, "-o", str(tmp_path / "logs")))
+    second = json.loads(done(server, *options))
+    assert first["race"] == second["race"] and first["name"] != second["name"]
+    told = first["race"]
+    assert told["rules"] == {
+        **{"laps": 2, "continuous": True, "off_track_penalty": 5.0, "crash_penalty": 5.0, "max_resets": 100},
+        **{"seconds": 30.0, "ranking": None},
+    }
+    assert told["track"] == ["chicane"] and [trial["trial"] for trial in told["trials"]] == [1, 2]
+    logs = sorted((tmp_path / "logs").rglob("*.csv"))
+    assert [log.name for log in logs] == ["0-iteration.csv", "1-iteration.csv"]
+    for log, trial in zip(logs, told["trials"], strict=True):
+        rows = log.read_text().splitlines()
+        assert len(rows) == 2 + trial["steps"]  # columns, the start, a row a step
+        assert trial["time"] == trial["steps"] / 15 + 5.0 * trial["off_tracks"]
+        assert sum(",off_track," in row for row in rows) == trial["off_tracks"]
+
+
+def test_a_race_is_printed_as_a_table_and_does_not_choose_the_best_checkpoint(server: Serving, run: str) -> None:
+    def chosen() -> list[tuple[str, bool, bool]]:
+        listed = server.client.get(f"/api/runs/{run}/checkpoints")
+        return [(each["name"], each["best"], each["evaluated"]) for each in listed]
+
+    before = chosen()
+    told = done(server, "evaluate", f"{run}@15", "--race", "--trials", "1", "--set", "race.seconds=2")
+    assert "TRIAL       TIME COMPLETED STATUS" in told and "checkpoint 00000015-e1" in told
+    assert chosen() == before
+
+
+def test_a_racer_is_registered_raced_ranked_and_verified(server: Serving, run: str) -> None:
+    done(server, "export", run, "--episodes", "0")
+    for _ in range(2):
+        done(server, "models", "register", run, "--name", "fast", "--again")
+
+    done(server, "league", "create", "cup", "--track", "oval", "--laps", "2", "--continuous")
+    told = done(server, "league", "submit", "cup", "fast@1", "--as", "ada")
+    assert "race: 2 laps of Racer on oval" in told
+    assert told.splitlines()[-1].startswith("entry 1 of cup: ada with fast@1")
+    later = json.loads(done(server, "league", "submit", "cup", "fast", "--as", "bob", "--json"))
     assert (later["entry"], later["model"], later["laps"]) == (2, "fast@2", 2)
-    rows = json.loads(done("league", "table", "cup", "--json"))
+    rows = json.loads(done(server, "league", "table", "cup", "--json"))
     cup = leagues.find(Store(server.home / "store"), "cup")
     for row in rows:
         trials = cup.entry(row["entry"])["race"]["trials"]
@@ -43,14 +93,12 @@ def test_a_racer_is_trained_registered_raced_ranked_and_verified(server: Serving
     order = [(row["rank"], row["entry"], row["time"]) for row in rows]
     assert order == [(1, 1, rows[0]["time"]), (2, 2, rows[0]["time"])], "the same policy: the earlier entry is ahead"
 
-    assert done("league", "verify", "cup", "1", "--rerun").splitlines() == [
-        "entry 1: every lap is the same, bit for bit"
-    ]
+    verified = done(server, "league", "verify", "cup", "1", "--rerun")
+    assert verified.splitlines() == ["entry 1: every lap is the same, bit for bit"]
     path = cup.path / "entries" / "2" / "entry.json"
     path.chmod(0o644)
     path.write_bytes(path.read_bytes().replace(b'"racer": "bob"', b'"racer": "eve"'))
     altered = server.muster("league", "verify", "cup")
     assert altered.returncode == 1 and "entry 2: the content of entry.json was altered" in altered.stdout
-    assert [row["status"] for row in json.loads(done("league", "table", "cup", "--json")) if row["entry"] == 2] == [
-        "altered"
-    ]
+    table = json.loads(done(server, "league", "table", "cup", "--json"))
+    assert [row["status"] for row in table if row["entry"] == 2] == ["altered"]
