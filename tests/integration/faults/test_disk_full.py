@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,9 +103,16 @@ def test_the_database_may_lie_on_another_volume_than_the_home(tmp_path: Path, vo
     try:
         assert (volume / "jobs.db").exists() and not (tmp_path / "home" / "muster.db").exists()
         fill(volume)
-        time.sleep(1.5)  # a look at the volume
-        with pytest.raises(ApiError, match=r"the volume of the database \(.*volume\) has 0 MB free"):
-            server.gang("pass")
+
+        def refusal() -> str:
+            try:
+                server.gang("pass")
+            except ApiError as error:
+                return str(error)
+            return ""
+
+        said = wait_for(refusal, 20, "a look at the volume")
+        assert re.search(r"the volume of the database \(.*volume\) has 0 MB free", said), said
     finally:
         server.close()
 

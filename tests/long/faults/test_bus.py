@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from tests.conftest import PATIENCE, REPOSITORY, Serving, wait_for
 from tests.support.processes import gang_members, processes_of
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
 from tests.support.worker.node import node_contract
+from worker.node import bus as node_bus
 from worker.node.bus import LEASE_MILLISECONDS, NodeBus
 
 NODE = """
@@ -113,8 +113,9 @@ def test_an_answer_that_is_too_long_for_the_router_comes_in_part(bus: Bus) -> No
     node.wait()
 
 
-def test_publishing_never_waits_for_a_router_that_hangs(tmp_path: Path) -> None:
+def test_publishing_never_waits_for_a_router_that_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With blocking congestion control a slow reader stops the writer for 5 s, after which Zenoh gives the connection up; ours drops."""
+    monkeypatch.setattr(node_bus, "LEASE_MILLISECONDS", 3_600_000)
     script = f"import sys, time; from pathlib import Path; from orchestrator.control.bus import Bus; b = Bus(Path({str(tmp_path)!r})); b.open(); print(b.endpoint, b.token('j', 1), flush=True); time.sleep(60)"
     router = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
     assert router.stdout is not None
@@ -123,16 +124,13 @@ def test_publishing_never_waits_for_a_router_that_hangs(tmp_path: Path) -> None:
     node = NodeBus(node_contract(endpoint, token), write)
     node.tend(None)
     router.send_signal(signal.SIGSTOP)
-    longest, progress = 0.0, {"iteration": 1, "fill": "x" * 10_000}
     for _ in range(3000):
         node._next_progress = 0.0
-        started = time.monotonic()
-        node.tend(progress)
-        longest = max(longest, time.monotonic() - started)
+        node.tend({"iteration": 1, "fill": "x" * 10_000})
+    assert node._session is not None and list(node._session.info.links()), "the connection was given up"
     router.kill()
     router.wait()
     node.close()
-    assert longest < 4.0, f"a put took {longest:.2f} s"
 
 
 def test_the_router_listens_on_loopback_only_and_wants_the_password(bus: Bus) -> None:
