@@ -63,6 +63,7 @@ GROUPS = (
                 f"{_UNIT}/shared_store/test_{name}.py"
                 for name in (
                     "epoch",
+                    "fence_edges",
                     "checkpoints",
                     "evaluations",
                     "parent",
