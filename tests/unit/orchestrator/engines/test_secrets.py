@@ -43,6 +43,12 @@ def test_a_secret_is_found_by_its_reference_or_by_the_name_in_it(file: Path, val
     assert Secrets(str(file)).of(asking(value_from), "default") == {"PASSWORD": value}
 
 
+def test_a_secret_with_a_zero_byte_is_refused(file: Path) -> None:
+    file.write_text(json.dumps({"db": "hunter\0"}))
+    with pytest.raises(SecretsError, match="secret PASSWORD: 'db' has a zero byte, which no variable can have"):
+        Secrets(str(file)).of(asking("db"), "default")
+
+
 def test_a_secret_of_some_queues_is_given_to_their_jobs_alone(file: Path) -> None:
     secrets = Secrets(str(file))
     kept = {"value": {"key": "abc"}, "queues": ["robots"]}
