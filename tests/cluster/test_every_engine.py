@@ -1,4 +1,4 @@
-"""The tests that every engine passes, on Ray; and on all engines, one that takes half a minute, on all of them at the same time.
+"""The tests that every engine passes, on Ray; and one test of half a minute, which runs on all engines at the same time.
 
 Of faults and engines each pair is proven once: a rank, a supervisor and the controller that are killed by :class:`EveryEngine` on each
 engine, a frozen node here (AWS's nodes have no bus to the controller: there it is found by ``stall_timeout`` alone), a node that a
@@ -25,7 +25,7 @@ ON_THE_BUS = [name for name in SITES if name != "aws-batch"]
 
 @pytest.fixture(scope="module")
 def orphan(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A job on Ray that ended when its controller had been killed."""
+    """A job on Ray that ended after its controller was killed."""
     with SITES["ray"](tmp_path_factory.mktemp("orphan"), request) as site:
         job = site.submit("echo ready; while [ ! -e $MUSTER_STORE/go ]; do sleep 0.05; done", nodes=1)
         site.ready(job, 1, 1)
@@ -43,7 +43,7 @@ class TestEveryEngine(EveryEngine):
 def frozen(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[dict[str, tuple[Site, str] | pytest.skip.Exception]]:
-    """On each engine a gang of which node 1 was frozen; or why the engine can't be tested here."""
+    """By engine: the site and a gang whose node 1 is frozen, or the reason why the engine can't be tested here."""
     found: dict[str, tuple[Site, str] | pytest.skip.Exception] = {}
     with ExitStack() as stack:
         for name in ON_THE_BUS:

@@ -1,4 +1,4 @@
-"""A training that loses a node on one engine after the other, goes on from each on the next, and ends with the bits of an undisturbed one."""
+"""A training loses a node on each engine in turn, resumes on the next one, and ends with the same bits as an undisturbed run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.support.engines.training import same_bits, submit
 from tests.support.processes import kill_supervisor, processes_of_job
 
 LAST = 120
-"""Iterations in all: each engine is to have some of them, but seldom gets beyond ten before it loses its node."""
+"""Iterations in all. Each engine trains for some of them and seldom gets beyond ten before it loses its node."""
 
 
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The run to which nothing happens."""
+    """The undisturbed run."""
     home = tmp_path_factory.mktemp("straight")
     with Serving(home, "--cpus", "4") as serving:
         done = serving.wait(submit(serving, "straight", "local", LAST), timeout=180)
@@ -29,7 +29,7 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def same_as(straight: Run, run: Run) -> None:
-    """The other run, in whatever store, has the bits of the straight one."""
+    """Check that the run, in any store, has the same bits as the straight one."""
     store = run.path.parent.parent
     shutil.copytree(straight.path, store / "runs" / straight.name)
     same_bits(store, run.name, straight.name)
@@ -77,7 +77,7 @@ def test_a_run_that_loses_a_node_on_one_engine_after_the_other_ends_with_the_bit
 def test_a_training_on_aws_that_loses_a_node_ends_with_the_bits_of_one_that_does_not(
     straight: Run, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """On its own volume, which the controller does not see: so it is no part of the run above."""
+    """Its volume is one that the controller does not see, so it can't be a stage of the run above."""
     with SITES["aws-batch"](tmp_path, request) as site:
         job = submit(site.serving, "lost", "aws-batch", LAST)
         run = Store(site.volume).run("lost")

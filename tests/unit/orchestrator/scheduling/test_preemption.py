@@ -74,6 +74,13 @@ def test_victims_are_ordered_by_queue_then_priority_then_age() -> None:
     assert Pass([host()], [job("ant", 2, queue="high")], held, HIGH).preempted == "starting"
 
 
+def test_a_gang_of_another_compute_environment_is_preempted_if_one_of_its_hosts_is_needed() -> None:
+    queues, places = [queue("high", 9, ("p",)), queue("low", 1, ("q",))], [environment("p", ("a",)), environment("q")]
+    wide = running("wide", on("a", 4), on("b", 4), queue="low", environment="q", preemptible=True)
+    decided = Pass([host("a"), host("b")], [job("ant", 3, queue="high")], [wide], queues, places)
+    assert decided.preempted == "wide"
+
+
 def test_a_gang_whose_host_is_gone_is_preempted_for_the_cpus_that_it_counts_for() -> None:
     lost, places = cart(host="gone"), [environment(max_cpus=4)]
     assert Pass([host()], [job("ant", 2, queue="high")], [lost], HIGH, places).preempted == "cart"
