@@ -141,7 +141,7 @@ def measure(names: Sequence[str], seed: int, which: str) -> Results:
 
         if any(numbers.values()):
             Trial([*numbers], group.tests, wanted, results.note, group.options, group.bounds_memory).run()
-    return results
+    return Results(path)  # children have noted most of them
 
 
 def summary(results: Results, seed: int) -> dict[str, dict[str, Any]]:
