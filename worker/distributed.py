@@ -124,10 +124,8 @@ class Gang:
         if self.is_main:
             self.store.set(key, "-" if text is None else f"+{text}")
             return text
-        try:
+        with _needs_main_rank():
             answer = self.store.get(key).decode()
-        except dist.DistError as error:  # it holds the store
-            raise GangError("the main rank ended before it answered; its log gives the reason") from error
         return answer[1:] if answer.startswith("+") else None
 
     @contextlib.contextmanager
@@ -138,13 +136,17 @@ class Gang:
             what: What is built; only the first time of each is in turn.
             warm: A marker in the cache that says that this was built before: then nobody waits, since all builds are quick.
                 The marker is a hint. Where it is wrong, kernels are compiled several times, and nothing else happens.
+
+        Raises:
+            GangError: The main rank has ended, or a build took longer than ``BUILD_SECONDS``.
         """
         first = self._sites.index(self._sites[self.rank])
         if self.store is not None and self._sites.count(self._sites[self.rank]) > 1:
-            if self.rank == first:
-                self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
-            elif self.store.get(f"warm/{what}/{first}") == b"0":
-                self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
+            with _needs_main_rank():
+                if self.rank == first:
+                    self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
+                elif self.store.get(f"warm/{what}/{first}") == b"0":
+                    self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
         try:
             yield
             if warm is not None and self.rank == first:
@@ -152,12 +154,22 @@ class Gang:
                     warm.mkdir(parents=True, exist_ok=True)
         finally:
             if self.store is not None and self.rank == first:
-                self.store.set(f"built/{what}/{first}", "1")
+                with _needs_main_rank():
+                    self.store.set(f"built/{what}/{first}", "1")
 
     def close(self) -> None:
         """Leave the process group."""
         if self.size > 1 and dist.is_initialized():
             dist.destroy_process_group()
+
+
+@contextlib.contextmanager
+def _needs_main_rank() -> Iterator[None]:
+    """The main rank holds the store: a call of it that fails becomes one line."""
+    try:
+        yield
+    except dist.DistError as error:
+        raise GangError("the main rank ended or did not answer in time; its log gives the reason") from error
 
 
 def require_gpus(visible: str, local_rank: int) -> None:

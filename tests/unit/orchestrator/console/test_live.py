@@ -6,14 +6,19 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
 from fastapi import Request
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.access import Access
+from orchestrator.console import job
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
+from shared_store.layout import Run, Store
+from shared_store.metrics import MetricsWriter, sampled
 
 
 def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
@@ -87,3 +92,25 @@ def test_a_value_that_many_want_at_once_is_computed_once() -> None:
     for key in range(200):
         recent.get(key, lambda: 0)
     assert recent.get("key", lambda: 9) == 9 and recent.get("key", lambda: 1) == 9, "nobody asked for it any more"
+
+
+def test_an_iteration_that_is_written_between_two_looks_at_the_run_is_sent_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Store(tmp_path).run("run")
+    run.path.mkdir(parents=True)
+    with MetricsWriter(run, 1, 0) as metrics:
+        metrics.write({"iteration": 1})
+        later = iter([2])
+
+        def look(run: Run, most: int) -> list[dict[str, Any]]:
+            found = sampled(run, most)
+            for iteration in later:
+                metrics.write({"iteration": iteration})
+            return found
+
+        monkeypatch.setattr(job, "sampled", look)
+        feed = job._Feed(None, cast(Any, None), run, iteration=0)
+        metrics_of = [event.data["iterations"] for _ in range(2) for event in feed._curves()]
+        metrics.write({"iteration": 3})
+        assert [*metrics_of, *(event.data["iterations"] for event in feed._curves())] == [[1, 2], [3]]
