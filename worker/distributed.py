@@ -165,7 +165,7 @@ class Gang:
 
 @contextlib.contextmanager
 def _needs_main_rank() -> Iterator[None]:
-    """The main rank holds the store: a call of it that fails becomes one line."""
+    """Raise GangError where the gang's store, which the main rank holds, fails or does not answer in time."""
     try:
         yield
     except dist.DistError as error:

@@ -145,16 +145,15 @@ class _Feed:
     def _curves(self) -> list[Event]:
         """New iterations; ``again`` where an attempt went back behind the page's last iteration, or the page has missed too many."""
         newest = max((each["iteration"] for each in sampled(self.run, 2)), default=0)
-        had = self.iteration
-        records = history_of(self.run).after(had, _RECORDS + 1) if had is not None and newest > had else []
-        if had is None or newest < had or len(records) > _RECORDS:
-            self.iteration = newest
-            return [] if had is None else [Event("metrics", {"again": True})]
-        if not records:
+        had, self.iteration = self.iteration, newest
+        if had is None or newest == had:
             return []
+        records = history_of(self.run).after(had, _RECORDS + 1) if newest > had else []
+        if newest < had or len(records) > _RECORDS:
+            return [Event("metrics", {"again": True})]
         # not ``newest``: one may have been written since that look, or a long history is not read to its end yet
-        self.iteration = records[-1]["iteration"]
-        return [Event("metrics", columns(records, ["*"]))]
+        self.iteration = records[-1]["iteration"] if records else had
+        return [Event("metrics", columns(records, ["*"]))] if records else []
 
 
 def _had(given: str) -> tuple[int | None, dict[str, int] | None]:

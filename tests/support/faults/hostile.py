@@ -155,7 +155,7 @@ def hostile_round(home: Path, seed: int, *, slow: bool = True) -> tuple[Counter[
         neighbour = submit_gang(serving.client, _NEIGHBOUR.format(over=str(over)), name="neighbour", env=_NATIVE)
         jobs = {}
         for name in cases:
-            # not of the seed: another run of the same round may be on this machine
+            # not drawn from the seed: another round of the same seed may run on this machine
             tokens[name] = f"{secrets.randbelow(10**17):017d}"
             prelude = _PRELUDE.format(seed=draw.randrange(2**31), token=tokens[name])
             jobs[name] = submit_gang(serving.client, prelude + CASES[name].script, name="hostile", env=_NATIVE)

@@ -11,7 +11,7 @@ from tests.support.worker.cartpole import submit
 
 
 def test_a_training_is_followed_saved_and_stopped_from_its_page(server: Serving) -> None:
-    # every checkpoint is one that the page asks for
+    # the training saves only when the page asks for it
     job = submit(server, "train.iterations=100000", "checkpoint.every=100000", "resources.cpus=0.3")["id"]
     visitor = Visitor(server.url)
     seen: dict[str, Any] = {}

@@ -124,7 +124,7 @@ def test_ranks_whose_main_rank_ends_at_the_resume_say_so_in_one_line(tmp_path: P
 
 
 def end_while_building() -> int:
-    """Body of a rank that waits for what the main rank builds; that one ends meanwhile."""
+    """Body of a rank: the main rank exits during its build, while the other one waits for it."""
     gang = connect(Placement.from_env(os.environ))
     with gang.build_in_turn():
         if gang.is_main:

@@ -68,9 +68,7 @@ CASES: dict[str, dict[str, Any]] = {
         "actor": {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN},
         "critic": CNN,
     },
-    "a class of one's own": {
-        "actor": {"class_name": "tests.unit.worker.test_rsl_rl:Tanh", "distribution_cfg": GAUSSIAN}
-    },
+    "a custom class": {"actor": {"class_name": "tests.unit.worker.test_rsl_rl:Tanh", "distribution_cfg": GAUSSIAN}},
     "distillation": {
         "algorithm": DISTILLATION,
         "student": {**GRU, "distribution_cfg": GAUSSIAN},
