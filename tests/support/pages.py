@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -31,12 +32,7 @@ def run_page(page: str, directory: Path, then: str = "", without: str = "make te
     if taken():
         pytest.skip(f"PORT {PORT}, WHICH THE PAGE USES, IS TAKEN ON THIS MACHINE")
     clone = directory / "muster"
-    shutil.copytree(
-        REPOSITORY,
-        clone,
-        ignore=shutil.ignore_patterns(".git", ".venv", ".*cache", "build", "__pycache__"),
-        symlinks=True,
-    )
+    _copy_tree(clone)
     environment = clone / ".venv"
     environment.mkdir()
     for entry in Path(sys.executable).parent.parent.iterdir():
@@ -54,6 +50,16 @@ def run_page(page: str, directory: Path, then: str = "", without: str = "make te
     assert done.returncode == 0, f"{done.stdout[-6000:]}\n{done.stderr[-6000:]}"
     wait_for(lambda: not taken(), 20, "the controller's end")
     return done.stdout
+
+
+def _copy_tree(directory: Path) -> None:
+    """Copy what git tracks, and what it does not ignore: other tests make and remove files of the rest meanwhile."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
+    for name in names.rstrip("\0").split("\0"):
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # deleted, and not committed yet
+            shutil.copy2(REPOSITORY / name, directory / name)
 
 
 def taken() -> bool:
