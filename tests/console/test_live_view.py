@@ -41,4 +41,3 @@ def test_a_training_is_watched_in_its_page_and_the_viewer_ends_with_it(server: S
     person.click("Close the live view")
     expect(frame).to_have_count(0)
     server.client.batch("TerminateJob", jobId=job, reason="seen")
-    person.close()

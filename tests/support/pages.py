@@ -52,11 +52,16 @@ def run_page(page: str, directory: Path, then: str = "", without: str = "make te
     return done.stdout
 
 
-def _copy_tree(directory: Path) -> None:
-    """Copy what git tracks, and what it does not ignore: other tests make and remove files of the rest meanwhile."""
-    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+def repository_files(pattern: str = "*") -> list[str]:
+    """What git tracks, and what it does not ignore: paths from the repository's root."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", pattern]
     names = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
-    for name in names.rstrip("\0").split("\0"):
+    return names.rstrip("\0").split("\0")
+
+
+def _copy_tree(directory: Path) -> None:
+    """Copy the repository's own files: other tests make and remove some of the rest meanwhile."""
+    for name in repository_files():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # deleted, and not committed yet
             shutil.copy2(REPOSITORY / name, directory / name)

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import REPOSITORY
+from tests.support.pages import repository_files
 
-PAGES = sorted(
-    REPOSITORY / name
-    for name in subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md"],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.split()
-)
+PAGES = sorted(REPOSITORY / name for name in repository_files("*.md"))
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 """Of a page or a picture."""
 

@@ -72,9 +72,11 @@ def visitor(console: Console) -> Visitor:
     return console.visitor()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def chromium() -> Iterator[Browser]:
-    """The system's Chromium. Not for longer: while Playwright runs, nothing else on this thread can have an event loop."""
+    """The system's Chromium, one for each test: asked to close what a person has open, it sometimes never answers, and only a whole
+    browser that doesn't is killed (by Playwright, after 30 s).
+    """
     program = shutil.which("chromium")
     if program is None:
         pytest.skip("CHROMIUM IS NOT INSTALLED (apt-get install chromium): NO PAGE OF THE CONSOLE HAS BEEN LOOKED AT")
@@ -96,5 +98,4 @@ def people(chromium: Browser) -> Iterator[People]:
 
     people = People(chromium)
     yield people
-    people.close()
     people.check()

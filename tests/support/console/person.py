@@ -88,9 +88,6 @@ class Person:
         """What the pages asked of anybody but the server."""
         return [each for each in self.asked if not each.startswith((f"{self.url}/", "data:"))]
 
-    def close(self) -> None:
-        self._context.close()
-
 
 class People:
     """Who is at the browser; in the end none of them may have seen a page that complains or asks somebody else."""
@@ -101,10 +98,6 @@ class People:
     def __call__(self, url: str, key: str = "", **context: Any) -> Person:
         self._all.append(Person(self._browser, url, key, **context))
         return self._all[-1]
-
-    def close(self) -> None:
-        for each in self._all:
-            each.close()
 
     def check(self) -> None:
         """Raises AssertionError: a page broke its Content-Security-Policy, a script failed, or something came from elsewhere."""
