@@ -30,7 +30,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for status in ("failed", "error"):
         for report in terminalreporter.getreports(status):
-            if (FLAKY, True) in report.user_properties:
+            if (FLAKY, True) in getattr(report, "user_properties", ()):  # a file that can't be collected has none
                 terminalreporter.write_line(
                     f"FLAKY {report.nodeid}: failed, then passed when it ran once more", red=True
                 )

@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,16 @@ from tests.support.worker.wandb_files import history, records
 TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 40, "seed": 5, "config": {"episode_seconds": 0.5}}
 
 
+PATIENT = f"""
+import runpy
+from worker.telemetry import tracking
+tracking.READY_SECONDS *= {PATIENCE}
+tracking.FAREWELL["finished"] *= {PATIENCE}
+runpy.run_module("worker.train", run_name="__main__")
+"""
+"""A training that waits for its services for as long as a busy machine needs to import them."""
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     made = Store(tmp_path / "store").open().run("taught")
@@ -36,7 +46,9 @@ def run(tmp_path: Path) -> Run:
     return made
 
 
-def train(run: Run, epoch: int, track: dict[str, Any], **env: str) -> tuple[int, str]:
+def train(
+    run: Run, epoch: int, track: dict[str, Any], how: Sequence[str] = ("-m", "worker.train"), **env: str
+) -> tuple[int, str]:
     """A rank as the supervisor starts it; exit code and output."""
     raise_epoch(run, epoch)
     spec = {"name": "taught", "train": TRAIN, "track": track, "checkpoint": {"every": 10, "keep": 5}}
@@ -47,7 +59,7 @@ def train(run: Run, epoch: int, track: dict[str, Any], **env: str) -> tuple[int,
     }
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("WANDB_", "MLFLOW_"))}
     done = subprocess.run(
-        [sys.executable, "-m", "worker.train"],
+        [sys.executable, *how],
         env={**kept, "PYTHONPATH": str(ROOT), **given, **env},
         cwd=run.path,
         capture_output=True,
@@ -61,7 +73,7 @@ def killed_and_gone_on(run: Run, track: dict[str, Any]) -> list[dict[str, Any]]:
     """The records of a training that was killed on its way and went on; every iteration is there once."""
     code, output = train(run, 1, track, MUSTER_KILL_AT="33")
     assert code == -9, output
-    code, output = train(run, 2, track)
+    code, output = train(run, 2, track, ("-c", PATIENT))
     assert code == 0 and "resumed from checkpoint 000000" in output and ": warning" not in output, output
     records = read_metrics(run)
     assert [each["iteration"] for each in records] == list(range(1, 41))
