@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import pytest
 from orchestrator.client import Client
 from orchestrator.keys import Key, KeyStore
 from tests.conftest import Serving
+from tests.support.browser import launched
 from tests.support.console.visitor import Visitor
 from tests.support.definitions import container, multinode
 
@@ -74,21 +74,14 @@ def visitor(console: Console) -> Visitor:
 
 @pytest.fixture
 def chromium() -> Iterator[Browser]:
-    """The system's Chromium, one for each test: asked to close what a person has open, it sometimes never answers, and only a whole
-    browser that doesn't is killed (by Playwright, after 30 s).
-    """
-    program = shutil.which("chromium")
-    if program is None:
-        pytest.skip("CHROMIUM IS NOT INSTALLED (apt-get install chromium): NO PAGE OF THE CONSOLE HAS BEEN LOOKED AT")
-    from playwright.sync_api import expect, sync_playwright
+    """A browser for persons."""
+    with launched() as browser:
+        from playwright.sync_api import expect
 
-    from tests.support.console.person import WAIT
+        from tests.support.console.person import WAIT
 
-    expect.set_options(timeout=WAIT)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        expect.set_options(timeout=WAIT)
         yield browser
-        browser.close()
 
 
 @pytest.fixture
