@@ -67,10 +67,15 @@ class SlurmBench(Bench):
         return self.cluster.processes(text)
 
     def close(self) -> None:
-        for handle in self.handles:
-            self.engine.stop(handle, 0.0)
-        wait_for(lambda: not self.processes(), 20, "no supervisor is left")
-        self.cluster.ready()
+        try:
+            for handle in self.handles:
+                self.engine.stop(handle, 0.0)
+            wait_for(lambda: not self.processes(), 20, "no supervisor is left")
+            self.cluster.ready()
+        except Exception as error:
+            shown = self.cluster.shown()
+            self.cluster.begin_anew()
+            raise AssertionError(f"{error}; {shown}") from error
 
 
 @pytest.fixture

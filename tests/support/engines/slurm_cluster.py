@@ -148,6 +148,14 @@ class SlurmCluster:
 
         wait_for(idle, 30, "all nodes are idle")
 
+    def begin_anew(self) -> None:
+        """All daemons without a memory: what one test left does not fail those after it."""
+        self.close()
+        shutil.rmtree(self.home / "state")
+        (self.home / "state").mkdir()
+        self.start()
+        self.ready()
+
     def close(self) -> None:
         """End every job, every daemon, and every process that they left."""
         if self.daemons and self.daemons["slurmctld"].poll() is None:
@@ -176,6 +184,13 @@ class SlurmCluster:
         done = subprocess.run(command, env=self.environment(), capture_output=True, text=True, timeout=30 * PATIENCE)
         assert done.returncode == 0 or not check, f"{command}: {done.stderr}"
         return done.stdout.strip()
+
+    def shown(self) -> str:
+        """Its nodes, jobs and processes, for whoever looks for a test's fault."""
+        answers = [
+            self.run(*words, check=False) for words in (("sinfo", "-N", "-o", "%N %T %E"), ("squeue", "-t", "all"))
+        ]
+        return "\n".join([*answers, *(" ".join(command(pid)) for pid in self.processes())])
 
     def processes(self, text: str = "") -> list[int]:
         """Pids of all that belongs to this cluster: daemons, steps, and what runs in them; with ``text`` in their command."""

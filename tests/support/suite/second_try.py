@@ -1,4 +1,7 @@
-"""A test that failed runs once more, for diagnosis alone: it stays failed, and is reported as flaky where it passes then."""
+"""A test that failed runs once more, for diagnosis alone: it stays failed, and is reported as flaky where it passes then.
+
+What failed is printed at once: a run that is ended for its time leaves no summary.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,25 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
+
+
+class _AtOnce:
+    """Of the process that reports."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.config = config
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        terminal = self.config.pluginmanager.get_plugin("terminalreporter")
+        if report.failed and terminal is not None:
+            crash = getattr(report.longrepr, "reprcrash", None)
+            words = crash.message if crash else report.longreprtext
+            terminal.write_line(f"\n{report.nodeid}, {report.when}: {words[:3000]}", red=True)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_AtOnce(config))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
