@@ -28,6 +28,7 @@ from orchestrator.control.compute_environments import ensure_compute_environment
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
+from orchestrator.control.presence import LOST_AFTER, Presence
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
@@ -74,6 +75,7 @@ class Server:
         secrets: str | None = None,
         trusted_proxies: Sequence[str] = (),
         min_free: MinFree = DEFAULT,
+        lost_after: float = LOST_AFTER,
         webhooks: str | None = None,
     ) -> None:
         """Take the lock, the port, the engines, the store and the database, in this order; nothing runs until :meth:`start`.
@@ -83,6 +85,7 @@ class Server:
         the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of jobs is kept;
         None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
         first.
+        ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
         ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`).
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
@@ -116,7 +119,7 @@ class Server:
                     ensure_compute_environments(session, nodes.names)
             except (DatabaseError, SecretsError) as error:
                 raise ServerError(str(error)) from None
-            self.bus = Bus(home, nodes.addresses)
+            self.bus = Bus(home, nodes.addresses, Presence(lost_after))
             stack.callback(self.bus.close)
             self.peers = Peers(self.store, home)
             stack.callback(self.peers.close)

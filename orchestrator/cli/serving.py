@@ -31,6 +31,7 @@ EngineOption = Annotated[
         "slurm or aws-batch. Repeatable: the first gets the queue default, each other a queue of its own name."
     ),
 ]
+_SHORTEST_SILENCE = 10.0
 CpusOption = Annotated[
     float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
 ]
@@ -104,6 +105,13 @@ def serve(
             show_default=False,
         ),
     ] = "",
+    lost_after: Annotated[
+        str,
+        typer.Option(
+            help="Time after which a node that alone is silent on the bus is lost, such as 5m, while its engine answers and says that "
+            "it runs. Nodes that fall silent together are waited for six times as long."
+        ),
+    ] = "120s",
     rate_limit: Annotated[
         int,
         typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited."),
@@ -152,6 +160,7 @@ def serve(
         secrets=secrets,
         trusted_proxies=trust_proxy or (),
         min_free=_min_free(min_free),
+        lost_after=_lost_after(lost_after),
         webhooks=webhooks,
     )
     ended = threading.Event()
@@ -169,6 +178,13 @@ def serve(
     finally:
         server.close()
     echo("stopped; running jobs continue and the next `muster serve` finds them")
+
+
+def _lost_after(text: str) -> float:
+    seconds = seconds_of("--lost-after", text)
+    if seconds is None or seconds < _SHORTEST_SILENCE:
+        raise SpecError(f"--lost-after {text}: expected at least {_SHORTEST_SILENCE:.0f}s; a busy machine is silent for some seconds")
+    return seconds
 
 
 def _min_free(text: str) -> MinFree:

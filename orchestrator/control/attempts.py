@@ -45,6 +45,7 @@ from orchestrator.domain.attempt import (
     Observed,
     Preempted,
     Save,
+    Silence,
     State,
     Stop,
     StopDelayed,
@@ -53,9 +54,8 @@ from orchestrator.domain.attempt import (
     step,
 )
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.hosts import engine_of
-from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
-from orchestrator.engines.api import EngineError, EngineFault, Gang, GangStatus, NodePhase, NotYet, Plan
+from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict, lost_host
+from orchestrator.engines.api import EngineError, EngineFault, Gang, GangStatus, NodePhase, NodeStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node, SchedulingPolicy, now
@@ -195,8 +195,8 @@ class Attempts:
 
     def _carry_out(self, session: Session, job: Job, attempt: Attempt, instruction: Instruction) -> Event | None:
         match instruction:
-            case Launch():
-                return self._launch(session, job, attempt)
+            case Launch(again):
+                return self._launch(session, job, attempt, again)
             case Keep(handle):
                 attempt.handle = handle
             case Observe():
@@ -226,14 +226,14 @@ class Attempts:
         record = record_owner(session, run, job)
         run.create(first_description(run, job, record.owner, record.queue))
 
-    def _launch(self, session: Session, job: Job, attempt: Attempt) -> Event:
+    def _launch(self, session: Session, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:
             gang = self.gang(session, job, attempt, job.gang)
             return self.engine.plan(self.engine.with_secrets(gang))
 
         self.bus.expect(job.id, attempt.number, len(attempt.nodes))
         try:
-            return Launched(self.engine.launch(_name(attempt), [node.host for node in attempt.nodes], plan))
+            return Launched(self.engine.launch(_name(attempt), [node.host for node in attempt.nodes], plan, again))
         except NotYet as wait:
             return LaunchDelayed(str(wait), wait.unknown)
         except EngineError as error:
@@ -283,16 +283,17 @@ class Attempts:
         return Observed(
             moment=self.clock.now(),
             ends=ends,
-            silences=[self._silence(attempt, node) for node in attempt.nodes],
+            silences=[self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)],
             waits=head.words if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) else "",
             words=head.words if head.running else "",
             stale=next((node.stale for node in status if node.stale), ""),
         )
 
-    def _silence(self, attempt: Attempt, node: Node) -> float | None:
-        if engine_of(node.host) not in self.engine.names:
-            return None  # the bus does not listen where its nodes look for it
-        return self.bus.silence(attempt.job_id, attempt.number, node.index, node.met)
+    def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
+        assert attempt.handle is not None
+        is_seen = status.phase is not NodePhase.UNREACHABLE and not status.stale
+        asked = self.engine.asked(attempt.handle) if is_seen else None
+        return self.bus.presence.silence((attempt.job_id, attempt.number, node.index), asked)
 
     def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node; noted in the attempt's record with the other facts about its nodes."""
@@ -307,11 +308,11 @@ class Attempts:
                 if record.stopped_at is None:
                     record.stopped_at = stopped
                     if attempt.ending is None:  # by itself: no one ended the gang
-                        gone = f"Host EC2 (instance {record.host}) terminated."
-                        record.status_reason = gone if end.lost else AWS_EXITED
-            ends.append(end)
-            if self.bus.met(job.id, attempt.number, record.index):
+                        record.status_reason = lost_host(record.host) if end.lost else AWS_EXITED
+                self.bus.presence.ended((job.id, attempt.number, record.index))
+            elif self.bus.presence.met((job.id, attempt.number, record.index)):
                 record.met = True
+            ends.append(end)
             if node.gpus:
                 record.devices = tuple(node.gpus)
             record.host = node.host or record.host
@@ -337,7 +338,8 @@ class Attempts:
             error = stop.exception()
             if error is None:
                 return self._gone(job, self._ends(job, attempt, stop.result()))
-            said = f"attempt {attempt.number} can't be stopped: {' '.join(str(error).split())}; trying again"
+            why = " ".join(str(error).split()).removesuffix("; trying again")
+            said = f"attempt {attempt.number} can't be stopped: {why}; trying again"
             expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
             self._denied.failed(key, f"job {job.id}: {said}", None if expected else error)
         said_last = self._denied.said(key)

@@ -4,8 +4,8 @@ Every node may connect; access rules in the router let a node publish below node
 can neither send a command nor read a message. A node's message counts only with the proof of its attempt's credential, and
 commands carry that proof to the node (:mod:`shared_store.bus`).
 
-The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval;
-a message that is lost costs nothing. With the bus off everything works from the store and the engine, slower.
+The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval, and its
+silence counts as :mod:`orchestrator.control.presence` says; a message that is lost costs nothing. With the bus off everything works from the store and the engine, slower.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import os
 import secrets
 import socket
 import threading
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from orchestrator.control.presence import Presence
 from shared_store.bus import LARGEST_MESSAGE, LARGEST_PROGRESS, Credential, Node, node_of, prefix, presence_key
 from shared_store.files import DamagedFile, json_object, read_json, write_atomic, write_json
 
@@ -72,6 +72,10 @@ _ACCESS = {
 attempts; the proofs do that. The controller's own session is inside the router: no rule applies to it."""
 
 
+_ITSELF: Node = ("controller", 0, 0)
+"""The controller's own session, as a node that no job has."""
+
+
 class BusError(Exception):
     """A command got no answer; the message says why."""
 
@@ -84,20 +88,18 @@ class Bus:
     They must: nodes that outlive a controller look for its successor where they found it.
     """
 
-    def __init__(self, home: Path, addresses: Sequence[str] = ()) -> None:
+    def __init__(self, home: Path, addresses: Sequence[str] = (), presence: Presence | None = None) -> None:
         """``addresses``: addresses of this machine on which the router listens beside loopback."""
+        self.presence = presence or Presence()
+        """Which nodes are connected."""
         self.changed: Callable[[], None] = lambda: None
         """Called (on the network's thread) when a node came or went."""
         self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
-        self._expected: dict[tuple[str, int], int] = {}
-        """The open attempts and their numbers of nodes; messages about others are dropped."""
-        self._gone: dict[Node, float | None] = {}
-        """Since when (monotonic [s]) each node that was ever here is gone; None while it is here."""
         self._progress: dict[Node, dict[str, Any]] = {}
-        self._opened: float | None = None
-        """When (monotonic [s]) this router took its predecessor's place; None where nodes can't know that it is here."""
         self._session: Any = None
+        self._loopback: Any = None
+        """A session of the controller's own that reaches the router as nodes do: it tells a router that hears nobody from nodes that are gone."""
         self._declared: list[Any] = []
         self._master = ""
         self.endpoint: str | None = None
@@ -118,7 +120,6 @@ class Bus:
             for port in (kept.get("port"), _free_port()):
                 if isinstance(port, int) and self._try(port):
                     self.endpoint = f"tcp/127.0.0.1:{port}"
-                    self._opened = time.monotonic() if port == kept.get("port") else None
                     if (facts := {"port": port, "key": self._master}) != kept:
                         write_json(self._home / "bus.json", facts, mode=0o600)
                     return
@@ -162,36 +163,40 @@ class Bus:
             ),
             self._session.declare_subscriber("muster/*/*/*/progress", direct(self._note, indirect=False)),
         ]
+        self._hear_itself(port)
         return True
+
+    def _hear_itself(self, port: int) -> None:
+        import zenoh
+
+        config = zenoh.Config()
+        credential = self._credential(*_ITSELF[:2])
+        settings = {
+            "mode": "client",
+            "connect/endpoints": [f"tcp/127.0.0.1:{port}"],
+            "scouting/multicast/enabled": False,
+            "transport/auth/usrpwd/user": "muster",
+            "transport/auth/usrpwd/password": credential.password,
+        }
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        self._loopback = zenoh.open(config)
+        self._declared.append(self._loopback.liveliness().declare_token(presence_key(credential, *_ITSELF)))
 
     def close(self) -> None:
         """Stop the router; nodes look for the next one."""
-        if self._session is not None:
-            self._session.close()
-            self._session = None
+        for session in (self._loopback, self._session):
+            if session is not None:
+                session.close()
+        self._loopback = self._session = None
 
     def expect(self, job: str, attempt: int, nodes: int) -> None:
         """Listen to the attempt's nodes from now on, until :meth:`forget`."""
-        with self._lock:
-            self._expected[job, attempt] = nodes
+        self.presence.expect(job, attempt, nodes)
 
     def token(self, job: str, attempt: int) -> str | None:
         """``MUSTER_BUS_TOKEN`` of the attempt's nodes; None with the bus off."""
         return str(self._credential(job, attempt)) if self.endpoint else None
-
-    def met(self, job: str, attempt: int, node: int) -> bool:
-        """Whether the node is or was connected."""
-        with self._lock:
-            return (job, attempt, node) in self._gone
-
-    def silence(self, job: str, attempt: int, node: int, met_before: bool = False) -> float | None:
-        """Seconds since a node that was connected has gone; None where it is connected, or never was.
-
-        ``met_before``: an earlier router met it. Where it does not connect to this router, it counts as gone since this router's start.
-        """
-        with self._lock:
-            since = self._gone.get((job, attempt, node), self._opened if met_before else None)
-        return None if since is None else time.monotonic() - since
 
     def progress(self, job: str, attempt: int, node: int) -> dict[str, Any] | None:
         """The newest progress that a node reported."""
@@ -200,11 +205,10 @@ class Bus:
 
     def forget(self, job: str, attempt: int) -> None:
         """The attempt is closed."""
+        self.presence.forget(job, attempt)
         with self._lock:
-            self._expected.pop((job, attempt), None)
-            for table in (self._gone, self._progress):
-                for node in [node for node in table if node[:2] == (job, attempt)]:
-                    del table[node]
+            for node in [node for node in self._progress if node[:2] == (job, attempt)]:
+                del self._progress[node]
 
     def command(self, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
         """Send a command to a node's supervisor and wait for its answer. Raises BusError."""
@@ -235,22 +239,22 @@ class Bus:
 
     def _presence(self, sample: Any) -> None:
         key = str(sample.key_expr)
-        node = self._sender(key)
-        if node is None or not hmac.compare_digest(
-            key.encode(), presence_key(self._credential(*node[:2]), *node).encode()
-        ):
+        node = node_of(key)
+        if node is None or not (node == _ITSELF or self.presence.expects(node)):
+            return
+        if not hmac.compare_digest(key.encode(), presence_key(self._credential(*node[:2]), *node).encode()):
             return
         here = str(sample.kind).endswith("PUT")
-        with self._lock:
-            if node[:2] not in self._expected:
-                return
-            self._gone[node] = None if here else time.monotonic()
+        if node == _ITSELF:
+            self.presence.hear_itself(here)
+            return
+        (self.presence.came if here else self.presence.left)(node)
         self.changed()
 
     def _note(self, sample: Any) -> None:
         key = str(sample.key_expr)
-        node = self._sender(key)
-        if node is None or sample.attachment is None:
+        node = node_of(key)
+        if node is None or sample.attachment is None or not self.presence.expects(node):
             return
         payload, proof = sample.payload.to_bytes(), sample.attachment.to_bytes()
         text = payload[: LARGEST_PROGRESS + 1].decode(errors="replace")
@@ -260,14 +264,8 @@ class Bus:
             return
         progress = _message(payload)
         with self._lock:
-            if progress and node[:2] in self._expected:
+            if progress and self.presence.expects(node):
                 self._progress[node] = progress
-
-    def _sender(self, key: str) -> Node | None:
-        """The node of this key, if its attempt is open and has such a node."""
-        node = node_of(key)
-        with self._lock:
-            return node if node is not None and 0 <= node[2] < self._expected.get(node[:2], 0) else None
 
 
 def _message(payload: bytes) -> dict[str, Any]:

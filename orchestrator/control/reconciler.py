@@ -79,7 +79,7 @@ class Reconciler:
         self.interval, self.retention = interval, retention
         volumes = {"store": store.path, "database": database.volume}
         self.disk = Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
-        self._short = False
+        self._short, self._is_cut_off = False, False
         self.work_queue = WorkQueue()
         self.clock = clock or Clock()
         self.monitoring = Monitoring()
@@ -151,8 +151,15 @@ class Reconciler:
         for job_id in self.work_queue.active():
             if not self._backoff.waits(("advance", job_id)):
                 self._guarded("advance", [job_id], self._advance)
+        self._note_silence()
         self._isolated("scheduling", self._admit)
         self._isolated("clearing away", self._sweep)
+
+    def _note_silence(self) -> None:
+        why = self.bus.presence.cut_off
+        if (why is not None) != self._is_cut_off:
+            self._is_cut_off = why is not None
+            log.warning("%s", f"{why}: no gang ends for it" if why else "nodes are heard again")
 
     def _keep_database(self) -> None:
         """Check the database, and read the jobs anew where it is back. Raises DatabaseError where it is unavailable or another controller's."""

@@ -6,17 +6,17 @@ instructions out and reads the state anew from the database; :func:`after` says 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws, lost_host
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.domain.retry import retries
 from shared_store.wording import counted
 
-LOST = 20.0
-"""Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
+UNHEARD = 10.0
+"""Seconds of a node's silence from which its job says so."""
 CAUSE_PATIENCE = 90_000
 """For so long [ms] a gang that has lost nodes which were told to end waits for the end of the node that is the cause."""
 FINISHING = 10_000
@@ -105,6 +105,19 @@ class State:
         return Phase.RUNNING if self.started else Phase.STARTING
 
 
+@dataclass(frozen=True)
+class Silence:
+    """That the bus does not hear a node that it knew."""
+
+    seconds: float
+    since: str
+    """When it was heard last, for people."""
+    is_lost: bool
+    """Whether that proves that the node is lost; else it is unreachable, and waited for."""
+    cause: str = ""
+    """Why it may be the controller that is cut off; empty where it is not."""
+
+
 # -- events ---------------------------------------------------------------------------------------------------------------
 
 
@@ -150,8 +163,8 @@ class Observed:
     """Steady time [ms]."""
     ends: Sequence[NodeEnd | None]
     """By node index; None for a node that has not ended."""
-    silences: Sequence[float | None]
-    """By node index: for how many seconds the bus has missed a node that it knew; None where it does not."""
+    silences: Sequence[Silence | None]
+    """By node index; None for a node that the bus hears, or never knew."""
     waits: str = ""
     """Why the main node does not run yet or can't be seen; empty once it runs or has ended."""
     words: str = ""
@@ -188,6 +201,9 @@ Event = Due | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | 
 @dataclass(frozen=True)
 class Launch:
     """Ask the engine to launch the gang, which it does once for an epoch: → Launched, LaunchDelayed or LaunchRefused."""
+
+    again: bool = True
+    """Whether to try again where nothing of the gang can run yet."""
 
 
 @dataclass(frozen=True)
@@ -282,9 +298,11 @@ def step(state: State, event: Event) -> Instructions:
         case Phase.CLOSED, _:
             return ()
         case Phase.LAUNCHING, Due():
-            return (Launch(),)
+            return (Launch(again=state.verdict is None and state.stop_reason is None),)
         case Phase.LAUNCHING, Launched(handle):
             return Keep(handle), Save()
+        case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
+            return (WindUp(),)
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
             return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
         case Phase.LAUNCHING, LaunchDelayed(reason) if reason:
@@ -316,6 +334,7 @@ def _observed(state: State, seen: Observed) -> Instructions:
 def _tell(state: State, seen: Observed) -> Instructions:
     """The reason that the job's user sees."""
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
+    runs = "; ".join(each for each in (runs, _unheard(state.terms, seen), seen.stale) if each)
     if seen.waits:
         return (Explain(seen.waits),)
     if not state.started:
@@ -359,13 +378,28 @@ def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:
 
 
 def _by_silence(terms: Terms, seen: Observed) -> Verdict | None:
-    """That a node is frozen or cut off; on AWS a child's death changes nothing."""
-    for index, (end, silence) in enumerate(zip(seen.ends, seen.silences, strict=True)):
-        counts = index == terms.main or terms.options.is_native
-        if counts and end is None and silence is not None and silence > LOST:
-            reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
-            return Verdict(Ending.FAILED, reason)
+    """That a node is lost; on AWS a child's death changes nothing."""
+    for index, silence in _silent(seen):
+        if silence.is_lost and (index == terms.main or terms.options.is_native):
+            reason = f"node {index} has been silent for {silence.seconds:.0f} s: it hangs, or its network is down"
+            return Verdict(Ending.LOST, reason if terms.options.is_native else lost_host(terms.hosts[index]))
     return None
+
+
+def _silent(seen: Observed) -> Iterator[tuple[int, Silence]]:
+    """The nodes that are silent, although nothing is known of their end."""
+    for index, (end, silence) in enumerate(zip(seen.ends, seen.silences, strict=True)):
+        if end is None and silence is not None:
+            yield index, silence
+
+
+def _unheard(terms: Terms, seen: Observed) -> str:
+    """A note about the first node that is unreachable; empty where there is none."""
+    for index, silence in _silent(seen):
+        if silence.seconds > UNHEARD:
+            name = "the main node" if index == terms.main else f"node {index}"
+            return f"{name} has been unreachable since {silence.since}" + (f" ({silence.cause})" if silence.cause else "")
+    return ""
 
 
 def _by_time(state: State, moment: int) -> Verdict | None:
@@ -389,7 +423,7 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         return Close(gone.moment, not is_free, status, reason)
 
     match ending:
-        case Ending.STOPPED | Ending.FAILED | Ending.PREEMPTED | Ending.REQUEUE if state.stop_reason is not None:
+        case Ending.STOPPED | Ending.FAILED | Ending.LOST | Ending.PREEMPTED | Ending.REQUEUE if state.stop_reason is not None:
             return to(Status.FAILED, f"{state.stop_reason}{progress}" if native else state.stop_reason)
         case Ending.SUCCEEDED:
             return to(Status.SUCCEEDED, verdict.reason)
@@ -401,9 +435,9 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
             return to(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
         case Ending.REQUEUE if is_free or is_left:
             return to(Status.RUNNABLE, f"attempt {number} left on request{progress}; starting again")
-        case Ending.FAILED if is_left and _retries(terms, verdict, head):
+        case Ending.FAILED | Ending.LOST if is_left and _retries(terms, verdict, head):
             return to(Status.RUNNABLE, f"attempt {number} failed ({verdict.reason}){progress}; trying again")
-        case Ending.FAILED if native:
+        case Ending.FAILED | Ending.LOST if native:
             return to(Status.FAILED, f"{verdict.reason} (attempt {spent} of {terms.allowed})")
     return to(Status.FAILED, verdict.reason)
 

@@ -56,6 +56,8 @@ class Ending(StrEnum):
     SUCCEEDED = "succeeded"
     FAILED = "failed"
     """A failure that a retry may mend."""
+    LOST = "lost"
+    """The same, for a node that is silent: the others may save."""
     FATAL = "fatal"
     """A failure after which the job is not tried again."""
     PREEMPTED = "preempted"
@@ -102,6 +104,11 @@ AWS_EXITED = "Essential container in task exited"
 """AWS Batch's reason for an attempt whose main container ended, successfully or not; clients match it."""
 
 
+def lost_host(host: str) -> str:
+    """AWS Batch's reason for an attempt that has lost the host of its main node."""
+    return f"Host EC2 (instance {host}) terminated."
+
+
 def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdict | None:
     """The same for a job of the Batch API: the main node's end ends the job and decides, in AWS's own words.
 
@@ -114,7 +121,7 @@ def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdic
     if head is None:
         return None
     if head.lost:
-        return Verdict(Ending.FAILED, f"Host EC2 (instance {host}) terminated.", None)
+        return Verdict(Ending.FAILED, lost_host(host), None)
     return Verdict(Ending.SUCCEEDED if head.exit_code == 0 else Ending.FAILED, AWS_EXITED, head.exit_code)
 
 

@@ -134,15 +134,16 @@ class EngineSet:
         if any(self._traits(name).secrets is not SecretValues.REFERENCES for name in names):
             self.secrets.check(containers, queue)
 
-    def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]]) -> str:
+    def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]], again: bool = True) -> str:
         """The handle of a gang, as text, once it is started; does not wait. Raises NotYet until then, and EngineError.
 
         Args:
             gang: Its name.
             hosts: Where its nodes are placed.
             plan: Makes its plan, where it has not been handed to the engine yet.
+            again: Whether to try again where the last try has left nothing.
         """
-        return self._runner(engine_of(hosts[0])).launch(gang, plan).text()
+        return self._runner(engine_of(hosts[0])).launch(gang, plan, again).text()
 
     def observe(self, handle: str) -> GangStatus | None:
         """The newest picture of a gang; None before the first. Does not wait, and raises nothing.
@@ -154,6 +155,11 @@ class EngineSet:
             return self._runner(found.engine).observe(found)
         except NotServed as error:
             return [NodeStatus(NodePhase.UNREACHABLE, words=str(error))] * found.nodes
+
+    def asked(self, handle: str) -> float | None:
+        """Seconds since the engine was asked for the status that :meth:`observe` returns; None where it does not answer now."""
+        found = read_handle(handle)
+        return self._runner(found.engine).asked(found) if found.engine in self._runners else None
 
     def stop(self, handle: str, grace: float) -> GangStatus:
         """Stop the gang, which may take long; returns how its nodes ended. Raises EngineError."""

@@ -38,6 +38,8 @@ log = logging.getLogger("muster.engines")
 
 OVERDUE = 10.0
 """Seconds after which an engine whose call has not returned counts as not answering."""
+_LAST_LOOK = 60.0
+"""Seconds that :meth:`Runner.stop` waits for the last status of a gang that was stopped."""
 _CLOSING = 5.0
 """Seconds that :meth:`Runner.close` gives the call that is being carried out."""
 
@@ -79,8 +81,8 @@ class Runner:
         """By gang: what its last launch has to wait for."""
         self._looks: set[Handle] = set()
         """Handles of the gangs that are being looked at."""
-        self._seen: dict[Handle, GangStatus] = {}
-        """By handle: the newest picture."""
+        self._seen: dict[Handle, tuple[GangStatus, float]] = {}
+        """By handle: the newest status, and when the engine was asked for it (monotonic [s])."""
         self._telling: Future[Capacity] | None = None
         self._capacity: Capacity | None = None
         self._told_at: int | None = None
@@ -149,21 +151,24 @@ class Runner:
         """As the engine plans it, on the caller's thread. Raises EngineError."""
         return self._call("plan the gang", lambda: _lasting(lambda: self.engine.plan(gang)))
 
-    def launch(self, gang: str, plan: Callable[[], Plan[Any]]) -> Handle:
+    def launch(self, gang: str, plan: Callable[[], Plan[Any]], again: bool = True) -> Handle:
         """The handle of the gang of that name once it is started. Raises :class:`Underway` until then, NotYet and EngineError.
 
         ``plan`` is called, on the caller's thread, where the gang's launch is not under way. One thread launches.
+        ``again``: whether to try again where the last try has left nothing of the gang.
         """
         launch = self._launches.get(gang)
         if launch is None:
-            if self._backoff.waits(("launch", gang)):
-                raise self._refused[gang]
+            refused = self._refused.get(gang)
+            if refused and (self._backoff.waits(("launch", gang)) or not (again or refused.unknown)):
+                raise refused
             try:
                 planned = plan()
             except Transient as error:
                 self._refused[gang] = error
                 self._failed(("launch", gang), error)
                 raise
+            self._refused.pop(gang, None)
             launch = self._launches[gang] = self._submit(lambda: self._start(planned))
             launch.add_done_callback(lambda _: self._changed())
         if not launch.done():
@@ -185,7 +190,7 @@ class Runner:
             if handle not in self._looks and not self._backoff.waits(subject):
                 self._looks.add(handle)
                 self._calls.put(partial(self._look, handle))
-        seen = self._seen.get(handle)
+        seen, _ = self._seen.get(handle, (None, 0.0))
         if trouble := self.silence or self._backoff.said(subject):
             away = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
             return [
@@ -194,10 +199,20 @@ class Runner:
             ]
         return seen
 
+    def asked(self, handle: Handle) -> float | None:
+        """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
+        if handle not in self._seen or self.silence or self._backoff.said(("look", handle)):
+            return None
+        return time.monotonic() - self._seen[handle][1]
+
     def stop(self, handle: Handle, grace: float) -> GangStatus:
         """Stop the gang on the caller's thread, which may take long, and look at it once more. Raises EngineError."""
         self._call("stop the gang", lambda: self.engine.stop(handle, grace))
-        return self._submit(lambda: self._call("look at the gang", lambda: self.engine.observe(handle))).result()
+        looking = self._submit(lambda: self._call("look at the gang", lambda: self.engine.observe(handle)))
+        try:
+            return looking.result(_LAST_LOOK)
+        except TimeoutError:
+            raise Transient(self.silence or f"the {self.engine.name} engine has not said how the gang ended") from None
 
     def forget(self, gang: str, handle: Handle | None) -> None:
         """The gang is over; ``handle``: None where it was never launched."""
@@ -279,7 +294,8 @@ class Runner:
 
     def _look(self, handle: Handle) -> None:
         subject = ("look", handle)
-        before = self._seen.get(handle), self._backoff.said(subject)
+        before = self._seen.get(handle, (None, 0.0))[0], self._backoff.said(subject)
+        asked = time.monotonic()
         try:
             status = self._call("look at the gang", lambda: self.engine.observe(handle))
         except EngineError as error:
@@ -288,10 +304,10 @@ class Runner:
             self._backoff.worked(subject)
             with self._lock:
                 if handle in self._looks:  # else it was forgotten meanwhile
-                    self._seen[handle] = status
+                    self._seen[handle] = status, asked
         with self._lock:
             self._looks.discard(handle)
-        if before != (self._seen.get(handle), self._backoff.said(subject)):
+        if before != (self._seen.get(handle, (None, 0.0))[0], self._backoff.said(subject)):
             self._changed()
 
 

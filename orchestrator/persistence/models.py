@@ -366,7 +366,7 @@ class Node(Base):
     status_reason: Mapped[str | None] = mapped_column(default=None)
     """AWS's status reason for a node that ended by itself."""
     met: Mapped[bool] = mapped_column(default=False)
-    """Whether it has connected to the bus: then the next controller must report it missing, too, if it does not return."""
+    """Whether it has connected to the bus."""
 
     @validates("reason", "error", "status_reason")
     def _storable(self, _key: str, text: str | None) -> str | None:

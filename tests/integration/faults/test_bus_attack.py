@@ -20,6 +20,7 @@ from tests.support.worker.node import node_contract
 from worker.node.bus import NodeBus
 
 KEY = "muster/victim/1/0"
+VICTIM = ("victim", 1, 0)
 
 
 class Victim:
@@ -64,7 +65,7 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
 def victim(bus: Bus) -> Iterator[Victim]:
     victim = Victim(bus)
     victim.report(bus, {"iteration": 7})
-    wait_for(lambda: bus.silence("victim", 1, 0) is None and bus.met("victim", 1, 0), 10, "the victim's token")
+    wait_for(lambda: bus.presence.silence(VICTIM, None) is None and bus.presence.met(VICTIM), 10, "the victim's token")
     yield victim
     victim.node.close()
 
@@ -160,11 +161,11 @@ def test_a_node_feigns_no_presence_nor_absence_of_another(bus: Bus, victim: Vict
     keys += [f"{KEY}/alive/é", "muster/*/*/*/alive/*"]
     tokens = [mallory.liveliness().declare_token(key) for key in keys]
     settled(bus)
-    assert not bus.met("victim", 1, 1)
+    assert not bus.presence.met(("victim", 1, 1))
     for token in tokens:
         token.undeclare()
     settled(bus)
-    assert bus.silence("victim", 1, 0) is None
+    assert bus.presence.silence(VICTIM, None) is None
 
 
 @pytest.mark.parametrize("complete", [False, True])
@@ -204,7 +205,7 @@ def test_a_command_that_is_repeated_is_not_carried_out_again(bus: Bus, victim: V
 
 def test_invented_keys_leave_nothing_in_the_controller(bus: Bus, victim: Victim) -> None:
     session = attacker(bus)
-    before = set(bus._gone), set(bus._progress) | {("mallory", 1, 0)}
+    before = set(bus.presence._nodes), set(bus._progress) | {("mallory", 1, 0)}
     tokens = []
     for number in range(20_000):
         key = f"muster/invented-{number}/1/0/progress"
@@ -215,7 +216,7 @@ def test_invented_keys_leave_nothing_in_the_controller(bus: Bus, victim: Victim)
             tokens.append(session.liveliness().declare_token(presence_key(own(bus), "mallory", 1, number + 2)))
             tokens.append(session.liveliness().declare_token(presence_key(own(bus), f"invented-{number}", 1, 0)))
     settled(bus, session)
-    assert (set(bus._gone), set(bus._progress)) == before
+    assert (set(bus.presence._nodes), set(bus._progress)) == before
     session.close()
 
 
@@ -232,7 +233,7 @@ def test_messages_of_a_closed_attempt_are_dropped(tmp_path: Path) -> None:
         victim.node.tend({"iteration": 8})
         victim.node.close()
         settled(bus, session)
-        assert {job for job, _, _ in (*bus._gone, *bus._progress)} == {"mallory"}
+        assert {job for job, _, _ in (*bus.presence._nodes, *bus._progress)} == {"mallory"}
         session.close()
     finally:
         bus.close()

@@ -49,7 +49,7 @@ def start_node(bus: Bus, then: str, index: int = 0, lease: int = LEASE_MILLISECO
     """A process with a node's session that goes on with ``then``."""
     script = NODE.format(index=index, endpoint=bus.endpoint, token=bus.token("j", 1), lease=lease) + then
     process = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY)
-    wait_for(lambda: ("j", 1, index) in bus._gone, 20, "the node's token")
+    wait_for(lambda: bus.presence.met(("j", 1, index)), 20, "the node's token")
     return process
 
 
@@ -59,21 +59,21 @@ def contract(bus: Bus, index: int = 0) -> NodeContract:
 
 def test_a_killed_node_is_noticed_by_its_connection_long_before_its_lease_ends(bus: Bus) -> None:
     node = start_node(bus, "time.sleep(600)", lease=3_600_000)
-    assert bus.silence("j", 1, 0) is None
+    assert bus.presence.silence(("j", 1, 0), None) is None
     noticed = threading.Event()
     bus.changed = noticed.set
     node.kill()
     assert noticed.wait(20 * PATIENCE)
-    assert bus.silence("j", 1, 0) is not None
+    assert bus.presence.silence(("j", 1, 0), None) is not None
     node.wait()
 
 
 def test_a_frozen_node_is_noticed_by_its_lease_and_welcomed_back(bus: Bus) -> None:
     node = start_node(bus, "time.sleep(60)")
     node.send_signal(signal.SIGSTOP)
-    wait_for(lambda: bus.silence("j", 1, 0) is not None, 6, "the loss of the frozen node")
+    wait_for(lambda: bus.presence.silence(("j", 1, 0), None) is not None, 6, "the loss of the frozen node")
     node.send_signal(signal.SIGCONT)
-    wait_for(lambda: bus.silence("j", 1, 0) is None, 10, "its return")
+    wait_for(lambda: bus.presence.silence(("j", 1, 0), None) is None, 10, "its return")
     node.kill()
     node.wait()
 
@@ -155,7 +155,7 @@ def test_two_routers_on_one_machine_do_not_see_each_others_nodes(bus: Bus, tmp_p
     other.open()
     other.expect("j", 1, nodes=2)
     nodes = [start_node(each, "time.sleep(600)", index) for index, each in enumerate((bus, other))]
-    assert [set(each._gone) for each in (bus, other)] == [{("j", 1, 0)}, {("j", 1, 1)}]
+    assert [[each.presence.met(("j", 1, index)) for index in (0, 1)] for each in (bus, other)] == [[True, False], [False, True]]
     assert other.endpoint != bus.endpoint
     for node in nodes:
         node.kill()
@@ -169,7 +169,7 @@ def test_processes_started_after_the_session_opened_work(bus: Bus) -> None:
     node = NodeBus(contract(bus), write)
     node.tend(None)
     child = start_node(bus, "time.sleep(60)", index=1)
-    assert bus.silence("j", 1, 1) is None
+    assert bus.presence.silence(("j", 1, 1), None) is None
     child.kill()
     child.wait()
     node.close()

@@ -104,7 +104,7 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
 
 
 def _served(engine: str, home: Path, *options: str, volume: Path | None = None, **needs: Any) -> Iterator[Site]:
-    with Serving(home, "--engine", engine, *options) as serving:
+    with Serving(home, "--engine", engine, "--lost-after", "20s", *options) as serving:
         yield Site(engine, serving, volume or home / "store", **needs)
 
 

@@ -7,11 +7,10 @@ import shutil
 import sqlite3
 from pathlib import Path
 
-from orchestrator.control.bus import Bus
 from shared_store.checkpoints import CheckpointWriter, list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
-from tests.conftest import Serving, wait_for
+from tests.conftest import Serving
 from tests.support.worker.trained import run_in
 
 
@@ -30,26 +29,6 @@ def test_a_commit_removes_what_a_killed_writer_left_but_not_what_comes_next(tmp_
     assert [checkpoint.name for checkpoint in list_checkpoints(run)] == ["00000030-e2"]
     hidden = sorted(entry.name for entry in run.checkpoints.iterdir() if entry.name.startswith("."))
     assert hidden == [".00000010-e3.tmp", ".00000040-e2.tmp"]
-
-
-def test_a_node_that_an_earlier_controller_met_is_missed_by_the_next_one(tmp_path: Path) -> None:
-    """A node that is frozen while the controller is started again never comes to the new router."""
-    first = Bus(tmp_path)
-    first.open()
-    assert first.silence("job", 1, 0, met_before=True) is None, (
-        "nobody can know of a router that was never there before"
-    )
-    port = first.endpoint
-    first.close()
-    second = Bus(tmp_path)
-    second.open()
-    try:
-        assert second.endpoint == port
-        assert second.silence("job", 1, 0) is None, "one that never was on the bus may be without it"
-        assert not second.met("job", 1, 0)
-        wait_for(lambda: (second.silence("job", 1, 0, met_before=True) or 0) > 0.1, 5, "its silence")
-    finally:
-        second.close()
 
 
 def test_a_job_that_was_struck_after_its_last_save_may_be_resumed_for_its_evaluation(

@@ -11,8 +11,8 @@ import pytest
 from orchestrator.domain.attempt import (
     CAUSE_PATIENCE,
     FINISHING,
-    LOST,
     SHORTEST_REQUEUE,
+    UNHEARD,
     AwaitCause,
     AwaitChildren,
     Close,
@@ -33,6 +33,7 @@ from orchestrator.domain.attempt import (
     Phase,
     Preempted,
     Save,
+    Silence,
     State,
     Stop,
     StopDelayed,
@@ -69,7 +70,7 @@ def on_aws(state: State) -> State:
     return with_terms(state, options=NativeOptions())
 
 
-def seen(*ends: NodeEnd | None, silences: Sequence[float | None] = (None, None), **facts: Any) -> Observed:
+def seen(*ends: NodeEnd | None, silences: Sequence[Silence | None] = (None, None), **facts: Any) -> Observed:
     """A look at two nodes that run, where nothing else is said."""
     return Observed(T, ends or (None, None), silences, **facts)
 
@@ -86,7 +87,11 @@ FAILED = Verdict(Ending.FAILED, "main node: exit 1", 1)
 MAIN_LAST = (end(0), end(0))
 KILLED = end(143, asked=True)
 UNSURE = Verdict(Ending.FAILED, "main node: exit 143", 143, certain=False)
-FROZEN = Verdict(Ending.FAILED, "node 1 gives no sign of life for 21 s: frozen, or cut off")
+QUIET = Silence(121.0, "12:00:00 UTC", False, "none is heard")
+GONE_QUIET = replace(QUIET, is_lost=True, cause="")
+FROZEN = Verdict(Ending.LOST, "node 1 has been silent for 121 s: it hangs, or its network is down")
+UNHEARD_SO = Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC (none is heard)")
+QUIET_SO = Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC")
 LATE = Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
 REFUSED = Verdict(Ending.FATAL, "can't start the gang: no such image")
 AWS_FAILED = Verdict(Ending.FAILED, AWS_EXITED, 1)
@@ -104,7 +109,13 @@ TIMED = with_terms(RUNNING, timeout=50)
 RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     # -- launching
     "what is recorded is launched": (LAUNCHING, Due(), [Launch()]),
-    "also when it is to end": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [Launch()]),
+    "what is to end is not launched anew": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [Launch(again=False)]),
+    "nor on request": (asked(LAUNCHING), Due(), [Launch(again=False)]),
+    "what was preempted before it could start is over": (
+        ending(Ending.PREEMPTED, of=LAUNCHING),
+        LaunchDelayed("pulling the image", False),
+        [WindUp()],
+    ),
     "a handle is saved at once": (LAUNCHING, Launched("handle"), [Keep("handle"), Save()]),
     "a launch that waits says why": (LAUNCHING, LaunchDelayed("no room", False), [Explain("no room")]),
     "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
@@ -145,10 +156,21 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "a request ends it": (asked(RUNNING), seen(), ends(STOPPED)),
     "also before it runs": (asked(STARTING), seen(waits="queued"), ends(STOPPED, first=Explain("queued"))),
     "an end counts more than a request": (asked(RUNNING), seen(*MAIN_LAST), ends(DONE)),
-    "silence ends it": (RUNNING, seen(silences=(None, LOST + 1)), ends(FROZEN, 5.0)),
-    "not a short one": (RUNNING, seen(silences=(None, LOST)), [SAYS_SO]),
-    "nor that of a node that has ended": (RUNNING, seen(None, end(0), silences=(None, LOST + 1)), [SAYS_SO]),
-    "nor that of a child on AWS": (on_aws(RUNNING), seen(silences=(None, LOST + 1)), [SAYS_SO]),
+    "a node that is lost ends it, with its whole grace": (
+        RUNNING,
+        seen(silences=(None, GONE_QUIET)),
+        ends(FROZEN, 35.0, first=QUIET_SO),
+    ),
+    "one that is unreachable does not, and is called so": (RUNNING, seen(silences=(None, QUIET)), [UNHEARD_SO]),
+    "after a moment": (RUNNING, seen(silences=(None, replace(QUIET, seconds=UNHEARD))), [SAYS_SO]),
+    "the silence of a node that has ended is none": (RUNNING, seen(None, end(0), silences=(None, GONE_QUIET)), [SAYS_SO]),
+    "that of a child on AWS ends nothing": (on_aws(RUNNING), seen(silences=(None, GONE_QUIET)), [QUIET_SO]),
+    "that of the main node loses its host": (
+        on_aws(RUNNING),
+        seen(silences=(GONE_QUIET, None)),
+        ends(replace(GONE, ending=Ending.LOST), 35.0, first=Explain(f"{RUNS}; the main node{QUIET_SO.reason[33:]}")),
+    ),
+    "an engine that does not answer is named": (RUNNING, seen(stale="Slurm is away"), [Explain(f"{RUNS}; Slurm is away")]),
     "time ends it": (replace(TIMED, running_since=T - 50_001), seen(), ends(LATE)),
     "to the second": (TIMED, seen(), [SAYS_SO]),
     "on AWS a child's end is nothing": (on_aws(RUNNING), seen(None, end(1)), [SAYS_SO]),
@@ -238,6 +260,8 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=2), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
     "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),
     "left at once, the last time": (with_terms(AT_ONCE, spent=2), BOTH_LEFT, SPENT, S.FAILED, "why"),
+    "lost": (ending(Ending.LOST), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "lost the last time": (with_terms(ending(Ending.LOST), spent=2), (), SPENT, S.FAILED, "why (attempt 3 of 3)"),
     "failed": (ending(Ending.FAILED), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
     "failed the last time": (FAILED_LAST, MAIN_FAILED, SPENT, S.FAILED, "why (attempt 3 of 3)"),
     "failed the last time, on AWS": (on_aws(FAILED_LAST), MAIN_FAILED, SPENT, S.FAILED, "why"),

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from orchestrator.domain.attempt import (
-    LOST,
     SHORTEST_REQUEUE,
     AwaitCause,
     AwaitChildren,
@@ -50,13 +49,6 @@ def test_a_gang_that_failed_for_good_has_little_to_save() -> None:
 def test_a_look_has_a_silence_for_every_node() -> None:
     with pytest.raises(ValueError):
         step(RUNNING, Observed(2000, (None, None), (None,)))
-
-
-def test_on_aws_the_silence_of_the_main_node_counts() -> None:
-    on_aws = replace(RUNNING, terms=replace(RUNNING.terms, options=NativeOptions()))
-    reason = "node 0 gives no sign of life for 21 s: frozen, or cut off"
-    seen = Observed(2000, (None, None), (LOST + 1, None))
-    assert Decide(Verdict(Ending.FAILED, reason)) in step(on_aws, seen)
 
 
 def test_who_leaves_on_request_after_a_while_starts_again_though_no_attempt_is_left() -> None:

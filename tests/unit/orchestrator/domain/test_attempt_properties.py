@@ -20,7 +20,8 @@ node_ends = st.none() | st.builds(
     NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), asked=st.booleans()
 )
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
-silences = st.just([None] * NODES) | st.lists(st.none() | st.floats(0, 60), min_size=NODES, max_size=NODES)
+silence = st.builds(attempt.Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"]))
+silences = st.just([None] * NODES) | st.lists(st.none() | silence, min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
 delays = st.builds(attempt.LaunchDelayed, words, st.booleans())
 launches = st.one_of(*[st.just(attempt.Launched("handle"))] * 4, delays, st.just(attempt.LaunchRefused("refused")))
@@ -162,7 +163,8 @@ def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_rea
         state = page.now
         if state.closed:
             continue
-        assert attempt.step(state, attempt.Due()) == ((attempt.Observe(),) if state.launched else (attempt.Launch(),))
+        launch = attempt.Launch(again=state.verdict is None and state.stop_reason is None)
+        assert attempt.step(state, attempt.Due()) == ((attempt.Observe(),) if state.launched else (launch,))
         follows = attempt.step(state, seen) if state.launched else ()
         if state.verdict is not None or any(isinstance(each, attempt.Decide) for each in follows):
             assert not follows or isinstance(follows[-1], attempt.Stop | attempt.AwaitChildren)

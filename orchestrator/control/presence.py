@@ -1,0 +1,170 @@
+"""The nodes that the bus hears, and what the silence of the others proves. Pure: no network, no thread, no clock but the one it gets.
+
+Silence proves nothing by itself: the node may have died, its network may be down, or this controller is the one that is cut off. A node is
+lost once it alone has been silent for ``lost_after``, while its engine answers and somebody else is heard. Otherwise it is unreachable.
+What stays unreachable for another five times as long, while its engine answers, is lost too.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from orchestrator.domain.attempt import Silence
+from shared_store.bus import Node
+
+LOST_AFTER = 120.0
+"""Seconds of silence after which a node is lost, by default."""
+UNREACHABLE = 5
+"""Times ``lost_after`` for which a node may be unreachable beyond that."""
+_BURST = 10.0
+"""Seconds within which the nodes fall silent that the controller's own network takes away."""
+_FEWEST = 3
+"""Nodes below which their silence together says nothing about the controller's network."""
+
+
+@dataclass
+class _Heard:
+    """A node that this router has met."""
+
+    gone: float | None = None
+    """When it fell silent; None while it is heard. This and the other times: seconds of the monotonic clock."""
+    since: str = ""
+    """The same, for people."""
+    answered: float = 0.0
+    """From when its engine has answered without a break."""
+
+
+class Presence:
+    """The nodes of all open attempts. Any thread may call."""
+
+    def __init__(
+        self,
+        lost_after: float = LOST_AFTER,
+        monotonic: Callable[[], float] = time.monotonic,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        """``lost_after``: seconds; ``monotonic``, ``wall``: the machine's clocks [s]."""
+        self.lost_after, self._monotonic, self._wall = lost_after, monotonic, wall
+        self._lock = threading.Lock()
+        self._expected: dict[tuple[str, int], int] = {}
+        self._nodes: dict[Node, _Heard] = {}
+        self._silent = 0
+        """How many of them are silent."""
+        self._hears_itself = False
+        self._deaf_at = 0.0
+        """When the controller was cut off from its nodes the last time, as far as is known."""
+        self._burst: int | None = None
+        """How many nodes fell silent together; None where that is to be counted anew."""
+
+    def expect(self, job: str, attempt: int, nodes: int) -> None:
+        """Note an attempt's nodes from now on, until :meth:`forget`."""
+        with self._lock:
+            self._expected[job, attempt] = nodes
+
+    def expects(self, node: Node) -> bool:
+        """Whether its attempt is open and has such a node."""
+        with self._lock:
+            return 0 <= node[2] < self._expected.get(node[:2], 0)
+
+    def forget(self, job: str, attempt: int) -> None:
+        """The attempt is closed."""
+        with self._lock:
+            for index in range(self._expected.pop((job, attempt), 0)):
+                self._set((job, attempt, index), None)
+
+    def came(self, node: Node) -> None:
+        """A node is connected; of one that is not expected nothing is noted."""
+        if self.expects(node):
+            with self._lock:
+                self._set(node, _Heard())
+
+    def left(self, node: Node) -> None:
+        """A node's connection is gone."""
+        if self.expects(node):
+            now, since = self._monotonic(), datetime.fromtimestamp(self._wall(), UTC)
+            with self._lock:
+                self._set(node, _Heard(now, f"{since:%H:%M:%S} UTC", now))
+
+    def ended(self, node: Node) -> None:
+        """A node has ended, so that its silence means nothing."""
+        with self._lock:
+            self._set(node, None)
+
+    def hear_itself(self, heard: bool) -> None:
+        """Whether the router hears the controller's own session, by way of the loopback network."""
+        with self._lock:
+            self._note_deafness()
+            self._hears_itself = heard
+
+    def met(self, node: Node) -> bool:
+        """Whether the node is or was connected, and has not ended."""
+        with self._lock:
+            return node in self._nodes
+
+    @property
+    def cut_off(self) -> str | None:
+        """Why the controller takes itself to be cut off from its nodes; None while it does not."""
+        with self._lock:
+            return self._why_deaf() if self._silent else None
+
+    def silence(self, node: Node, asked: float | None) -> Silence | None:
+        """The silence of a node that was connected to this router; None where it is heard, or never was.
+
+        Args:
+            node: The node.
+            asked: Seconds since its engine was asked and answered that it runs; None where it does not answer.
+        """
+        with self._lock:
+            heard = self._nodes.get(node)
+            if heard is None or heard.gone is None:
+                return None
+            now = self._monotonic()
+            deaf = self._note_deafness()
+            if asked is None or asked > now - heard.gone:
+                heard.answered = now
+            alone = now - max(heard.gone, heard.answered, self._deaf_at)
+            patience = (1 + UNREACHABLE) * self.lost_after
+            is_lost = alone > self.lost_after or now - heard.answered > patience
+            return Silence(now - heard.gone, heard.since, is_lost, deaf or "")
+
+    def _set(self, node: Node, heard: _Heard | None) -> None:
+        """Note what is known of a node; None: nothing."""
+        self._note_deafness()
+        before = self._nodes.pop(node, None)
+        if heard is not None:
+            self._nodes[node] = heard
+        self._silent += (heard is not None and heard.gone is not None) - (before is not None and before.gone is not None)
+        self._burst = None
+
+    def _note_deafness(self) -> str | None:
+        """Why the controller may be the one that is cut off; None while it is not. Before each change: silence counts from its end on."""
+        if not self._silent or (why := self._why_deaf()) is None:
+            return None
+        self._deaf_at = self._monotonic()
+        return why
+
+    def _why_deaf(self) -> str | None:
+        nodes = len(self._nodes)
+        if nodes >= _FEWEST and 2 * (burst := self._silent_together()) > nodes:
+            return f"{burst} of {nodes} nodes fell silent within {_BURST:.0f} s, so the controller seems to be cut off"
+        if nodes > 1 and nodes == self._silent:
+            return f"none of {nodes} nodes is heard, so the controller may be cut off"
+        if nodes == 1 and not self._hears_itself:
+            return "the bus does not hear the controller either"
+        return None
+
+    def _silent_together(self) -> int:
+        """The most nodes that fell silent within one burst."""
+        if self._burst is None:
+            gone = sorted(each.gone for each in self._nodes.values() if each.gone is not None)
+            first = most = 0
+            for last, at in enumerate(gone):
+                while at - gone[first] > _BURST:
+                    first += 1
+                most = max(most, last + 1 - first)
+            self._burst = most
+        return self._burst

@@ -1,0 +1,163 @@
+"""The machine that the controller runs on: its clocks, its threads, and the pools for calls that may hang.
+
+The controller reads time and starts threads here alone, so that a simulation can replace the machine as a whole (:func:`replaced_by`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Protocol, TypeVar
+
+T = TypeVar("T")
+
+
+class PoolFull(Exception):
+    """All threads of a pool are busy, and no more calls may wait; the message says since when."""
+
+
+class Overdue(Exception):
+    """A call has not returned in time; its thread is still busy with it."""
+
+
+class Pool(Protocol):
+    """Carries out calls that may hang, on a bounded number of threads."""
+
+    def submit(self, body: Callable[[], T]) -> Future[T]:
+        """The result of ``body``, later. Raises PoolFull."""
+        ...
+
+    @property
+    def busy_since(self) -> float | None:
+        """Since when the oldest of the present calls is being carried out (monotonic [s]); None while there is none."""
+        ...
+
+    def close(self, patience: float = 0.0) -> None:
+        """Drop the calls that wait, and give those that are being carried out so many seconds."""
+        ...
+
+
+class ThreadPool:
+    """Daemon threads, started as they are needed: one that hangs does not keep the process alive."""
+
+    def __init__(self, name: str, threads: int, waiting: int | None) -> None:
+        """``waiting``: how many calls may wait for a thread; None: any number."""
+        self._name, self._threads, self._most = name, threads, waiting
+        self._lock = threading.Lock()
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._began: dict[threading.Thread, float | None] = {}
+        """By thread: when its present call began; None while it waits for one."""
+        self._open = 0
+        """Calls that were submitted and have not returned."""
+        self._closing = False
+
+    def submit(self, body: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+
+        def call() -> None:
+            try:
+                result = body()
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        with self._lock:
+            if self._most is not None and self._open >= self._threads + self._most:
+                raise PoolFull(f"{self._threads} calls of {self._name} are under way, and {self._most} wait")
+            self._open += 1
+            if self._open > len(self._began) and len(self._began) < self._threads:
+                thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._began[thread] = None
+                thread.start()
+        self._calls.put(call)
+        return future
+
+    @property
+    def busy_since(self) -> float | None:
+        return min((began for began in list(self._began.values()) if began is not None), default=None)
+
+    def close(self, patience: float = 0.0) -> None:
+        self._closing = True
+        deadline = time.monotonic() + patience
+        for _ in self._began:
+            self._calls.put(None)
+        for thread in list(self._began):
+            thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _run(self) -> None:
+        me = threading.current_thread()
+        while (call := self._calls.get()) is not None and not self._closing:
+            self._began[me] = time.monotonic()
+            call()
+            self._began[me] = None
+            with self._lock:
+                self._open -= 1
+
+
+class Machine:
+    """This machine."""
+
+    def monotonic(self) -> float:
+        """Seconds of a clock that no one sets."""
+        return time.monotonic()
+
+    def wall(self) -> float:
+        """Unix time [s]."""
+        return time.time()
+
+    def boot(self) -> str:
+        """An identifier of this boot of the machine: it stays while the monotonic clock runs."""
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+    def thread(self, name: str, body: Callable[[], None]) -> None:
+        """Start ``body`` on a daemon thread."""
+        threading.Thread(target=body, name=name, daemon=True).start()
+
+    def pool(self, name: str, threads: int, waiting: int | None = None) -> Pool:
+        """A pool of so many threads; ``waiting``: how many calls may wait for one, any number by default."""
+        return ThreadPool(name, threads, waiting)
+
+
+_current = Machine()
+
+
+@contextmanager
+def replaced_by(machine: Machine) -> Iterator[None]:
+    """A context in which the controller runs on another machine."""
+    global _current
+    before, _current = _current, machine
+    try:
+        yield
+    finally:
+        _current = before
+
+
+def monotonic() -> float:
+    """Seconds of a clock that no one sets."""
+    return _current.monotonic()
+
+
+def wall() -> float:
+    """Unix time [s]."""
+    return _current.wall()
+
+
+def boot() -> str:
+    """An identifier of this boot of the machine."""
+    return _current.boot()
+
+
+def thread(name: str, body: Callable[[], None]) -> None:
+    """Start ``body`` on a daemon thread."""
+    _current.thread(name, body)
+
+
+def pool(name: str, threads: int, waiting: int | None = None) -> Pool:
+    """A pool of so many threads; ``waiting``: how many calls may wait for one, any number by default."""
+    return _current.pool(name, threads, waiting)

@@ -1,0 +1,158 @@
+"""What the silence of a node proves: its own end, the end of its network, or nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from orchestrator.control.presence import Presence
+from shared_store.bus import Node
+
+L = 120.0
+"""``lost_after``."""
+AGO = 0.5
+"""Seconds since the engine was asked."""
+
+
+class Cluster:
+    """A controller with nodes of one gang each, at a time that the test sets."""
+
+    def __init__(self, nodes: int, *, itself: bool = True) -> None:
+        self.time = 1000.0
+        self.presence = Presence(L, lambda: self.time, lambda: self.time)
+        self.presence.hear_itself(itself)
+        self.nodes: list[Node] = [(f"job-{index}", 1, 0) for index in range(nodes)]
+        for node in self.nodes:
+            self.presence.expect(node[0], 1, 1)
+            self.presence.came(node)
+
+    def silence(self, *indices: int) -> None:
+        for index in indices:
+            self.presence.left(self.nodes[index])
+
+    def wait(self, seconds: float, *, answers: bool = True) -> None:
+        """Let time pass, with a look at every node each second, as the controller has."""
+        for _ in range(int(seconds)):
+            self.time += 1.0
+            self.lost(answers=answers)
+
+    def lost(self, *, answers: bool = True) -> list[int]:
+        found = [self.presence.silence(node, AGO if answers else None) for node in self.nodes]
+        return [index for index, silence in enumerate(found) if silence is not None and silence.is_lost]
+
+
+def test_a_node_that_alone_is_silent_is_lost_after_its_time() -> None:
+    cluster = Cluster(3)
+    cluster.silence(1)
+    cluster.wait(L)
+    assert cluster.lost() == []
+    cluster.wait(1)
+    assert cluster.lost() == [1]
+    silence = cluster.presence.silence(cluster.nodes[1], AGO)
+    assert silence is not None and (silence.seconds, silence.since, silence.cause) == (121.0, "00:16:40 UTC", "")
+
+
+def test_a_node_that_is_heard_again_was_never_lost() -> None:
+    cluster = Cluster(3)
+    cluster.silence(1)
+    cluster.wait(L)
+    cluster.presence.came(cluster.nodes[1])
+    cluster.wait(10)
+    assert cluster.presence.silence(cluster.nodes[1], AGO) is None and cluster.lost() == []
+
+
+def test_the_only_node_is_lost_where_the_router_hears_itself() -> None:
+    cluster = Cluster(1)
+    cluster.silence(0)
+    cluster.wait(L + 1)
+    assert cluster.lost() == [0]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "itself", "silent", "cause"),
+    [
+        (1, False, [0], "the bus does not hear the controller either"),
+        (2, True, [0, 1], "none of 2 nodes is heard, so the controller may be cut off"),
+        (5, True, [0, 1, 2], "3 of 5 nodes fell silent within 10 s, so the controller seems to be cut off"),
+    ],
+)
+def test_where_the_controller_may_be_cut_off_nodes_are_unreachable_for_a_long_time(
+    nodes: int, itself: bool, silent: list[int], cause: str
+) -> None:
+    cluster = Cluster(nodes, itself=itself)
+    cluster.silence(*silent)
+    assert cluster.presence.cut_off == cause
+    cluster.wait(6 * L)
+    assert cluster.lost() == []
+    silence = cluster.presence.silence(cluster.nodes[0], AGO)
+    assert silence is not None and silence.cause == cause
+    cluster.wait(1)
+    assert cluster.lost() == silent
+
+
+def test_ten_minutes_of_outage_end_nothing_though_the_nodes_come_back_one_by_one() -> None:
+    cluster = Cluster(8)
+    for index in range(8):
+        cluster.silence(index)
+        cluster.wait(1)
+    cluster.wait(600, answers=False)
+    for index in range(7):
+        cluster.presence.came(cluster.nodes[index])
+        cluster.wait(10)
+    assert cluster.lost() == []
+    cluster.wait(L)
+    assert cluster.lost() == [7], "the one that did not come back counts from when the others were heard again"
+
+
+def test_nodes_that_fall_silent_one_after_the_other_are_lost_each() -> None:
+    cluster = Cluster(4)
+    for index in range(3):
+        cluster.silence(index)
+        cluster.wait(11)
+    assert cluster.presence.cut_off is None
+    cluster.wait(L)
+    assert cluster.lost() == [0, 1, 2]
+
+
+def test_while_the_engine_does_not_answer_nothing_is_lost_and_its_time_does_not_count() -> None:
+    cluster = Cluster(3)
+    cluster.silence(1)
+    cluster.wait(20 * L, answers=False)
+    assert cluster.lost(answers=False) == []
+    cluster.wait(L)
+    assert cluster.lost() == []
+    cluster.wait(1)
+    assert cluster.lost() == [1]
+
+
+def test_an_answer_from_before_the_silence_is_none() -> None:
+    cluster = Cluster(3)
+    cluster.silence(1)
+    for _ in range(300):
+        cluster.time += 1.0
+        silence = cluster.presence.silence(cluster.nodes[1], cluster.time - 999.0)
+    assert silence is not None and not silence.is_lost
+
+
+def test_a_node_that_this_router_never_met_can_not_fall_silent() -> None:
+    cluster = Cluster(3)
+    cluster.presence.expect("job-9", 1, 2)
+    cluster.presence.came(("job-9", 1, 0))
+    assert cluster.presence.silence(("job-9", 1, 1), AGO) is None and not cluster.presence.met(("job-9", 1, 1))
+
+
+def test_nodes_of_no_open_attempt_are_not_noted() -> None:
+    cluster = Cluster(1)
+    for stranger in (("job-9", 1, 0), ("job-0", 2, 0), ("job-0", 1, 1), ("job-0", 1, -1)):
+        cluster.presence.came(stranger)
+        assert not cluster.presence.met(stranger)
+
+
+def test_nodes_that_have_ended_do_not_make_the_controller_cut_off() -> None:
+    cluster = Cluster(4)
+    cluster.silence(0, 1, 2)
+    assert cluster.presence.cut_off is not None
+    cluster.presence.ended(cluster.nodes[0])
+    cluster.presence.forget("job-1", 1)
+    assert cluster.presence.cut_off is None, "1 of 2 is silent"
+    cluster.wait(L + 1)
+    assert cluster.lost() == [2]
