@@ -183,7 +183,9 @@ def serve(
 def _lost_after(text: str) -> float:
     seconds = seconds_of("--lost-after", text)
     if seconds is None or seconds < _SHORTEST_SILENCE:
-        raise SpecError(f"--lost-after {text}: expected at least {_SHORTEST_SILENCE:.0f}s; a busy machine is silent for some seconds")
+        raise SpecError(
+            f"--lost-after {text}: expected at least {_SHORTEST_SILENCE:.0f}s; a busy machine is silent for some seconds"
+        )
     return seconds
 
 

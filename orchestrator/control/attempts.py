@@ -7,22 +7,22 @@ its ending before the gang is stopped. A controller that starts on the database 
 from __future__ import annotations
 
 import logging
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
 from orchestrator.control.endings import node_end
 from orchestrator.control.monitoring import Monitoring
-from orchestrator.control.peers import Peers
+from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
 from orchestrator.domain.attempt import (
@@ -43,12 +43,17 @@ from orchestrator.domain.attempt import (
     MarkRunning,
     Observe,
     Observed,
+    Phase,
     Preempted,
+    Prepare,
+    Prepared,
+    PrepareRefused,
     Save,
     Silence,
     State,
     Stop,
     StopDelayed,
+    TakeEpoch,
     Terms,
     WindUp,
     step,
@@ -61,82 +66,84 @@ from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node, SchedulingPolicy, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
-from shared_store.files import DamagedFile
-from shared_store.layout import Run, Store, StoreError
+from shared_store.epoch import Claim
+from shared_store.outcomes import Outcome
 
 log = logging.getLogger("muster.controller")
 
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
+NO_EPOCH = 0
+"""Of an attempt that has none yet."""
+_READERS = 16
+"""Threads for the store."""
+_STOPPERS = 128
+"""Threads for stops: each waits for its gang's grace time."""
+_CHECK_INTERVAL = 5.0
+"""Seconds between two looks for the outcomes of nodes that can't be seen or heard."""
+_SOON, _LATER = 1.0, 60.0
+"""Seconds until the next look at an attempt that waits for something, and at one that runs and has not changed."""
 _STOP_AGAIN, _STOP_RARELY = 2.0, 30.0
 """Seconds until another try to stop a gang that could not be stopped: at first, and at most."""
-
-
-class StoreUnavailable(Exception):
-    """The store can't be used now; the message says why. The action is tried again."""
 
 
 @dataclass
 class _Memory:
     """Facts about an attempt that its row does not hold, until it is closed."""
 
+    run: RunFacts | None = None
+    """The run, as it was found before the attempt takes it."""
     cause_since: int | None = None
     done_since: int | None = None
     """As in :class:`orchestrator.domain.attempt.State`."""
+    outcomes: dict[int, Outcome | None] = field(default_factory=dict)
+    """Of nodes that have ended, by index; None for one that has left none."""
+    asked: tuple[float, list[int]] | None = None
+    """The outcomes that are being read: since when (monotonic [s]), and of which nodes."""
+    checked: float | None = None
+    """When the outcomes were read last (monotonic [s])."""
     stop: Future[GangStatus] | None = None
     """The stop that is under way."""
+    stopped: GangStatus | None = None
+    """The gang's last status, once it is stopped."""
+    progress: Progress | None = None
+    """What the run holds since then."""
 
 
 class Attempts:
-    """Drives attempts; ``changed`` is called (from any thread) when one of them should be looked at."""
+    """Drives attempts. On the controller's thread alone, which never waits here for an engine or the store."""
 
     def __init__(
         self,
         engine: EngineSet,
-        store: Store,
+        runs: RunStore,
         bus: Bus,
-        peers: Peers,
         clock: Clock,
         monitoring: Monitoring,
-        changed: Callable[[], None],
+        changed: Callable[[str], None],
     ) -> None:
-        self.engine, self.store, self.bus = engine, store, bus
-        self.peers, self.clock, self.monitoring, self.changed = peers, clock, monitoring, changed
+        """``changed``: called, from any thread, with a job whose attempt should be looked at."""
+        self.engine, self.runs, self.bus = engine, runs, bus
+        self.clock, self.monitoring, self.changed = clock, monitoring, changed
         self._memories: dict[tuple[str, int], _Memory] = {}
         self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
         """Why the engine could not stop an attempt's gang when it was last asked."""
+        self._pool = machine.pool("store", _READERS)
+        self._errands = Errands(self._pool, changed)
+        self._stops = machine.pool("stop", _STOPPERS)
+
+    def close(self) -> None:
+        """Leave the calls that are under way to themselves."""
+        for pool in (self._pool, self._stops):
+            pool.close()
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
-        """Record a new attempt, then launch it: after a crash in between, the next pass finds no handle and launches it.
-
-        Raises StoreUnavailable where the run can't be prepared now; nothing is recorded then.
-        """
-        run = self.store.run(job.run)
-        try:
-            # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
-            known = [attempt.epoch for attempt in session.scalars(select(Attempt).join(Job).where(Job.run == job.run))]
-            current = read_epoch(run)
-            if current not in known and (writer := self.peers.writer(run)):
-                raise StoreError(f"it is being written by {writer}; stop that job first")
-            if job.first_epoch is not None and run.description() is None:
-                raise StoreError("it was deleted from the store while the job ran")
-            self._describe(session, run, job)
-            epoch = take_epoch(run, max([current, *known]), Claim(self.peers.id, job.id, len(job.attempts) + 1))
-        except (OSError, StaleEpoch) as error:  # a volume that is away may come back; another controller was faster
-            said = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
-            raise StoreUnavailable(said) from error
-        except (StoreError, ValueError) as error:
-            job.move(Status.FAILED, f"store {self.store.path}: can't prepare run {job.run}: {error}")
-            return
-        if job.first_epoch is None:
-            job.first_epoch = epoch
+        """Record a new attempt, and go on with it: after a crash in between, the next controller goes on from there."""
         number, nodes = len(job.attempts) + 1, new_nodes(start.placements)
         attempt = Attempt(
             job_id=job.id,
             number=number,
-            epoch=epoch,
+            epoch=NO_EPOCH,
             compute_environment=start.compute_environment,
             nodes=nodes,
             created_at=now(),
@@ -149,9 +156,20 @@ class Attempts:
         session.commit()
         self._happened(session, job, attempt, Due())
 
-    def advance(self, session: Session, job: Job, attempt: Attempt) -> None:
-        """One look at an open attempt. Raises StoreUnavailable."""
+    def advance(self, session: Session, job: Job, attempt: Attempt) -> float:
+        """One look at an open attempt; returns the seconds until the next one, if nothing changes. Raises StoreUnavailable."""
         self._happened(session, job, attempt, Due())
+        state = self._state(job, attempt)
+        key = (job.id, attempt.number)
+        if (
+            state.phase is not Phase.RUNNING
+            or state.cause_since is not None
+            or any(self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes)
+        ):
+            return _SOON
+        if job.timeout is None or attempt.running_since is None:
+            return _LATER
+        return max(0.0, min(_LATER, attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000)) + 0.001
 
     def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
         """Have an open attempt end in favour of another job."""
@@ -180,6 +198,7 @@ class Attempts:
         decided = Ending(attempt.ending) if attempt.ending is not None else None
         return State(
             terms,
+            prepared=attempt.epoch != NO_EPOCH,
             launched=attempt.handle is not None,
             started=job.status != Status.STARTING,
             running_since=attempt.running_since,
@@ -195,6 +214,11 @@ class Attempts:
 
     def _carry_out(self, session: Session, job: Job, attempt: Attempt, instruction: Instruction) -> Event | None:
         match instruction:
+            case Prepare():
+                return self._prepare(session, job, attempt)
+            case TakeEpoch(epoch):
+                attempt.epoch = epoch
+                job.first_epoch = job.first_epoch or epoch
             case Launch(again):
                 return self._launch(session, job, attempt, again)
             case Keep(handle):
@@ -217,14 +241,36 @@ class Attempts:
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
-                return self._gone(job, [])
+                return Gone(self.clock.now(), [], "")
             case Close():
                 self._close(session, job, attempt, instruction)
         return None
 
-    def _describe(self, session: Session, run: Run, job: Job) -> None:
-        record = record_owner(session, run, job)
-        run.create(first_description(run, job, record.owner, record.queue))
+    def _prepare(self, session: Session, job: Job, attempt: Attempt) -> Prepared | PrepareRefused | None:
+        """Look at the run, record its owner, then take it. Raises StoreUnavailable."""
+        memory, key = self._memory(attempt), (job.id, attempt.number)
+        try:
+            if memory.run is None:
+                memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run))
+            if (run := memory.run) is None:
+                return None
+            # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
+            known = list(session.scalars(select(Attempt.epoch).join(Job).where(Job.run == job.run)))
+            if run.epoch not in known and run.writer:
+                raise RunRefused(f"run {job.run} is being written by {run.writer}; stop that job first")
+            if job.first_epoch is not None and run.description() is None:
+                raise RunRefused(f"run {job.run} was deleted from the store while the job ran")
+            record = record_owner(session, run, job)
+            description = first_description(run, job, record.owner, record.queue)
+            claim = Claim(self.runs.peers.id, job.id, attempt.number)
+            taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim)
+            epoch = self._errands.result(key, "claim", taking)
+        except StoreUnavailable:
+            memory.run = None
+            raise
+        except (RunRefused, ValueError) as error:
+            return PrepareRefused(str(error))
+        return None if epoch is None else Prepared(epoch)
 
     def _launch(self, session: Session, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:
@@ -248,7 +294,7 @@ class Attempts:
             epoch=attempt.epoch,
             job_epoch=job.first_epoch or attempt.epoch,
             run=job.run,
-            store=str(self.store.path),
+            store=str(self.runs.store.path),
             queue=job.queue,
             compute_environment=attempt.environment,
             main=spec.main,
@@ -278,39 +324,78 @@ class Attempts:
         status = self.engine.observe(attempt.handle)
         if status is None:
             return None  # the engine's first look is under way
+        if not self._know_outcomes(job, attempt, status):
+            return None
         ends = self._ends(job, attempt, status)
         head = status[job.gang.main]
         return Observed(
             moment=self.clock.now(),
             ends=ends,
             silences=[self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)],
-            waits=head.words if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) else "",
+            waits=head.words
+            if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
+            else "",
             words=head.words if head.running else "",
             stale=next((node.stale for node in status if node.stale), ""),
         )
 
     def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
+        """The silence of a node; it counts only where its engine says that it runs, and it has left no outcome."""
         assert attempt.handle is not None
+        checked = self._memory(attempt).checked
         is_seen = status.phase is not NodePhase.UNREACHABLE and not status.stale
-        asked = self.engine.asked(attempt.handle) if is_seen else None
+        asked = self.engine.asked(attempt.handle) if is_seen and checked is not None else None
+        if asked is not None and checked is not None:
+            asked = max(asked, machine.monotonic() - checked)
         return self.bus.presence.silence((attempt.job_id, attempt.number, node.index), asked)
+
+    def _know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
+        """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
+
+        Returns whether those of the nodes that have ended are known. Raises StoreUnavailable.
+        """
+        memory, presence, moment = self._memory(attempt), self.bus.presence, machine.monotonic()
+        ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
+        hidden = [
+            index
+            for index, node in enumerate(status)
+            if node.running
+            and memory.outcomes.get(index) is None
+            and (
+                node.phase is NodePhase.UNREACHABLE or node.stale or presence.is_silent((job.id, attempt.number, index))
+            )
+        ]
+        if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < _CHECK_INTERVAL)):
+            return True
+        memory.asked = memory.asked or (moment, [*ended, *hidden])
+        began, nodes = memory.asked
+        reading = partial(self.runs.outcomes, job.run, job.id, attempt.number, nodes)
+        try:
+            found = self._errands.result((job.id, attempt.number), "outcomes", reading)
+        except StoreUnavailable:
+            memory.asked = None
+            raise
+        if found is None:
+            return not ended
+        memory.asked, memory.checked = None, began
+        memory.outcomes |= {index: found.get(index) for index in nodes if index in ended or index in found}
+        return all(index in memory.outcomes for index in ended)
 
     def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node; noted in the attempt's record with the other facts about its nodes."""
-        run = self.store.run(job.run)
-        ends: list[NodeEnd | None] = []
+        outcomes, ends = self._memory(attempt).outcomes, list[NodeEnd | None]()
         for record, node in zip(attempt.nodes, status, strict=True):
-            end = None
-            if not node.running:
-                with self._reading():
-                    end, stopped = node_end(run, record, node, job.gang.options.is_native, now())
+            end, key = None, (job.id, attempt.number, record.index)
+            outcome = outcomes.get(record.index)
+            if outcome is not None or not node.running:
+                end, stopped = node_end(outcome, node, job.gang.options.is_native, now())
                 record.exit_code, record.reason, record.error = end.exit_code, end.reason, end.error
                 if record.stopped_at is None:
                     record.stopped_at = stopped
                     if attempt.ending is None:  # by itself: no one ended the gang
                         record.status_reason = lost_host(record.host) if end.lost else AWS_EXITED
-                self.bus.presence.ended((job.id, attempt.number, record.index))
-            elif self.bus.presence.met((job.id, attempt.number, record.index)):
+                self.bus.presence.ended(key)
+            elif self.bus.presence.met(key):
                 record.met = True
             ends.append(end)
             if node.gpus:
@@ -330,14 +415,18 @@ class Attempts:
     def _stop(self, job: Job, attempt: Attempt, grace: float) -> Gone | StopDelayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
         key, memory = (job.id, attempt.number), self._memory(attempt)
+        if memory.stopped is not None:
+            return self._wind_up(job, attempt, memory.stopped)
         if memory.stop is None and not self._denied.waits(key):
             assert attempt.handle is not None
-            memory.stop = self._stop_in_thread(attempt.handle, grace)
+            memory.stop = self._stops.submit(partial(self.engine.stop, attempt.handle, grace))
+            memory.stop.add_done_callback(partial(self._stop_returned, job.id))
         if memory.stop is not None and memory.stop.done():
             stop, memory.stop = memory.stop, None
             error = stop.exception()
             if error is None:
-                return self._gone(job, self._ends(job, attempt, stop.result()))
+                memory.stopped = stop.result()
+                return self._wind_up(job, attempt, memory.stopped)
             why = " ".join(str(error).split()).removesuffix("; trying again")
             said = f"attempt {attempt.number} can't be stopped: {why}; trying again"
             expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
@@ -345,54 +434,42 @@ class Attempts:
         said_last = self._denied.said(key)
         return StopDelayed(said_last.removeprefix(f"job {job.id}: ")) if said_last else None
 
-    def _stop_in_thread(self, handle: str, grace: float) -> Future[GangStatus]:
-        """Stop the gang in a daemon thread, since a controller that leaves must not wait for a grace time. The result: its last status."""
-        done: Future[GangStatus] = Future()
+    def _stop_returned(self, job: str, _: object) -> None:
+        self.changed(job)
 
-        def stop() -> None:
-            try:
-                done.set_result(self.engine.stop(handle, grace))
-            except BaseException as error:
-                done.set_exception(error)
-            self.changed()
-
-        threading.Thread(target=stop, name="stop", daemon=True).start()
-        return done
-
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        """A context for reads of the store. Raises StoreUnavailable."""
-        try:
-            yield
-        except OSError as error:
-            raise StoreUnavailable(f"the store {self.store.path} can't be read now ({error}); trying again") from error
-
-    def _gone(self, job: Job, ends: Sequence[NodeEnd | None]) -> Gone:
-        with self._reading():
-            checkpoints = list_checkpoints(self.store.run(job.run))
-        progress = f"; last checkpoint: iteration {checkpoints[-1].iteration}" if checkpoints else ""
-        return Gone(self.clock.now(), ends, progress)
+    def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | None:
+        """Read what the gang has left, once nothing of it runs any more; None until it is known. Raises StoreUnavailable."""
+        memory = self._memory(attempt)
+        if not self._know_outcomes(job, attempt, status):
+            return None
+        if memory.progress is None:
+            reading = partial(self.runs.progress, job.run, attempt.epoch)
+            memory.progress = self._errands.result((job.id, attempt.number), "progress", reading)
+        if memory.progress is None:
+            return None
+        iteration = memory.progress.iteration
+        progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
+        return Gone(self.clock.now(), self._ends(job, attempt, status), progress)
 
     def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> None:
+        memory, key = self._memory(attempt), (job.id, attempt.number)
         ran = close.moment - (attempt.running_since or close.moment)
         attempt.started_at = attempt.started_at or now()
         attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
         attempt.spent = close.spent
-        with self._reading():
-            charge(attempt, self.store.run(job.run), close.moment)
+        charge(attempt, memory.progress.saved if memory.progress else None, close.moment)
         self.monitoring.ended(session, job, attempt)
         self._charge_share(session, job, attempt, close.moment)
         job.move(close.status, close.reason)
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
-        key = (job.id, attempt.number)
+        session.commit()
         self._memories.pop(key, None)
         self._denied.worked(key)
         self.bus.forget(*key)
-        with suppress(
-            OSError, DamagedFile
-        ):  # while this controller lives, another one may then say that the run is written
-            close_claim(self.store.run(job.run), attempt.epoch)
+        self._errands.forget(key)
+        if attempt.epoch != NO_EPOCH:
+            self._pool.submit(partial(self.runs.release, job.run, attempt.epoch))
         self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
 
     @staticmethod

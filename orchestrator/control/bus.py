@@ -92,8 +92,8 @@ class Bus:
         """``addresses``: addresses of this machine on which the router listens beside loopback."""
         self.presence = presence or Presence()
         """Which nodes are connected."""
-        self.changed: Callable[[], None] = lambda: None
-        """Called (on the network's thread) when a node came or went."""
+        self.changed: Callable[[str], None] = lambda _: None
+        """Called (on the network's thread) with the job of a node that came or went."""
         self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
         self._progress: dict[Node, dict[str, Any]] = {}
@@ -249,7 +249,7 @@ class Bus:
             self.presence.hear_itself(here)
             return
         (self.presence.came if here else self.presence.left)(node)
-        self.changed()
+        self.changed(node[0])
 
     def _note(self, sample: Any) -> None:
         key = str(sample.key_expr)

@@ -9,13 +9,12 @@ Times for people and clients (``createdAt``, logs) stay wall-clock times.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 from sqlalchemy import update
 from sqlalchemy.orm import Session
 
+from orchestrator import machine
 from orchestrator.persistence.models import ClockState
 
 log = logging.getLogger("muster.controller")
@@ -24,23 +23,14 @@ _STEP = 1000
 """A difference between both clocks that changes by more than this [ms] is a step; smaller ones come from reading them in turn."""
 
 
-def boot_id() -> str:
-    """An identifier of this boot of the machine: it stays while the monotonic clock runs."""
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-
-
-def _wall() -> float:
-    return time.time()  # looked up at each call: a test may move it
-
-
 class Clock:
     """Steady time of one database, continued by each controller that uses it. For the controller's thread to change."""
 
     def __init__(
         self,
-        wall: Callable[[], float] = _wall,
-        monotonic: Callable[[], float] = time.monotonic,
-        boot: Callable[[], str] = boot_id,
+        wall: Callable[[], float] = machine.wall,
+        monotonic: Callable[[], float] = machine.monotonic,
+        boot: Callable[[], str] = machine.boot,
     ) -> None:
         """The machine's clocks [s], and the identity of its boot."""
         self._wall, self._monotonic, self._boot = wall, monotonic, boot

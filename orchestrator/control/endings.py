@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
-from orchestrator.persistence.models import Node
-from shared_store.layout import Run
-from shared_store.outcomes import read_outcome
+from shared_store.outcomes import Outcome
 
 _TAKEN = (Cause.SIGNAL, Cause.HOST_LOST, Cause.PREEMPTED)
 """Causes from outside: who does not see the supervisor any more can't tell its end from that of its host."""
 _KILLED = 137
-"""Exit code of a node that has none of its own, or that left with 0 and without the outcome that belongs to it."""
+"""Exit code of a node that has none of its own."""
 
 
-def node_end(run: Run, record: Node, node: NodeStatus, is_native: bool, moment: int) -> tuple[NodeEnd, int]:
-    """The end of a node, and its time (Unix time [ms]). Raises OSError.
+def node_end(outcome: Outcome | None, node: NodeStatus, is_native: bool, moment: int) -> tuple[NodeEnd, int]:
+    """The end of a node, and its time (Unix time [ms]).
 
     Args:
-        run: Of its job.
-        record: Its row.
-        node: Its status by its engine; it has ended.
+        outcome: What its supervisor has left; None for one that has left nothing.
+        node: Its status by its engine.
         is_native: Its job came from YAML.
-        moment: When that was seen (Unix time [ms]).
+        moment: When its end was seen (Unix time [ms]).
     """
-    outcome = read_outcome(run, record.job_id, record.attempt, record.index)
     if outcome is None:
         return seen_end(node, is_native, moment / 1000), moment
     # a supervisor sees that its rank was killed; only the engine knows for what
@@ -40,15 +36,17 @@ def node_end(run: Run, record: Node, node: NodeStatus, is_native: bool, moment: 
 
 
 def seen_end(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
-    """The end of a node that left no outcome.
+    """The end of a node that left no outcome: its supervisor's exit code, which is the job's, is the second witness.
 
     Args:
         node: Its status by its engine; it has ended.
         is_native: Its job came from YAML. A job of the Batch API that is preempted has lost its host: AWS has no other word for it.
         moment: When it was seen (Unix time [s]).
     """
-    code = node.exit_code or _KILLED
+    code = _KILLED if node.exit_code is None else node.exit_code
     if node.cause is Cause.PREEMPTED and not is_native:
         code = _KILLED
     words = node.words or "the supervisor died without an outcome"
+    if node.cause is Cause.EXIT:
+        words = f"exit {code}, outcome not written{f' ({node.words})' if node.words else ''}"
     return NodeEnd(code, words, moment, lost=node.cause in _TAKEN)

@@ -8,12 +8,12 @@ What stays unreachable for another five times as long, while its engine answers,
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from orchestrator.domain.attempt import Silence
+from orchestrator import machine
+from orchestrator.domain.attempt import UNHEARD, Silence
 from shared_store.bus import Node
 
 LOST_AFTER = 120.0
@@ -44,8 +44,8 @@ class Presence:
     def __init__(
         self,
         lost_after: float = LOST_AFTER,
-        monotonic: Callable[[], float] = time.monotonic,
-        wall: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = machine.monotonic,
+        wall: Callable[[], float] = machine.wall,
     ) -> None:
         """``lost_after``: seconds; ``monotonic``, ``wall``: the machine's clocks [s]."""
         self.lost_after, self._monotonic, self._wall = lost_after, monotonic, wall
@@ -55,8 +55,10 @@ class Presence:
         self._silent = 0
         """How many of them are silent."""
         self._hears_itself = False
+        self._deaf_since: float | None = None
+        """Since when the controller may be cut off from its nodes; None while it is not."""
         self._deaf_at = 0.0
-        """When the controller was cut off from its nodes the last time, as far as is known."""
+        """When that was so the last time, as far as is known."""
         self._burst: int | None = None
         """How many nodes fell silent together; None where that is to be counted anew."""
 
@@ -105,11 +107,19 @@ class Presence:
         with self._lock:
             return node in self._nodes
 
+    def is_silent(self, node: Node) -> bool:
+        """Whether the node was connected, and is not heard now."""
+        with self._lock:
+            heard = self._nodes.get(node)
+            return heard is not None and heard.gone is not None
+
     @property
     def cut_off(self) -> str | None:
-        """Why the controller takes itself to be cut off from its nodes; None while it does not."""
+        """Why the controller takes itself to be cut off from its nodes; None while it does not, or not for long."""
         with self._lock:
-            return self._why_deaf() if self._silent else None
+            why = self._note_deafness()
+            since = self._deaf_since
+        return why if since is not None and self._monotonic() - since > UNHEARD else None
 
     def silence(self, node: Node, asked: float | None) -> Silence | None:
         """The silence of a node that was connected to this router; None where it is heard, or never was.
@@ -137,14 +147,18 @@ class Presence:
         before = self._nodes.pop(node, None)
         if heard is not None:
             self._nodes[node] = heard
-        self._silent += (heard is not None and heard.gone is not None) - (before is not None and before.gone is not None)
+        self._silent += (heard is not None and heard.gone is not None) - (
+            before is not None and before.gone is not None
+        )
         self._burst = None
 
     def _note_deafness(self) -> str | None:
         """Why the controller may be the one that is cut off; None while it is not. Before each change: silence counts from its end on."""
         if not self._silent or (why := self._why_deaf()) is None:
+            self._deaf_since = None
             return None
         self._deaf_at = self._monotonic()
+        self._deaf_since = self._deaf_at if self._deaf_since is None else self._deaf_since
         return why
 
     def _why_deaf(self) -> str | None:

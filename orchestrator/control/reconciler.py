@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
@@ -15,13 +14,15 @@ from functools import partial
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session, selectinload
 
-from orchestrator.control.attempts import Attempts, StoreUnavailable
+from orchestrator import machine
+from orchestrator.control.attempts import Attempts
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
+from orchestrator.control.run_store import RunStore, StoreUnavailable
 from orchestrator.control.snapshot import open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
@@ -51,6 +52,8 @@ _PASS_SHARE = 0.2
 """Share of one CPU that passes may take."""
 _WITHOUT_DATABASE = 1.0
 """Seconds between two tries of a database that can't be used."""
+_SOON = 1.0
+"""Seconds until the next look at a gang after one that failed."""
 _SWEEP_INTERVAL = 2.0
 """Seconds between two looks for queues that are gone and history that may be forgotten."""
 
@@ -71,6 +74,7 @@ class Reconciler:
         retention: float | None = None,
         clock: Clock | None = None,
         min_free: MinFree = DEFAULT,
+        runs: RunStore | None = None,
     ) -> None:
         """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
         ``min_free``: free space that the volumes of the store and the database need for something new to start.
@@ -83,11 +87,13 @@ class Reconciler:
         self.work_queue = WorkQueue()
         self.clock = clock or Clock()
         self.monitoring = Monitoring()
-        self.attempts = Attempts(engine, store, bus, peers, self.clock, self.monitoring, self.wake)
+        self.attempts = Attempts(
+            engine, runs or RunStore(store, peers), bus, self.clock, self.monitoring, self._gang_changed
+        )
         self.writing = threading.Lock()
         """Held while something is registered, submitted or changed: checks must still hold at the commit."""
         self.submissions = GroupCommit(database, self.writing)
-        bus.changed = engine.changed = self.wake
+        bus.changed = engine.changed = self._gang_changed
         database.committed = self._committed
         database.changed = self._look_again
         self._report: WaitReport | None = None
@@ -95,6 +101,8 @@ class Reconciler:
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
         self._swept = self._kept = 0.0
         self._wake, self._ending = threading.Event(), threading.Event()
+        self._ticking: int | None = None
+        """The thread that makes a pass now."""
         self.trouble: str | None = None
         """Why the database can't be used at present: nothing is launched, and no request is accepted."""
         self._is_full = False
@@ -116,6 +124,11 @@ class Reconciler:
         """Look now instead of at the next interval, since something changed."""
         self._wake.set()
 
+    def _gang_changed(self, gang: str) -> None:
+        """Look at a gang now, by its name or that of its job; empty: what an engine has, changed."""
+        self.work_queue.hurry(gang.partition("/")[0])
+        self.wake()
+
     def close(self) -> None:
         """Leave the loop; running gangs continue, and the next controller on this database finds them."""
         self._ending.set()
@@ -123,6 +136,7 @@ class Reconciler:
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join()
+        self.attempts.close()
 
     def _loop(self) -> None:
         while not self._ending.is_set():
@@ -136,6 +150,13 @@ class Reconciler:
 
         Raises DatabaseError where the database can't be used; the next pass tries again.
         """
+        self._ticking = threading.get_ident()
+        try:
+            self._pass()
+        finally:
+            self._ticking = None
+
+    def _pass(self) -> None:
         self._keep_database()
         with self.database.session() as session:
             if self.clock.stepped:
@@ -148,9 +169,11 @@ class Reconciler:
             self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), _SETTLED_AT_ONCE):
             self.work_queue.look_again(self._guarded("settle", due[start : start + _SETTLED_AT_ONCE], self._settle))
-        for job_id in self.work_queue.active():
+        self.engine.look()
+        for job_id in self.work_queue.take_active(machine.monotonic()):
             if not self._backoff.waits(("advance", job_id)):
                 self._guarded("advance", [job_id], self._advance)
+            self.work_queue.later(job_id, machine.monotonic() + _SOON)
         self._note_silence()
         self._isolated("scheduling", self._admit)
         self._isolated("clearing away", self._sweep)
@@ -164,9 +187,9 @@ class Reconciler:
     def _keep_database(self) -> None:
         """Check the database, and read the jobs anew where it is back. Raises DatabaseError where it is unavailable or another controller's."""
         self.database.check()
-        if self.trouble is not None or time.monotonic() - self._kept > _SWEEP_INTERVAL:
+        if self.trouble is not None or machine.monotonic() - self._kept > _SWEEP_INTERVAL:
             self.database.keep_lock()
-            self._kept = time.monotonic()
+            self._kept = machine.monotonic()
         if self.trouble is not None:
             with self.database.session() as session:
                 self.clock.rewrite(session)  # to be read is not enough: its volume may be full
@@ -225,11 +248,12 @@ class Reconciler:
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:
-            self.attempts.advance(session, job, attempt)
+            pause = self.attempts.advance(session, job, attempt)
+            self.work_queue.later(job.id, machine.monotonic() + pause)
 
     def _committed(self, jobs: Sequence[Job]) -> None:
         """Note the jobs of a commit as they are, where this thread has made it; read them again after a commit of a request."""
-        if threading.current_thread() is self._thread:
+        if threading.get_ident() == self._ticking:
             self.work_queue.note(jobs)
         else:
             self._look_again([job.id for job in jobs])
@@ -257,10 +281,10 @@ class Reconciler:
             return
         version, at, took = self._passed
         pause = took / _PASS_SHARE
-        idle = time.monotonic() - at
+        idle = machine.monotonic() - at
         if idle < pause or (version == self.work_queue.version and idle < _PASS_INTERVAL):
             return
-        started, version = time.monotonic(), self.work_queue.version
+        started, version = machine.monotonic(), self.work_queue.version
         waiting = self.work_queue.waiting()
         if self._backoff:  # seldom: there may be very many of them
             waiting = [each for each in waiting if not self._backoff.waits(("start", each.job))]
@@ -281,7 +305,7 @@ class Reconciler:
             )
         decisions = decide(snapshot)
         self._report, self._leading = decisions.report, decisions.leading
-        took = time.monotonic() - started
+        took = machine.monotonic() - started
         self._passed = (version, started, took)
         self.monitoring.pass_took(took)
         self._carry_out(decisions)
@@ -305,6 +329,7 @@ class Reconciler:
         by = session.get_one(Job, preempt.by)
         if attempt := job.open_attempt:
             self.attempts.preempt(session, job, attempt, f"preempted by job {by.name} ({by.id[:8]})")
+            self.work_queue.hurry(job.id)
 
     def _start(self, start: Start, session: Session, job: Job) -> None:
         # a request may have ended the job since the snapshot was taken
@@ -376,12 +401,12 @@ class Reconciler:
 
     def _sweep(self) -> None:
         """Remove deleted queues that are empty, and history beyond the retention time."""
-        if time.monotonic() - self._swept < _SWEEP_INTERVAL:
+        if machine.monotonic() - self._swept < _SWEEP_INTERVAL:
             return
         if not self.writing.acquire(blocking=False):
             return  # somebody writes: gangs must not wait for that
         try:
-            self._swept = time.monotonic()
+            self._swept = machine.monotonic()
             self._clear_away()
         finally:
             self.writing.release()

@@ -20,8 +20,6 @@ from orchestrator.persistence.models import (
     WebhookDelivery,
 )
 from orchestrator.scheduling.order import decayed
-from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
-from shared_store.layout import Run
 
 
 def held_by(attempt: Attempt) -> Resources:
@@ -34,27 +32,19 @@ def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
     return tuple(node.placement for node in attempt.nodes)
 
 
-def charge(attempt: Attempt, run: Run, moment: int) -> None:
-    """Record the usage of a closed attempt until ``moment`` (steady time [ms]), and the lost part: all since its last checkpoint."""
+def charge(attempt: Attempt, saved: float | None, moment: int) -> None:
+    """Record the usage of a closed attempt until ``moment`` (steady time [ms]), and the lost part: all since its last checkpoint.
+
+    ``saved``: when it made that (Unix time [s]); None where it made none.
+    """
     assert attempt.stopped_at is not None
     seconds = _held(attempt, moment)
     held = held_by(attempt)
-    lost = 0.0 if attempt.ending == Ending.SUCCEEDED else min(seconds, _since_checkpoint(attempt, run, seconds))
+    lost = 0.0 if attempt.ending == Ending.SUCCEEDED else seconds
+    if lost and saved is not None:
+        lost = min(seconds, max(0.0, attempt.stopped_at / 1000 - saved))
     attempt.gpu_seconds, attempt.cpu_seconds = held.gpus * seconds, held.cpus * seconds
     attempt.wasted_gpu_seconds, attempt.wasted_cpu_seconds = held.gpus * lost, held.cpus * lost
-
-
-def _since_checkpoint(attempt: Attempt, run: Run, otherwise: float) -> float:
-    """Seconds from the last checkpoint that this attempt made to its end; ``otherwise`` where it made none."""
-    assert attempt.stopped_at is not None
-    for checkpoint in reversed(list_checkpoints(run)):
-        if checkpoint.epoch != attempt.epoch:
-            continue
-        try:
-            return max(0.0, attempt.stopped_at / 1000 - float(checkpoint.manifest["created"]))
-        except (DamagedCheckpoint, KeyError, TypeError, ValueError):
-            continue
-    return otherwise
 
 
 def _held(attempt: Attempt, moment: int) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Sequence
 from itertools import islice
+from math import inf
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -26,7 +27,8 @@ class WorkQueue:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: dict[str, Waiting] = {}
-        self._active: dict[str, None] = {}
+        self._active: dict[str, float] = {}
+        """When each is looked at next (monotonic [s]); infinity while it is being looked at."""
         self._due: dict[str, None] = {}
         self._ended: dict[str, None] = {}
         self._shapes: dict[Shape, Shape] = {}
@@ -51,7 +53,7 @@ class WorkQueue:
                 self._note(job)
 
     def _note(self, job: Job) -> None:
-        before = (job.id in self._waiting, job.id in self._active)
+        before, next_look = (job.id in self._waiting, job.id in self._active), self._active.get(job.id, 0.0)
         # not out of _due: whoever asked for another look may know of a change that came after this one was read
         for group in (self._waiting, self._active):
             group.pop(job.id, None)
@@ -60,7 +62,7 @@ class WorkQueue:
             if job.parent is not None:
                 self._due[job.parent] = None
         elif job.status in (Status.STARTING, Status.RUNNING):
-            self._active[job.id] = None
+            self._active[job.id] = next_look
         elif job.status == Status.RUNNABLE and job.stop_reason is None:
             try:
                 self._waiting[job.id] = self._entry(job)
@@ -81,9 +83,32 @@ class WorkQueue:
         return due
 
     def look_again(self, jobs: Iterable[str]) -> None:
-        """Return these at the next :meth:`take_due`."""
+        """Return these at the next :meth:`take_due`, and at the next :meth:`take_active` where they have a gang."""
         with self._lock:
-            self._due.update(dict.fromkeys(jobs))
+            for job in jobs:
+                self._due[job] = None
+                if job in self._active:
+                    self._active[job] = 0.0
+
+    def hurry(self, job: str) -> None:
+        """Something of its gang has changed: return it at the next :meth:`take_active`."""
+        with self._lock:
+            if job in self._active:
+                self._active[job] = 0.0
+
+    def take_active(self, moment: float) -> Sequence[str]:
+        """The jobs whose gang is to be looked at by now (monotonic [s]); each should have its next look by :meth:`later`."""
+        with self._lock:
+            taken = [job for job, look in self._active.items() if look <= moment]
+            for job in taken:
+                self._active[job] = inf
+        return taken
+
+    def later(self, job: str, moment: float) -> None:
+        """Look at a gang next at this moment (monotonic [s]), unless something has changed since it was taken."""
+        with self._lock:
+            if self._active.get(job) == inf:
+                self._active[job] = moment
 
     def take_dependents(self, session: Session) -> None:
         """Make the jobs due that depend on jobs that ended since the last call."""

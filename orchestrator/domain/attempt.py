@@ -33,8 +33,10 @@ _MARGIN = 5.0
 class Phase(StrEnum):
     """How far an attempt is."""
 
+    PREPARING = "preparing"
+    """Recorded; it has no epoch in its run yet."""
     LAUNCHING = "launching"
-    """Recorded; no handle of its gang is known."""
+    """It has an epoch; no handle of its gang is known."""
     STARTING = "starting"
     """Launched; its main node has not been seen to run."""
     RUNNING = "running"
@@ -79,6 +81,8 @@ class State:
     """An attempt as it is known. Times are steady time [ms]."""
 
     terms: Terms
+    prepared: bool = False
+    """Whether it has an epoch in its run."""
     launched: bool = False
     """Whether the handle of its gang is known."""
     started: bool = False
@@ -98,6 +102,8 @@ class State:
     def phase(self) -> Phase:
         if self.closed:
             return Phase.CLOSED
+        if not self.prepared:
+            return Phase.PREPARING
         if not self.launched:
             return Phase.LAUNCHING
         if self.verdict is not None:
@@ -124,6 +130,20 @@ class Silence:
 @dataclass(frozen=True)
 class Due:
     """It is time for a look at the attempt."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The run belongs to the attempt."""
+
+    epoch: int
+
+
+@dataclass(frozen=True)
+class PrepareRefused:
+    """The run can't be used for good."""
+
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -192,10 +212,33 @@ class Gone:
     """The last checkpoint, as a part of a reason; empty where there is none."""
 
 
-Event = Due | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | StopDelayed | Gone
+Event = (
+    Due
+    | Prepared
+    | PrepareRefused
+    | Launched
+    | LaunchDelayed
+    | LaunchRefused
+    | Preempted
+    | Observed
+    | StopDelayed
+    | Gone
+)
 
 
 # -- instructions ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Create the run where it is missing, and give it to the attempt: → Prepared or PrepareRefused, or nothing yet."""
+
+
+@dataclass(frozen=True)
+class TakeEpoch:
+    """Note the attempt's epoch."""
+
+    epoch: int
 
 
 @dataclass(frozen=True)
@@ -284,7 +327,20 @@ class Close:
 
 
 Instruction = (
-    Launch | Keep | Observe | Explain | MarkRunning | AwaitCause | AwaitChildren | Decide | Save | Stop | WindUp | Close
+    Prepare
+    | TakeEpoch
+    | Launch
+    | Keep
+    | Observe
+    | Explain
+    | MarkRunning
+    | AwaitCause
+    | AwaitChildren
+    | Decide
+    | Save
+    | Stop
+    | WindUp
+    | Close
 )
 Instructions = tuple[Instruction, ...]
 
@@ -297,6 +353,16 @@ def step(state: State, event: Event) -> Instructions:
     match state.phase, event:
         case Phase.CLOSED, _:
             return ()
+        case Phase.PREPARING, Due() if state.verdict is not None:
+            return (WindUp(),)
+        case Phase.PREPARING, Due() if state.stop_reason is not None:
+            return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
+        case Phase.PREPARING, Due():
+            return (Prepare(),)
+        case Phase.PREPARING, Prepared(epoch):
+            return TakeEpoch(epoch), Save(), Launch()
+        case Phase.PREPARING, PrepareRefused(reason):
+            return Decide(Verdict(Ending.FATAL, reason)), WindUp()
         case Phase.LAUNCHING, Due():
             return (Launch(again=state.verdict is None and state.stop_reason is None),)
         case Phase.LAUNCHING, Launched(handle):
@@ -398,7 +464,9 @@ def _unheard(terms: Terms, seen: Observed) -> str:
     for index, silence in _silent(seen):
         if silence.seconds > UNHEARD:
             name = "the main node" if index == terms.main else f"node {index}"
-            return f"{name} has been unreachable since {silence.since}" + (f" ({silence.cause})" if silence.cause else "")
+            return f"{name} has been unreachable since {silence.since}" + (
+                f" ({silence.cause})" if silence.cause else ""
+            )
     return ""
 
 
@@ -423,7 +491,9 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         return Close(gone.moment, not is_free, status, reason)
 
     match ending:
-        case Ending.STOPPED | Ending.FAILED | Ending.LOST | Ending.PREEMPTED | Ending.REQUEUE if state.stop_reason is not None:
+        case Ending.STOPPED | Ending.FAILED | Ending.LOST | Ending.PREEMPTED | Ending.REQUEUE if (
+            state.stop_reason is not None
+        ):
             return to(Status.FAILED, f"{state.stop_reason}{progress}" if native else state.stop_reason)
         case Ending.SUCCEEDED:
             return to(Status.SUCCEEDED, verdict.reason)
@@ -449,6 +519,8 @@ def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
 def after(state: State, instruction: Instruction) -> State:
     """The state once an instruction was carried out."""
     match instruction:
+        case TakeEpoch():
+            return replace(state, prepared=True)
         case Keep():
             return replace(state, launched=True)
         case MarkRunning(_, moment):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import wait
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
+from orchestrator import machine
 from orchestrator.domain.hosts import Capacity, engine_of
 from orchestrator.engines.api import (
     Engine,
@@ -47,10 +47,10 @@ class EngineSet:
         """Takes the engines over: :meth:`close` closes them. Waits a little for their first answers."""
         self.secrets = Secrets()
         """The source of the jobs' secrets; none at first."""
-        self.changed: Callable[[], None] = lambda: None
-        """Called (on an engine's thread) when an engine has something new to tell."""
+        self.changed: Callable[[str], None] = lambda _: None
+        """Called (on an engine's thread) with the name of a gang that has changed; empty: what an engine has, did."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
-        self._runners = {engine.name: Runner(engine, lambda: self.changed()) for engine in engines}
+        self._runners = {engine.name: Runner(engine, lambda gang: self.changed(gang)) for engine in engines}
         wait([runner.first for runner in self._runners.values()], START)
 
     def close(self) -> None:
@@ -77,9 +77,9 @@ class EngineSet:
 
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
-        deadline = time.monotonic() + patience
+        deadline = machine.monotonic() + patience
         asked = [name for name in (self.engines if names is None else names) if name in self._runners]
-        told = {name: self._runners[name].capacity(max(0.0, deadline - time.monotonic())) for name in asked}
+        told = {name: self._runners[name].capacity(max(0.0, deadline - machine.monotonic())) for name in asked}
         return {name: capacity for name, capacity in told.items() if capacity is not None}
 
     def unknown(self) -> Mapping[str, str]:
@@ -155,6 +155,11 @@ class EngineSet:
             return self._runner(found.engine).observe(found)
         except NotServed as error:
             return [NodeStatus(NodePhase.UNREACHABLE, words=str(error))] * found.nodes
+
+    def look(self) -> None:
+        """Ask for newer statuses of the gangs that are observed; :attr:`changed` tells of those that differ. Does not wait."""
+        for runner in self._runners.values():
+            runner.look()
 
     def asked(self, handle: str) -> float | None:
         """Seconds since the engine was asked for the status that :meth:`observe` returns; None where it does not answer now."""

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
-from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from orchestrator import machine
 from orchestrator.domain.hosts import Capacity
 from orchestrator.engines.api import (
     Engine,
@@ -70,46 +69,41 @@ class Underway(NotYet):
 class Runner:
     """Carries out the calls of one engine, in their order, on a thread of its own. Any thread may ask."""
 
-    def __init__(self, engine: Engine, changed: Callable[[], None]) -> None:
-        """``changed`` is called, on the engine's thread, when an answer differs from the one before."""
+    def __init__(self, engine: Engine, changed: Callable[[str], None]) -> None:
+        """``changed`` is called, on the engine's thread, when an answer differs from the one before: with the gang's name, or empty."""
         self.engine, self._changed = engine, changed
         self._lock = threading.Lock()
-        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._launches: dict[str, Future[Handle]] = {}
         """By gang: launches whose end has not been collected."""
         self._refused: dict[str, NotYet] = {}
         """By gang: what its last launch has to wait for."""
+        self._observed: set[Handle] = set()
+        """Handles of the gangs whose status the controller wants."""
         self._looks: set[Handle] = set()
-        """Handles of the gangs that are being looked at."""
+        """Those that are being looked at."""
         self._seen: dict[Handle, tuple[GangStatus, float]] = {}
         """By handle: the newest status, and when the engine was asked for it (monotonic [s])."""
         self._telling: Future[Capacity] | None = None
         self._capacity: Capacity | None = None
         self._told_at: int | None = None
         self._backoff = Backoff(log)
-        self._since: float | None = None
-        """Since when the present call is being carried out (monotonic [s])."""
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"engine {engine.name}", daemon=True)
-        self._thread.start()
+        self._thread = machine.pool(f"engine {engine.name}", 1)
         self.first = self.ask_capacity()
         """Done once the engine has told its capacity for the first time, or has failed to."""
 
     def close(self) -> None:
         """Give the present call a few seconds, drop those that wait, and close the engine; its gangs go on."""
-        self._closing.set()
-        self._calls.put(None)
-        self._thread.join(_CLOSING)
+        self._thread.close(_CLOSING)
         self.engine.close()
 
     @property
     def silence(self) -> str | None:
         """That the engine does not answer, and since when; None while it does."""
-        since = self._since
-        if since is None or (passed := time.monotonic() - since) < OVERDUE:
+        since = self._thread.busy_since
+        if since is None or (passed := machine.monotonic() - since) < OVERDUE:
             return None
         if (said := self._backoff.said("silence")) is None:
-            began = datetime.fromtimestamp(time.time() - passed, UTC)
+            began = datetime.fromtimestamp(machine.wall() - passed, UTC)
             said = f"the {self.engine.name} engine has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
             self._backoff.failed("silence", said)
         return said
@@ -170,7 +164,7 @@ class Runner:
                 raise
             self._refused.pop(gang, None)
             launch = self._launches[gang] = self._submit(lambda: self._start(planned))
-            launch.add_done_callback(lambda _: self._changed())
+            launch.add_done_callback(lambda _: self._changed(gang))
         if not launch.done():
             raise Underway(self.silence or "")
         del self._launches[gang]
@@ -181,15 +175,14 @@ class Runner:
             raise
 
     def observe(self, handle: Handle) -> GangStatus | None:
-        """The newest picture of a gang, and a newer one is asked for; None before the first.
+        """The newest status of a gang, of which :meth:`look` asks for newer ones from now on; None before the first.
 
         Nodes that were seen running, or not yet at all, are unreachable where there is no newer picture, and say why.
         """
         subject = ("look", handle)
-        with self._lock:
-            if handle not in self._looks and not self._backoff.waits(subject):
-                self._looks.add(handle)
-                self._calls.put(partial(self._look, handle))
+        if handle not in self._observed:
+            self._observed.add(handle)
+            self.look([handle])
         seen, _ = self._seen.get(handle, (None, 0.0))
         if trouble := self.silence or self._backoff.said(subject):
             away = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
@@ -199,11 +192,18 @@ class Runner:
             ]
         return seen
 
+    def look(self, handles: Iterable[Handle] | None = None) -> None:
+        """Ask for a newer status of these gangs, or of all that are observed; of none twice at a time."""
+        for handle in list(self._observed) if handles is None else handles:
+            if handle not in self._looks and not self._backoff.waits(("look", handle)):
+                self._looks.add(handle)
+                self._submit(partial(self._look, handle))
+
     def asked(self, handle: Handle) -> float | None:
         """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
         if handle not in self._seen or self.silence or self._backoff.said(("look", handle)):
             return None
-        return time.monotonic() - self._seen[handle][1]
+        return machine.monotonic() - self._seen[handle][1]
 
     def stop(self, handle: Handle, grace: float) -> GangStatus:
         """Stop the gang on the caller's thread, which may take long, and look at it once more. Raises EngineError."""
@@ -219,37 +219,27 @@ class Runner:
         with self._lock:
             self._refused.pop(gang, None)
             if handle is not None:
-                self._looks.discard(handle)
+                self._observed.discard(handle)
                 self._seen.pop(handle, None)
         self._backoff.worked(("launch", gang))
         self._backoff.worked(("look", handle))
 
     # -- on the engine's thread ---------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        while (call := self._calls.get()) is not None and not self._closing.is_set():
-            self._since = time.monotonic()
-            try:
-                call()
-            except Exception:  # a bug here must not end the thread
-                log.exception("a call of the %s engine failed", self.engine.name)
-            self._since = None
-            if self._backoff.worked("silence"):
-                log.warning("the %s engine answers again", self.engine.name)
-
     def _submit(self, body: Callable[[], T]) -> Future[T]:
-        future: Future[T] = Future()
-
-        def call() -> None:
+        def call() -> T:
             try:
-                result = body()
-            except BaseException as error:
-                future.set_exception(error)
-            else:
-                future.set_result(result)
+                return body()
+            except EngineError:
+                raise
+            except Exception:
+                log.exception("a call of the %s engine failed", self.engine.name)
+                raise
+            finally:
+                if self._backoff.worked("silence"):
+                    log.warning("the %s engine answers again", self.engine.name)
 
-        self._calls.put(call)
-        return future
+        return self._thread.submit(call)
 
     def _call(self, what: str, body: Callable[[], T]) -> T:
         """Carry out a call. Raises EngineError, whatever the engine raises; ``what``: for the message."""
@@ -276,10 +266,10 @@ class Runner:
             self._failed("hosts", error)
             raise
         self._backoff.worked("hosts")
-        self._told_at = int(time.time() * 1000)
+        self._told_at = int(machine.wall() * 1000)
         if capacity != self._capacity:
             self._capacity = capacity
-            self._changed()
+            self._changed("")
         return capacity
 
     def _start(self, plan: Plan[Any]) -> Handle:
@@ -295,7 +285,7 @@ class Runner:
     def _look(self, handle: Handle) -> None:
         subject = ("look", handle)
         before = self._seen.get(handle, (None, 0.0))[0], self._backoff.said(subject)
-        asked = time.monotonic()
+        asked = machine.monotonic()
         try:
             status = self._call("look at the gang", lambda: self.engine.observe(handle))
         except EngineError as error:
@@ -303,12 +293,11 @@ class Runner:
         else:
             self._backoff.worked(subject)
             with self._lock:
-                if handle in self._looks:  # else it was forgotten meanwhile
+                if handle in self._observed:  # else it was forgotten meanwhile
                     self._seen[handle] = status, asked
-        with self._lock:
-            self._looks.discard(handle)
+        self._looks.discard(handle)
         if before != (self._seen.get(handle, (None, 0.0))[0], self._backoff.said(subject)):
-            self._changed()
+            self._changed(handle.gang)
 
 
 def _lasting(body: Callable[[], T]) -> T:

@@ -5,12 +5,12 @@ Times are Unix milliseconds, as in the Batch API. A change here needs a migratio
 
 from __future__ import annotations
 
-import time
 from typing import Any, Generic, Self, TypeVar, overload
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
+from orchestrator import machine
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
@@ -21,7 +21,7 @@ from orchestrator.persistence.gangs import gangs
 
 def now() -> int:
     """Unix time [ms], the unit of every time in the database and in the Batch API."""
-    return int(time.time() * 1000)
+    return int(machine.wall() * 1000)
 
 
 _T = TypeVar("_T")

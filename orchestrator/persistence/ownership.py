@@ -6,7 +6,8 @@ was lost, still has its owner.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 from sqlalchemy import ColumnElement, or_, select
 from sqlalchemy.orm import Session
@@ -14,10 +15,23 @@ from sqlalchemy.orm import Session
 from orchestrator.domain.job import TERMINAL
 from orchestrator.persistence.models import Job, RunRecord, now
 from shared_store import __version__
-from shared_store.layout import Run
 
 
-def owner_of(session: Session, run: Run) -> RunRecord | None:
+class FoundRun(Protocol):
+    """A run as it is in the store, or as it was found there."""
+
+    @property
+    def name(self) -> str: ...
+    def is_missing(self) -> bool:
+        """Whether the store lacks it."""
+        ...
+
+    def description(self) -> Mapping[str, Any] | None:
+        """Its ``run.json``. Raises ValueError where that is damaged."""
+        ...
+
+
+def owner_of(session: Session, run: FoundRun) -> RunRecord | None:
     """The owner and the queue of a run: as recorded, else as ``run.json`` says, else as its first job says.
 
     A run that does not exist belongs to the unfinished job that will create it, whatever is recorded of an earlier run of that
@@ -44,14 +58,14 @@ def owner_of(session: Session, run: Run) -> RunRecord | None:
     return None if description is None else _record(run, "", None)
 
 
-def first_description(run: Run, job: Job, owner: str | None, queue: str) -> dict[str, Any]:
+def first_description(run: FoundRun, job: Job, owner: str | None, queue: str) -> dict[str, Any]:
     """The first ``run.json`` of a run that ``job`` begins."""
     spec = job.gang.spec
     facts = {"run": run.name, "job": job.id, "created": now(), "version": __version__, "spec": spec, "name": job.name}
     return {**facts, "owner": owner, "queue": queue}
 
 
-def born_at(run: Run) -> int:
+def born_at(run: FoundRun) -> int:
     """When the run was created [Unix ms]; 0 where it does not say."""
     try:
         created = (run.description() or {}).get("created")
@@ -60,24 +74,24 @@ def born_at(run: Run) -> int:
     return int(created) if isinstance(created, int | float) else 0
 
 
-def is_of_earlier_run(job: Job, run: Run) -> bool:
+def is_of_earlier_run(job: Job, run: FoundRun) -> bool:
     """Whether a job's own run is gone, and ``run`` is another one that was created under its name afterwards."""
     return job.stopped_at is not None and job.stopped_at < born_at(run)
 
 
-def jobs_of(run: Run) -> list[ColumnElement[bool]]:
+def jobs_of(run: FoundRun) -> list[ColumnElement[bool]]:
     """Conditions of the jobs that made and continued the run; not those of an earlier run of its name."""
     return [Job.run == run.name, or_(Job.stopped_at.is_(None), Job.stopped_at >= born_at(run))]
 
 
-def forget_gone_run(session: Session, run: Run) -> None:
+def forget_gone_run(session: Session, run: FoundRun) -> None:
     """Forget the owner of an earlier run of this name that is gone from the store: it has no rights to a new one. Commits."""
     if (record := session.get(RunRecord, run.name)) is not None:
         session.delete(record)
         session.commit()
 
 
-def record_owner(session: Session, run: Run, job: Job) -> RunRecord:
+def record_owner(session: Session, run: FoundRun, job: Job) -> RunRecord:
     """The record of a run that ``job`` is about to create or continue, added to the session where there was none.
 
     A run that exists and says nothing about its queue belongs to that of ``job`` from now on: only a key with all queues gets
@@ -95,5 +109,5 @@ def record_owner(session: Session, run: Run, job: Job) -> RunRecord:
     return record
 
 
-def _record(run: Run, queue: str, owner: str | None) -> RunRecord:
+def _record(run: FoundRun, queue: str, owner: str | None) -> RunRecord:
     return RunRecord(name=run.name, queue=queue, owner=owner, created_at=now())

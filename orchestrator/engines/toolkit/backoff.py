@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Hashable
 from dataclasses import dataclass
+
+from orchestrator import machine
 
 
 @dataclass
@@ -40,7 +41,7 @@ class Backoff:
         with self._lock:
             before = self._troubles.get(subject)
             pause = self._first if before is None else min(2 * before.pause, self._most)
-            self._troubles[subject] = _Trouble(said, pause, time.monotonic() + pause)
+            self._troubles[subject] = _Trouble(said, pause, machine.monotonic() + pause)
         if before is not None and before.said == said:
             return False
         self._log.error("%s", said, exc_info=error)
@@ -49,7 +50,7 @@ class Backoff:
     def waits(self, subject: Hashable) -> bool:
         """Whether the pause after the last failure is not over."""
         trouble = self._troubles.get(subject)
-        return trouble is not None and time.monotonic() < trouble.next
+        return trouble is not None and machine.monotonic() < trouble.next
 
     def said(self, subject: Hashable) -> str | None:
         """The last failure; None where the subject works."""
@@ -59,7 +60,7 @@ class Backoff:
     def pauses(self) -> dict[Hashable, float]:
         """Seconds until the next try of each subject that fails at present; 0 where it may be tried now."""
         with self._lock:
-            return {subject: max(0.0, each.next - time.monotonic()) for subject, each in self._troubles.items()}
+            return {subject: max(0.0, each.next - machine.monotonic()) for subject, each in self._troubles.items()}
 
     def hurry(self, subject: Hashable) -> None:
         """Something has changed: the next try need not wait."""
@@ -76,13 +77,13 @@ class Backoff:
         trouble = self._troubles.get(subject)
         if trouble is None:  # the usual case, without the lock
             return False
-        if lasting and time.monotonic() < trouble.next + trouble.pause:
+        if lasting and machine.monotonic() < trouble.next + trouble.pause:
             return False
         with self._lock:
             return self._troubles.pop(subject, None) is not None
 
     def tidy(self, idle: float = 600.0) -> None:
         """Forget what was not tried for ``idle`` seconds after its pause, such as the start of a job that ended otherwise."""
-        before = time.monotonic() - idle
+        before = machine.monotonic() - idle
         with self._lock:
             self._troubles = {subject: each for subject, each in self._troubles.items() if each.next >= before}

@@ -155,7 +155,10 @@ def test_two_routers_on_one_machine_do_not_see_each_others_nodes(bus: Bus, tmp_p
     other.open()
     other.expect("j", 1, nodes=2)
     nodes = [start_node(each, "time.sleep(600)", index) for index, each in enumerate((bus, other))]
-    assert [[each.presence.met(("j", 1, index)) for index in (0, 1)] for each in (bus, other)] == [[True, False], [False, True]]
+    assert [[each.presence.met(("j", 1, index)) for index in (0, 1)] for each in (bus, other)] == [
+        [True, False],
+        [False, True],
+    ]
     assert other.endpoint != bus.endpoint
     for node in nodes:
         node.kill()

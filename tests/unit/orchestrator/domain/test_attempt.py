@@ -32,11 +32,15 @@ from orchestrator.domain.attempt import (
     Observed,
     Phase,
     Preempted,
+    Prepare,
+    Prepared,
+    PrepareRefused,
     Save,
     Silence,
     State,
     Stop,
     StopDelayed,
+    TakeEpoch,
     Terms,
     WindUp,
     step,
@@ -49,7 +53,8 @@ T = 1_000_000
 NATIVE = NativeOptions(is_native=True, on_child_failure="restart")
 TERMS = Terms(number=2, hosts=("h/0", "h/1"), whole=2, main=0, options=NATIVE, grace=30.0, allowed=3, spent=1)
 
-LAUNCHING = State(TERMS)
+PREPARING = State(TERMS)
+LAUNCHING = replace(PREPARING, prepared=True)
 STARTING = replace(LAUNCHING, launched=True)
 RUNNING = replace(STARTING, started=True, running_since=T - 50_000)
 
@@ -107,6 +112,17 @@ def ends(verdict: Verdict, grace: float = 35.0, first: Instruction = SAYS_SO) ->
 TIMED = with_terms(RUNNING, timeout=50)
 
 RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
+    # -- preparing
+    "a new attempt takes its run": (PREPARING, Due(), [Prepare()]),
+    "its epoch is saved before anything is launched": (PREPARING, Prepared(7), [TakeEpoch(7), Save(), Launch()]),
+    "a run that can't be used is final": (
+        PREPARING,
+        PrepareRefused("it is damaged"),
+        [Decide(Verdict(Ending.FATAL, "it is damaged")), WindUp()],
+    ),
+    "one that is not needed takes nothing": (asked(PREPARING), Due(), [Decide(STOPPED), WindUp()]),
+    "nor one that was preempted": (ending(Ending.PREEMPTED, of=PREPARING), Due(), [WindUp()]),
+    "the scheduler may take its place": (PREPARING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     # -- launching
     "what is recorded is launched": (LAUNCHING, Due(), [Launch()]),
     "what is to end is not launched anew": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [Launch(again=False)]),
@@ -163,14 +179,22 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     ),
     "one that is unreachable does not, and is called so": (RUNNING, seen(silences=(None, QUIET)), [UNHEARD_SO]),
     "after a moment": (RUNNING, seen(silences=(None, replace(QUIET, seconds=UNHEARD))), [SAYS_SO]),
-    "the silence of a node that has ended is none": (RUNNING, seen(None, end(0), silences=(None, GONE_QUIET)), [SAYS_SO]),
+    "the silence of a node that has ended is none": (
+        RUNNING,
+        seen(None, end(0), silences=(None, GONE_QUIET)),
+        [SAYS_SO],
+    ),
     "that of a child on AWS ends nothing": (on_aws(RUNNING), seen(silences=(None, GONE_QUIET)), [QUIET_SO]),
     "that of the main node loses its host": (
         on_aws(RUNNING),
         seen(silences=(GONE_QUIET, None)),
         ends(replace(GONE, ending=Ending.LOST), 35.0, first=Explain(f"{RUNS}; the main node{QUIET_SO.reason[33:]}")),
     ),
-    "an engine that does not answer is named": (RUNNING, seen(stale="Slurm is away"), [Explain(f"{RUNS}; Slurm is away")]),
+    "an engine that does not answer is named": (
+        RUNNING,
+        seen(stale="Slurm is away"),
+        [Explain(f"{RUNS}; Slurm is away")],
+    ),
     "time ends it": (replace(TIMED, running_since=T - 50_001), seen(), ends(LATE)),
     "to the second": (TIMED, seen(), [SAYS_SO]),
     "on AWS a child's end is nothing": (on_aws(RUNNING), seen(None, end(1)), [SAYS_SO]),
@@ -279,7 +303,16 @@ def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
 
 
 EVENTS = (
-    *(Due(), Launched("handle"), LaunchDelayed("why", False), LaunchRefused("why"), Preempted("why"), seen()),
+    *(
+        Due(),
+        Prepared(7),
+        PrepareRefused("why"),
+        Launched("handle"),
+        LaunchDelayed("why", False),
+        LaunchRefused("why"),
+        Preempted("why"),
+        seen(),
+    ),
     *(StopDelayed("why"), Gone(T, MAIN_LAST, "")),
 )
 

@@ -21,6 +21,7 @@ from orchestrator.domain.attempt import (
     Save,
     State,
     Stop,
+    TakeEpoch,
     Terms,
     after,
     step,
@@ -29,14 +30,15 @@ from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions
 
 NATIVE = NativeOptions(is_native=True, on_child_failure="fail")
-LAUNCHING = State(Terms(1, ("h/0", "h/1"), 2, 0, NATIVE, 30.0))
+PREPARING = State(Terms(1, ("h/0", "h/1"), 2, 0, NATIVE, 30.0))
+LAUNCHING = replace(PREPARING, prepared=True)
 STARTING = replace(LAUNCHING, launched=True)
 RUNNING = replace(STARTING, started=True, running_since=1000)
 
 
 def test_phases_follow_one_another() -> None:
     ending = replace(RUNNING, verdict=Verdict(Ending.FAILED, "why"))
-    phases = [each.phase for each in (LAUNCHING, STARTING, RUNNING, ending, replace(ending, closed=True))]
+    phases = [each.phase for each in (PREPARING, LAUNCHING, STARTING, RUNNING, ending, replace(ending, closed=True))]
     assert phases == list(Phase)
     assert replace(ending, launched=False).phase is Phase.LAUNCHING
 
@@ -59,6 +61,7 @@ def test_who_leaves_on_request_after_a_while_starts_again_though_no_attempt_is_l
 
 def test_what_is_known_after_each_instruction() -> None:
     verdict = Verdict(Ending.FAILED, "why")
+    assert after(PREPARING, TakeEpoch(7)) == LAUNCHING
     assert after(LAUNCHING, Keep("handle")) == STARTING
     assert after(STARTING, MarkRunning("runs", 1000)) == RUNNING
     assert after(RUNNING, AwaitCause(5)) == replace(RUNNING, cause_since=5)

@@ -20,10 +20,14 @@ node_ends = st.none() | st.builds(
     NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), asked=st.booleans()
 )
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
-silence = st.builds(attempt.Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"]))
+silence = st.builds(
+    attempt.Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"])
+)
 silences = st.just([None] * NODES) | st.lists(st.none() | silence, min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
 delays = st.builds(attempt.LaunchDelayed, words, st.booleans())
+prepared = st.just(attempt.Prepared(7))
+prepares = st.one_of(prepared, prepared, prepared, st.none(), st.just(attempt.PrepareRefused("refused")))
 launches = st.one_of(*[st.just(attempt.Launched("handle"))] * 4, delays, st.just(attempt.LaunchRefused("refused")))
 looks = st.builds(attempt.Observed, moments, both, silences, words, words, words)
 gone = st.builds(attempt.Gone, moments, both | st.just([]), words)
@@ -36,6 +40,7 @@ class Turn:
 
     before: attempt.Event | str | None
     """A text: the user asks the job to end, which a request writes to the database."""
+    prepare: attempt.Event | None
     launch: attempt.Event
     seen: attempt.Observed
     stop: attempt.Event | None
@@ -43,7 +48,7 @@ class Turn:
 
 out_of_place = st.one_of(launches, looks, gone)
 before = st.one_of(*[st.none()] * 4, st.just("enough"), st.just(attempt.Preempted("preempted by job b")), out_of_place)
-turns = st.builds(Turn, before, launches, looks, stops)
+turns = st.builds(Turn, before, prepares, launches, looks, stops)
 policies = st.sampled_from(["ignore", "restart", "fail"])
 terms = st.builds(
     attempt.Terms,
@@ -84,6 +89,8 @@ def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
             for instruction in instructions:
                 state = attempt.after(state, instruction)
                 match instruction:
+                    case attempt.Prepare() if turn.prepare is not None:
+                        events.append(turn.prepare)
                     case attempt.Launch():
                         events.append(turn.launch)
                     case attempt.Observe():
@@ -113,16 +120,16 @@ def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_sa
     kept = [page.before.terms.number for page in story for each in page.instructions if isinstance(each, attempt.Keep)]
     assert len(kept) == len(set(kept)), "a second handle of one epoch"
     for page in story:
-        assert attempt.Launch() not in page.instructions or not page.before.launched
+        assert not any(isinstance(each, attempt.Launch) for each in page.instructions) or not page.before.launched
         for index, each in enumerate(page.instructions):
             if isinstance(each, attempt.Stop):
                 assert page.before.launched and page.now.verdict is not None
                 assert page.before.verdict is not None or attempt.Save() in page.instructions[:index], (
                     "a crash would forget it"
                 )
-            if isinstance(each, attempt.Keep):
+            if isinstance(each, attempt.Keep | attempt.TakeEpoch):
                 assert attempt.Save() in page.instructions[index:], "a crash would forget it"
-            if isinstance(each, attempt.Launch | attempt.Observe | attempt.Stop | attempt.WindUp):
+            if isinstance(each, attempt.Prepare | attempt.Launch | attempt.Observe | attempt.Stop | attempt.WindUp):
                 assert each is page.instructions[-1], "what it leads to is decided on when all else is carried out"
 
 
@@ -150,7 +157,11 @@ def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
             assert close.status.is_terminal, "it is started again"
         if isinstance(page.event, attempt.Observed) and page.before.launched:
             assert page.now.verdict is not None, "the next look decides its end"
-        if isinstance(page.event, attempt.LaunchDelayed) and not page.event.unknown and not page.before.launched:
+        if (
+            isinstance(page.event, attempt.LaunchDelayed)
+            and page.before.phase is attempt.Phase.LAUNCHING
+            and not page.event.unknown
+        ):
             assert attempt.WindUp() in page.instructions, "nothing is launched any more"
 
 
@@ -163,8 +174,11 @@ def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_rea
         state = page.now
         if state.closed:
             continue
-        launch = attempt.Launch(again=state.verdict is None and state.stop_reason is None)
-        assert attempt.step(state, attempt.Due()) == ((attempt.Observe(),) if state.launched else (launch,))
+        next_look = attempt.Observe if state.launched else attempt.Launch if state.prepared else attempt.Prepare
+        wanted = (
+            next_look if state.prepared or (state.verdict is None and state.stop_reason is None) else attempt.WindUp
+        )
+        assert isinstance(attempt.step(state, attempt.Due())[-1], wanted)
         follows = attempt.step(state, seen) if state.launched else ()
         if state.verdict is not None or any(isinstance(each, attempt.Decide) for each in follows):
             assert not follows or isinstance(follows[-1], attempt.Stop | attempt.AwaitChildren)
@@ -204,6 +218,7 @@ def test_a_gang_whose_main_node_is_done_succeeds(terms: attempt.Terms, turns: Se
     answered = [
         Turn(
             None,
+            attempt.Prepared(7),
             attempt.Launched("handle"),
             replace(turn.seen, ends=done, waits=""),
             attempt.Gone(turn.seen.moment, done, ""),

@@ -1,0 +1,161 @@
+"""The store as the controller's loop uses it: each call is carried out on a thread of a pool, since the volume may hang.
+
+What is missing on a volume may be missing because the volume is: each answer counts only if the store is still the one that the
+controller knows, after it was read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from orchestrator.control.peers import Peers
+from orchestrator.machine import Pool
+from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
+from shared_store.files import DamagedFile
+from shared_store.layout import Store, StoreError
+from shared_store.outcomes import Outcome, read_outcome
+
+T = TypeVar("T")
+Key = tuple[str, int]
+"""Job and number of an attempt."""
+
+
+class StoreUnavailable(Exception):
+    """The store can't be used now; the message says why. The action is tried again."""
+
+
+class RunRefused(Exception):
+    """The run can't be used for good; the message says why."""
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """A run as it was found; a :class:`shared_store.layout.Run` for those who only read its ``run.json``."""
+
+    name: str
+    missing: bool
+    content: Mapping[str, Any] | None
+    """Its ``run.json``; None where there is none, or where it is damaged."""
+    damage: str = ""
+    epoch: int = 0
+    writer: str | None = None
+    """The attempt of another controller that writes it now, in words."""
+
+    def is_missing(self) -> bool:
+        return self.missing
+
+    def description(self) -> Mapping[str, Any] | None:
+        """Raises ValueError where it is damaged."""
+        if self.damage:
+            raise ValueError(self.damage)
+        return self.content
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run holds after an attempt."""
+
+    iteration: int | None = None
+    """Of its newest checkpoint; None where it has none."""
+    saved: float | None = None
+    """When the attempt made its newest checkpoint (Unix time [s]); None where it made none."""
+
+
+class RunStore:
+    """Calls on the store. Every method may hang; all raise StoreUnavailable."""
+
+    def __init__(self, store: Store, peers: Peers, check: Callable[[], None] = lambda: None) -> None:
+        """``check``: raises OSError where the volume of the store is not there, or another one is."""
+        self.store, self.peers, self._check = store, peers, check
+
+    def examine(self, name: str) -> RunFacts:
+        """A run before an attempt begins. Raises RunRefused."""
+        with self._using(f"read run {name}"):
+            run = self.store.run(name)
+            try:
+                content, damage = run.description(), ""
+            except (ValueError, RecursionError) as error:
+                content, damage = None, str(error)
+            return RunFacts(name, run.is_missing(), content, damage, read_epoch(run), self.peers.writer(run))
+        raise AssertionError
+
+    def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
+        """Create the run, where it is missing, and give it to an attempt; returns the epoch, greater than ``after``. Raises RunRefused."""
+        with self._using(f"prepare run {name}"):
+            run = self.store.run(name)
+            run.create(dict(description))
+            return take_epoch(run, after, claim)
+        raise AssertionError
+
+    def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
+        """The outcomes of those of these nodes that have left one."""
+        with self._using("read outcomes"):
+            found = {node: read_outcome(self.store.run(name), job, attempt, node) for node in nodes}
+            return {node: outcome for node, outcome in found.items() if outcome is not None}
+        raise AssertionError
+
+    def progress(self, name: str, epoch: int) -> Progress:
+        """What the run holds after the attempt of this epoch."""
+        with self._using(f"read the checkpoints of run {name}"):
+            checkpoints = list_checkpoints(self.store.run(name))
+            iteration = checkpoints[-1].iteration if checkpoints else None
+            for checkpoint in reversed(checkpoints):
+                if checkpoint.epoch == epoch:
+                    with suppress(DamagedCheckpoint, KeyError, TypeError, ValueError):
+                        return Progress(iteration, float(checkpoint.manifest["created"]))
+            return Progress(iteration)
+        raise AssertionError
+
+    def release(self, name: str, epoch: int) -> None:
+        """The attempt of this epoch is closed: while this controller lives, another one may then say that the run is written."""
+        with suppress(OSError, DamagedFile):
+            close_claim(self.store.run(name), epoch)
+
+    @contextmanager
+    def _using(self, what: str) -> Iterator[None]:
+        path = self.store.path
+        try:
+            self._check()  # before a write, and after a read: what is missing may be missing because the volume is
+            yield
+            self._check()
+        except (OSError, StaleEpoch) as error:
+            raise StoreUnavailable(f"store {path}: can't {what} now ({error}); trying again") from error
+        except (StoreError, ValueError) as error:
+            raise RunRefused(f"store {path}: can't {what}: {error}") from error
+
+
+class Errands:
+    """Calls on the store for attempts: one at a time for each attempt, on a pool. The loop collects the results, and never waits."""
+
+    def __init__(self, pool: Pool, changed: Callable[[str], None]) -> None:
+        """``changed``: called, on any thread, with the job whose result is there."""
+        self._pool, self._changed = pool, changed
+        self._under_way: dict[Key, tuple[str, Future[Any]]] = {}
+
+    def result(self, key: Key, name: str, body: Callable[[], T]) -> T | None:
+        """The result of ``body``, once; None until it is there, and at first, when it is started. Raises what it raised.
+
+        ``name``: tells the errands of an attempt apart; another one that is under way is waited for, and its result dropped.
+        """
+        under_way = self._under_way.get(key)
+        if under_way is not None:
+            started, future = under_way
+            if not future.done():
+                return None
+            del self._under_way[key]
+            if started == name:
+                result: T = future.result()
+                return result
+        future = self._pool.submit(body)
+        self._under_way[key] = name, future
+        future.add_done_callback(lambda _: self._changed(key[0]))
+        return None
+
+    def forget(self, key: Key) -> None:
+        """The attempt is closed."""
+        self._under_way.pop(key, None)
