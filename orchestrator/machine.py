@@ -119,6 +119,10 @@ class Machine:
         """Start ``body`` on a daemon thread."""
         threading.Thread(target=body, name=name, daemon=True).start()
 
+    def result(self, future: Future[T], seconds: float) -> T:
+        """The result of a pool's call. Raises TimeoutError where it is not there in time."""
+        return future.result(seconds)
+
     def pool(self, name: str, threads: int, waiting: int | None = None) -> Pool:
         """A pool of so many threads; ``waiting``: how many calls may wait for one, any number by default."""
         return ThreadPool(name, threads, waiting)
@@ -156,6 +160,11 @@ def boot() -> str:
 def thread(name: str, body: Callable[[], None]) -> None:
     """Start ``body`` on a daemon thread."""
     _current.thread(name, body)
+
+
+def result(future: Future[T], seconds: float) -> T:
+    """The result of a pool's call. Raises TimeoutError where it is not there in time."""
+    return _current.result(future, seconds)
 
 
 def pool(name: str, threads: int, waiting: int | None = None) -> Pool:

@@ -75,6 +75,7 @@ class Reconciler:
         clock: Clock | None = None,
         min_free: MinFree = DEFAULT,
         runs: RunStore | None = None,
+        disk: Disk | None = None,
     ) -> None:
         """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
         ``min_free``: free space that the volumes of the store and the database need for something new to start.
@@ -82,7 +83,7 @@ class Reconciler:
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval, self.retention = interval, retention
         volumes = {"store": store.path, "database": database.volume}
-        self.disk = Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
+        self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
         self._short, self._is_cut_off = False, False
         self.work_queue = WorkQueue()
         self.clock = clock or Clock()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import wait
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -51,7 +50,10 @@ class EngineSet:
         """Called (on an engine's thread) with the name of a gang that has changed; empty: what an engine has, did."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
         self._runners = {engine.name: Runner(engine, lambda gang: self.changed(gang)) for engine in engines}
-        wait([runner.first for runner in self._runners.values()], START)
+        deadline = machine.monotonic() + START
+        for runner in self._runners.values():
+            with suppress(TimeoutError, EngineError):
+                machine.result(runner.first, max(0.0, deadline - machine.monotonic()))
 
     def close(self) -> None:
         """Close every engine; gangs go on."""

@@ -210,7 +210,7 @@ class Runner:
         self._call("stop the gang", lambda: self.engine.stop(handle, grace))
         looking = self._submit(lambda: self._call("look at the gang", lambda: self.engine.observe(handle)))
         try:
-            return looking.result(_LAST_LOOK)
+            return machine.result(looking, _LAST_LOOK)
         except TimeoutError:
             raise Transient(self.silence or f"the {self.engine.name} engine has not said how the gang ended") from None
 

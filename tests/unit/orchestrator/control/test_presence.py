@@ -81,9 +81,9 @@ def test_where_the_controller_may_be_cut_off_nodes_are_unreachable_for_a_long_ti
     cluster = Cluster(nodes, itself=itself)
     cluster.silence(*silent)
     assert cluster.presence.cut_off is None, "at once it may be the end of a gang"
-    cluster.wait(11)
+    cluster.wait(12)
     assert cluster.presence.cut_off == cause
-    cluster.wait(6 * L - 11)
+    cluster.wait(6 * L - 12)
     assert cluster.lost() == []
     silence = cluster.presence.silence(cluster.nodes[0], AGO)
     assert silence is not None and silence.cause == cause
@@ -152,7 +152,7 @@ def test_nodes_of_no_open_attempt_are_not_noted() -> None:
 def test_nodes_that_have_ended_do_not_make_the_controller_cut_off() -> None:
     cluster = Cluster(4)
     cluster.silence(0, 1, 2)
-    cluster.wait(11)
+    cluster.wait(12)
     assert cluster.presence.cut_off is not None
     cluster.presence.ended(cluster.nodes[0])
     cluster.presence.forget("job-1", 1)

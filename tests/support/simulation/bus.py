@@ -1,0 +1,48 @@
+"""The bus of one process of the controller: the real presence, and messages that a broken network loses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from orchestrator.control.presence import Presence
+
+if TYPE_CHECKING:
+    from tests.support.simulation.cluster import SimulatedNode
+    from tests.support.simulation.run import Simulation
+
+
+class SimulatedBus:
+    endpoint = "tcp/127.0.0.1:7447"
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.presence = Presence()
+        self.presence.hear_itself(True)
+        self.changed: Callable[[str], None] = lambda _: None
+        self._simulation = simulation
+        self._process = simulation.machine.process
+
+    def expect(self, job: str, attempt: int, nodes: int) -> None:
+        self.presence.expect(job, attempt, nodes)
+        for gang in self._simulation.gangs.values():
+            if (gang.job, gang.attempt) == (job, attempt):
+                for node in gang.nodes:
+                    self._simulation.connect(node)
+
+    def forget(self, job: str, attempt: int) -> None:
+        self.presence.forget(job, attempt)
+
+    def token(self, job: str, attempt: int) -> str:
+        return "token"
+
+    def notice(self, node: SimulatedNode) -> None:
+        """A node's connection may have come or gone."""
+        here = self._simulation.hears(node)
+        silent = self.presence.is_silent(node.key)
+        if here and (silent or not self.presence.met(node.key)):
+            self.presence.came(node.key)
+        elif not here and self.presence.met(node.key) and not silent:
+            self.presence.left(node.key)
+        else:
+            return
+        self.changed(node.key[0])

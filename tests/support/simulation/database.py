@@ -1,0 +1,79 @@
+"""A database in memory that fails, or ends its process, at any statement or commit."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from sqlalchemy import StaticPool, create_engine
+
+from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.persistence.session import Database, _read_document
+
+
+class Memory(sqlite3.Connection):
+    """The data, which outlives each process."""
+
+    hook: Callable[[str], None] = staticmethod(lambda _: None)
+    """Called with each statement, and with COMMIT and COMMITTED before and after a commit; raises where that fails."""
+
+    def cursor(self, *_: Any) -> sqlite3.Cursor:
+        return super().cursor(_Cursor)
+
+    def close(self) -> None:
+        """The data stay: SQLAlchemy closes the connection of a process that ends."""
+
+    def commit(self) -> None:
+        self.hook("COMMIT")
+        super().commit()
+        self.hook("COMMITTED")
+
+
+class _Cursor(sqlite3.Cursor):
+    def execute(self, statement: str, *parameters: Any) -> sqlite3.Cursor:
+        assert isinstance(self.connection, Memory)
+        self.connection.hook(statement)
+        return super().execute(statement, *parameters)
+
+
+@cache
+def _template() -> sqlite3.Connection:
+    """A database with all tables, and the queue of the simulated engine."""
+    memory = sqlite3.connect(":memory:", check_same_thread=False)
+    with TemporaryDirectory() as folder:
+        database = Database.at(Path(folder))
+        with database.session() as session:
+            ensure_compute_environments(session, ["simulated"])
+        database.close()
+        file = sqlite3.connect(Path(folder) / "muster.db")
+        file.backup(memory)
+        file.close()
+    return memory
+
+
+def new_memory() -> Memory:
+    """An empty database."""
+    memory = sqlite3.connect(":memory:", check_same_thread=False, factory=Memory)
+    _template().backup(memory)
+    return memory
+
+
+class SimulatedDatabase(Database):
+    """The sessions of one process of the controller."""
+
+    def __init__(self, memory: Memory) -> None:
+        self.committed = self.changed = self.ended = None
+        self._lock = self._file_lock = self._damage = self._file = self._identity = None
+        memory.rollback()  # what a process that was killed has not committed
+        self.engine = create_engine(
+            "sqlite://", creator=lambda: memory, poolclass=StaticPool, json_deserializer=_read_document
+        )
+
+    def close(self) -> None:
+        """The data stay."""
+
+

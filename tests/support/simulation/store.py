@@ -1,0 +1,137 @@
+"""A volume that stalls, fills up, fails, or is not there; and the calls of one process of the controller on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.control.run_store import Progress, RunFacts, RunStore
+from shared_store.epoch import Claim
+from shared_store.layout import Store
+from shared_store.outcomes import Outcome
+
+if TYPE_CHECKING:
+    from tests.support.simulation.run import Simulation
+
+
+@dataclass
+class SimulatedRun:
+    """What the volume holds of a run."""
+
+    description: Mapping[str, Any] | None = None
+    epoch: int = 0
+    iteration: int | None = None
+    """Of its newest checkpoint."""
+    saved: dict[int, float] = field(default_factory=dict)
+    """When each epoch made its newest checkpoint (Unix time [s])."""
+    outcomes: dict[tuple[str, int, int], Outcome] = field(default_factory=dict)
+
+
+@dataclass
+class Volume:
+    """The shared volume, as it is for everybody."""
+
+    runs: dict[str, SimulatedRun] = field(default_factory=dict)
+    stalled: bool = False
+    """Calls do not return."""
+    full: bool = False
+    absent: bool = False
+    """An empty directory is in its place."""
+    failing: bool = False
+
+    def read(self, name: str) -> SimulatedRun:
+        """Raises OSError."""
+        if self.failing:
+            raise OSError(5, "Input/output error")
+        return SimulatedRun() if self.absent else self.runs.get(name, SimulatedRun())
+
+    def write(self, name: str) -> SimulatedRun:
+        """Raises OSError."""
+        if self.full:
+            raise OSError(28, "No space left on device")
+        if self.absent:
+            return SimulatedRun()  # below the mount point: it is lost
+        if self.failing:
+            raise OSError(5, "Input/output error")
+        return self.runs.setdefault(name, SimulatedRun())
+
+
+@dataclass
+class SimulatedPeers:
+    id: str = "controller"
+
+
+class SimulatedRunStore(RunStore):
+    """The calls, with the real rules of what an answer is worth."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        super().__init__(Store("/simulated"), SimulatedPeers(), self._check_volume)  # type: ignore[arg-type]
+        self._simulation = simulation
+
+    def _check_volume(self) -> None:
+        self._wait()
+        if self._simulation.volume.absent:
+            raise OSError("the store is not the one that the database knows")
+
+    def _wait(self) -> None:
+        while self._simulation.volume.stalled:
+            self._simulation.machine.sleep(1.0)
+
+    def examine(self, name: str) -> RunFacts:
+        with self._using(f"read run {name}"):
+            self._wait()
+            run = self._simulation.volume.read(name)
+            return RunFacts(name, run.description is None, run.description, epoch=run.epoch)
+        raise AssertionError
+
+    def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
+        with self._using(f"prepare run {name}"):
+            self._wait()
+            run = self._simulation.volume.write(name)
+            run.description = run.description or description
+            self._simulation.crash("before an epoch")
+            run.epoch = max(run.epoch, after) + 1
+            self._simulation.crash("after an epoch")
+            return run.epoch
+        raise AssertionError
+
+    def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
+        with self._using("read outcomes"):
+            self._wait()
+            found = self._simulation.volume.read(name).outcomes
+            return {node: found[job, attempt, node] for node in nodes if (job, attempt, node) in found}
+        raise AssertionError
+
+    def progress(self, name: str, epoch: int) -> Progress:
+        with self._using(f"read the checkpoints of run {name}"):
+            self._wait()
+            run = self._simulation.volume.read(name)
+            return Progress(run.iteration, run.saved.get(epoch))
+        raise AssertionError
+
+    def release(self, name: str, epoch: int) -> None:
+        """There is no other controller."""
+
+
+class SimulatedDisk:
+    """What the controller's watch on its volumes says, some seconds later than it is so."""
+
+    names = ("store", "database")
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+
+    def start(self) -> None:
+        """Nothing has to be started."""
+
+    def close(self) -> None:
+        """Nothing has to be stopped."""
+
+    def shortage(self, purpose: str | None = None) -> str | None:
+        volume = self._simulation.volume
+        if purpose == "database" or not (volume.stalled or volume.full or volume.absent):
+            return None
+        return "the volume of the store does not answer, is full, or is another one"
+
+
