@@ -159,15 +159,19 @@ class Attempts:
     def advance(self, session: Session, job: Job, attempt: Attempt) -> float:
         """One look at an open attempt; returns the seconds until the next one, if nothing changes. Raises StoreUnavailable."""
         self._happened(session, job, attempt, Due())
+        return self._pause(job, attempt)
+
+    def _pause(self, job: Job, attempt: Attempt) -> float:
+        """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
+        key, memory = (job.id, attempt.number), self._memory(attempt)
         state = self._state(job, attempt)
-        key = (job.id, attempt.number)
-        if (
-            state.phase is not Phase.RUNNING
-            or state.cause_since is not None
-            or any(self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes)
-        ):
+        if state.phase is Phase.LAUNCHING or state.done_since is not None or (state.verdict and memory.stop is None):
             return _SOON
-        if job.timeout is None or attempt.running_since is None:
+        if state.cause_since is not None or any(
+            self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes
+        ):
+            return _CHECK_INTERVAL
+        if job.timeout is None or attempt.running_since is None or state.verdict is not None:
             return _LATER
         return max(0.0, min(_LATER, attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000)) + 0.001
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
 from sqlalchemy import select, update
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.attempts import Attempts
@@ -20,6 +20,7 @@ from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
+from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import RunStore, StoreUnavailable
@@ -86,6 +87,7 @@ class Reconciler:
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
         self._short, self._is_cut_off = False, False
         self.work_queue = WorkQueue()
+        self._loaded = LoadedJobs(database)
         self.clock = clock or Clock()
         self.monitoring = Monitoring()
         self.attempts = Attempts(
@@ -170,11 +172,14 @@ class Reconciler:
             self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), _SETTLED_AT_ONCE):
             self.work_queue.look_again(self._guarded("settle", due[start : start + _SETTLED_AT_ONCE], self._settle))
+        self._loaded.keep(self.work_queue.active())
         self.engine.look()
         for job_id in self.work_queue.take_active(machine.monotonic()):
-            if not self._backoff.waits(("advance", job_id)):
-                self._guarded("advance", [job_id], self._advance)
-            self.work_queue.later(job_id, machine.monotonic() + _SOON)
+            try:
+                if not self._backoff.waits(("advance", job_id)):
+                    self._guarded("advance", [job_id], self._advance)
+            finally:
+                self.work_queue.later(job_id, machine.monotonic() + _SOON)
         self._note_silence()
         self._isolated("scheduling", self._admit)
         self._isolated("clearing away", self._sweep)
@@ -230,12 +235,9 @@ class Reconciler:
         return []
 
     def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
-        with self.database.session() as session:
-            query = select(Job).where(Job.id.in_(ids)).options(selectinload(Job.attempts))
-            jobs = {job.id: job for job in session.scalars(query)}
-            for job_id in ids:
-                if job_id in jobs:
-                    body(session, jobs[job_id])
+        with self._loaded.session() as session:
+            for job in self._loaded.jobs(session, ids).values():
+                body(session, job)
 
     def _failed(self, what: str, job_id: str, error: Exception) -> None:
         """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
@@ -246,6 +248,7 @@ class Reconciler:
             with self.database.session() as session:  # by its id alone: its row may be what is damaged
                 told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
                 session.execute(told)
+            self._loaded.changed([job_id])
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:
@@ -261,6 +264,7 @@ class Reconciler:
 
     def _look_again(self, ids: Collection[str]) -> None:
         """Try failed actions on these jobs at once, since requests have changed the jobs."""
+        self._loaded.changed(ids)
         for job_id in ids:
             for what in ("settle", "advance", "cancel", "preempt", "start"):
                 self._backoff.hurry((what, job_id))

@@ -111,11 +111,20 @@ class Database:
         Raises DatabaseError where the database can't be used, also after a commit into a file that is gone: what was written there
         must not be acknowledged.
         """
+        with self.open() as session, self.using(session):
+            yield session
+
+    def open(self) -> Session:
+        """A session for :meth:`using`; to be closed by the caller."""
+        return _Session(self.engine, expire_on_commit=False, info={"database": self})
+
+    @contextmanager
+    def using(self, session: Session) -> Iterator[None]:
+        """A block that uses an open session, as :meth:`session` says."""
         self.check()
         try:
-            with _Session(self.engine, expire_on_commit=False, info={"database": self}) as session:
-                yield session
-                session.commit()
+            yield
+            session.commit()
         except DBAPIError as error:
             if _is_damaged(error):
                 self._damage = _explain(self._shown, error)

@@ -75,5 +75,3 @@ class SimulatedDatabase(Database):
 
     def close(self) -> None:
         """The data stay."""
-
-

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from random import Random
 from typing import Any
-
 
 from orchestrator import machine as seam
 from orchestrator.control.presence import LOST_AFTER
@@ -96,6 +96,7 @@ class Simulation:
         self._crash_in: int | None = None
         """How many more writes the process survives."""
         self._next_tick = 0.0
+        self._committed = False
         self._jobs = [self._draw_job(index) for index in range(jobs)]
         self._faults = faults
 
@@ -130,7 +131,11 @@ class Simulation:
 
     def _step(self) -> None:
         self.machine.step()
-        if self.reconciler is not None and self.reconciler._wake.is_set() and self._next_tick > self.machine.time + 0.02:
+        if (
+            self.reconciler is not None
+            and self.reconciler._wake.is_set()
+            and self._next_tick > self.machine.time + 0.02
+        ):
             self._next_tick = self.machine.time + 0.02
             self._schedule_tick()
 
@@ -198,8 +203,7 @@ class Simulation:
                 raise Crash(where)
 
     def _on_statement(self, statement: str) -> None:
-        import sqlite3
-
+        self._committed |= statement == "COMMITTED"
         if statement[:6] not in ("SELECT", "PRAGMA"):
             self.crash(f"at {statement[:30]}")
         if self.database_down:
@@ -336,14 +340,18 @@ class Simulation:
             self.machine.after(5.0, lambda: self._finish(node, code, tries))
             return
         run = self.volume.runs.get(node.gang.run)
-        can_write = run is not None and not (self.volume.full or self.volume.absent or self.volume.failing or self.volume.stalled)
+        can_write = run is not None and not (
+            self.volume.full or self.volume.absent or self.volume.failing or self.volume.stalled
+        )
         if not can_write and tries and not node.asked:
             self.machine.after(1.0, lambda: self._finish(node, code, tries - 1))
             return
         gang = node.gang
         if can_write and run is not None:
             wall = self.machine.wall()
-            outcome = Outcome(node.index, gang.epoch, code, None, f"exit {code}", None, wall - 1, wall, asked=node.asked)
+            outcome = Outcome(
+                node.index, gang.epoch, code, None, f"exit {code}", None, wall - 1, wall, asked=node.asked
+            )
             run.outcomes[gang.job, gang.attempt, node.index] = outcome
         node.alive, node.exit_code = False, code
         if node.index == 0 and not node.asked:
@@ -400,7 +408,15 @@ class Simulation:
     def _draw_fault(self) -> Callable[[], None]:
         kinds: Sequence[Callable[[], None]] = (
             *(self._crash_soon, self._crash_soon, self._partition, self._engine_outage, self._bus_outage),
-            *(self._database_outage, self._freeze, self._isolate, self._lose_host, self._stall, self._fill, self._vanish),
+            *(
+                self._database_outage,
+                self._freeze,
+                self._isolate,
+                self._lose_host,
+                self._stall,
+                self._fill,
+                self._vanish,
+            ),
             *(self._fail_volume, self._move, self._step_clock, self._kill_node),
         )
         return self.rng.choice(kinds)
@@ -532,17 +548,23 @@ class Simulation:
 
     def _look(self) -> None:
         """What a user sees now."""
+        if not self._committed:
+            return
+        self._committed = False
+        rows = {row[0]: row[1:] for row in self.memory.execute("SELECT id, status, status_reason FROM jobs").fetchall()}
         for job in self._jobs:
-            if not job.id or job.final:
+            if not job.id:
                 continue
-            row = self._row(job)
-            if row is None:
+            if job.id not in rows:
                 raise Violation(f"{job.name} was acknowledged, and is lost")
-            if not row.status_reason and row.status != Status.SUBMITTED:
-                raise Violation(f"{job.name} is {row.status} and does not say why")
-            if row.status in TERMINAL:
-                job.final = row.status
-                self._check_end(job, row.status, row.status_reason)
+            status, reason = rows[job.id]
+            if job.final and status != job.final:
+                raise Violation(f"{job.name} was {job.final}, and is {status} ({reason})")
+            if not reason and status != Status.SUBMITTED:
+                raise Violation(f"{job.name} is {status} and does not say why")
+            if status in TERMINAL and not job.final:
+                job.final = status
+                self._check_end(job, status, reason)
 
     def _check_end(self, job: SimulatedJob, status: str, reason: str) -> None:
         """An end is the true end."""
@@ -556,9 +578,7 @@ class Simulation:
 
     def _check_attempts(self, job: SimulatedJob, reason: str) -> None:
         """A job that failed has spent its attempts, each for a cause."""
-        spent = self.memory.execute(
-            "SELECT count(*) FROM attempts WHERE job_id = ? AND spent", (job.id,)
-        ).fetchone()[0]
+        spent = self.memory.execute("SELECT count(*) FROM attempts WHERE job_id = ? AND spent", (job.id,)).fetchone()[0]
         if spent < job.attempts:
             raise Violation(f"{job.name} is FAILED ({reason}) after {spent} of {job.attempts} attempts")
 
@@ -571,5 +591,3 @@ def simulate(seed: int, jobs: int = JOBS, faults: int = FAULTS) -> Simulation:
     except Violation as violation:
         raise Violation(f"seed {seed}: {violation}\n" + "\n".join(simulation.story)) from None
     return simulation
-
-

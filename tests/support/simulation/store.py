@@ -133,5 +133,3 @@ class SimulatedDisk:
         if purpose == "database" or not (volume.stalled or volume.full or volume.absent):
             return None
         return "the volume of the store does not answer, is full, or is another one"
-
-
