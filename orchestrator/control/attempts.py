@@ -22,14 +22,16 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
 from orchestrator.control.endings import node_end
 from orchestrator.control.monitoring import Monitoring
-from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
+from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
 from orchestrator.domain.attempt import (
+    FINISHING,
     AwaitCause,
     AwaitChildren,
     Close,
     Decide,
+    Delayed,
     Due,
     Event,
     Explain,
@@ -52,7 +54,6 @@ from orchestrator.domain.attempt import (
     Silence,
     State,
     Stop,
-    StopDelayed,
     TakeEpoch,
     Terms,
     WindUp,
@@ -81,8 +82,8 @@ _STOPPERS = 128
 """Threads for stops: each waits for its gang's grace time."""
 _CHECK_INTERVAL = 5.0
 """Seconds between two looks for the outcomes of nodes that can't be seen or heard."""
-_SOON, _LATER = 1.0, 60.0
-"""Seconds until the next look at an attempt that waits for something, and at one that runs and has not changed."""
+_LEAST, _LATER = 0.02, 60.0
+"""Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
 _STOP_AGAIN, _STOP_RARELY = 2.0, 30.0
 """Seconds until another try to stop a gang that could not be stopped: at first, and at most."""
 
@@ -157,7 +158,7 @@ class Attempts:
         self._happened(session, job, attempt, Due())
 
     def advance(self, session: Session, job: Job, attempt: Attempt) -> float:
-        """One look at an open attempt; returns the seconds until the next one, if nothing changes. Raises StoreUnavailable."""
+        """One look at an open attempt; returns the seconds until the next one, if nothing changes."""
         self._happened(session, job, attempt, Due())
         return self._pause(job, attempt)
 
@@ -165,15 +166,25 @@ class Attempts:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
         key, memory = (job.id, attempt.number), self._memory(attempt)
         state = self._state(job, attempt)
-        if state.phase is Phase.LAUNCHING or state.done_since is not None or (state.verdict and memory.stop is None):
-            return _SOON
-        if state.cause_since is not None or any(
+        if state.phase is Phase.LAUNCHING:
+            pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
+        elif self._errands.trouble(key):
+            pause = self._errands.pause(key)
+        elif memory.stop is not None or memory.stopped is not None:
+            pause = _LATER
+        elif state.done_since is not None:
+            pause = (state.done_since + FINISHING - self.clock.now()) / 1000
+        elif state.verdict is not None:
+            pause = self._denied.pause(key)
+        elif state.cause_since is not None or any(
             self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes
         ):
-            return _CHECK_INTERVAL
-        if job.timeout is None or attempt.running_since is None or state.verdict is not None:
-            return _LATER
-        return max(0.0, min(_LATER, attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000)) + 0.001
+            pause = _CHECK_INTERVAL
+        elif job.timeout is not None and attempt.running_since is not None:
+            pause = attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000
+        else:
+            pause = _LATER
+        return min(max(pause, 0.0) + _LEAST, _LATER)
 
     def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
         """Have an open attempt end in favour of another job."""
@@ -250,14 +261,14 @@ class Attempts:
                 self._close(session, job, attempt, instruction)
         return None
 
-    def _prepare(self, session: Session, job: Job, attempt: Attempt) -> Prepared | PrepareRefused | None:
-        """Look at the run, record its owner, then take it. Raises StoreUnavailable."""
+    def _prepare(self, session: Session, job: Job, attempt: Attempt) -> Prepared | PrepareRefused | Delayed | None:
+        """Look at the run, record its owner, then take it."""
         memory, key = self._memory(attempt), (job.id, attempt.number)
         try:
             if memory.run is None:
                 memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run))
             if (run := memory.run) is None:
-                return None
+                return self._delayed(key)
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
             known = list(session.scalars(select(Attempt.epoch).join(Job).where(Job.run == job.run)))
             if run.epoch not in known and run.writer:
@@ -269,12 +280,16 @@ class Attempts:
             claim = Claim(self.runs.peers.id, job.id, attempt.number)
             taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim)
             epoch = self._errands.result(key, "claim", taking)
-        except StoreUnavailable:
-            memory.run = None
-            raise
         except (RunRefused, ValueError) as error:
             return PrepareRefused(str(error))
-        return None if epoch is None else Prepared(epoch)
+        if epoch is not None:
+            return Prepared(epoch)
+        if (delayed := self._delayed(key)) is not None:
+            memory.run = None  # whoever took it meanwhile is found by another look
+        return delayed
+
+    def _delayed(self, key: Key) -> Delayed | None:
+        return Delayed(trouble) if (trouble := self._errands.trouble(key)) else None
 
     def _launch(self, session: Session, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:
@@ -323,13 +338,13 @@ class Attempts:
             options=engine_options(session, attempt.environment, job.queue),
         )
 
-    def _observe(self, job: Job, attempt: Attempt) -> Observed | None:
+    def _observe(self, job: Job, attempt: Attempt) -> Observed | Delayed | None:
         assert attempt.handle is not None
         status = self.engine.observe(attempt.handle)
         if status is None:
             return None  # the engine's first look is under way
         if not self._know_outcomes(job, attempt, status):
-            return None
+            return self._delayed((job.id, attempt.number))
         ends = self._ends(job, attempt, status)
         head = status[job.gang.main]
         return Observed(
@@ -356,7 +371,7 @@ class Attempts:
     def _know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
 
-        Returns whether those of the nodes that have ended are known. Raises StoreUnavailable.
+        Returns whether those of the nodes that have ended are known.
         """
         memory, presence, moment = self._memory(attempt), self.bus.presence, machine.monotonic()
         ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
@@ -374,12 +389,10 @@ class Attempts:
         memory.asked = memory.asked or (moment, [*ended, *hidden])
         began, nodes = memory.asked
         reading = partial(self.runs.outcomes, job.run, job.id, attempt.number, nodes)
-        try:
-            found = self._errands.result((job.id, attempt.number), "outcomes", reading)
-        except StoreUnavailable:
-            memory.asked = None
-            raise
+        found = self._errands.result((job.id, attempt.number), "outcomes", reading)
         if found is None:
+            if self._errands.trouble((job.id, attempt.number)):
+                memory.asked = None
             return not ended
         memory.asked, memory.checked = None, began
         memory.outcomes |= {index: found.get(index) for index in nodes if index in ended or index in found}
@@ -416,7 +429,7 @@ class Attempts:
             array.started_at = job.started_at
         job.move(Status.RUNNING, reason)
 
-    def _stop(self, job: Job, attempt: Attempt, grace: float) -> Gone | StopDelayed | None:
+    def _stop(self, job: Job, attempt: Attempt, grace: float) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
         key, memory = (job.id, attempt.number), self._memory(attempt)
         if memory.stopped is not None:
@@ -436,21 +449,21 @@ class Attempts:
             expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
             self._denied.failed(key, f"job {job.id}: {said}", None if expected else error)
         said_last = self._denied.said(key)
-        return StopDelayed(said_last.removeprefix(f"job {job.id}: ")) if said_last else None
+        return Delayed(said_last.removeprefix(f"job {job.id}: ")) if said_last else None
 
     def _stop_returned(self, job: str, _: object) -> None:
         self.changed(job)
 
-    def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | None:
-        """Read what the gang has left, once nothing of it runs any more; None until it is known. Raises StoreUnavailable."""
-        memory = self._memory(attempt)
+    def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
+        """Read what the gang has left, once nothing of it runs any more; None until it is known."""
+        memory, key = self._memory(attempt), (job.id, attempt.number)
         if not self._know_outcomes(job, attempt, status):
-            return None
+            return self._delayed(key)
         if memory.progress is None:
             reading = partial(self.runs.progress, job.run, attempt.epoch)
-            memory.progress = self._errands.result((job.id, attempt.number), "progress", reading)
+            memory.progress = self._errands.result(key, "progress", reading)
         if memory.progress is None:
-            return None
+            return self._delayed(key)
         iteration = memory.progress.iteration
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
         return Gone(self.clock.now(), self._ends(job, attempt, status), progress)

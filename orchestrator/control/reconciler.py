@@ -23,7 +23,7 @@ from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
-from orchestrator.control.run_store import RunStore, StoreUnavailable
+from orchestrator.control.run_store import RunStore
 from orchestrator.control.snapshot import open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
@@ -241,10 +241,9 @@ class Reconciler:
 
     def _failed(self, what: str, job_id: str, error: Exception) -> None:
         """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
-        expected = isinstance(error, StoreUnavailable)
-        reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
+        reason = f"the controller failed on this job ({_words(error)}); trying again"
         reason = excerpt(storable(reason), LONGEST_REASON)
-        if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", None if expected else error):
+        if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", error):
             with self.database.session() as session:  # by its id alone: its row may be what is damaged
                 told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
                 session.execute(told)

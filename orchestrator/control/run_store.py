@@ -6,19 +6,24 @@ controller knows, after it was read.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from math import inf
 from typing import Any, TypeVar
 
 from orchestrator.control.peers import Peers
+from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.machine import Pool
 from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
 from shared_store.files import DamagedFile
 from shared_store.layout import Store, StoreError
 from shared_store.outcomes import Outcome, read_outcome
+
+log = logging.getLogger("muster.controller")
 
 T = TypeVar("T")
 Key = tuple[str, int]
@@ -136,26 +141,42 @@ class Errands:
         """``changed``: called, on any thread, with the job whose result is there."""
         self._pool, self._changed = pool, changed
         self._under_way: dict[Key, tuple[str, Future[Any]]] = {}
+        self._failing = Backoff(log)
 
     def result(self, key: Key, name: str, body: Callable[[], T]) -> T | None:
-        """The result of ``body``, once; None until it is there, and at first, when it is started. Raises what it raised.
+        """The result of ``body``, once; None until it is there. Where it raises StoreUnavailable, it is called again later.
 
         ``name``: tells the errands of an attempt apart; another one that is under way is waited for, and its result dropped.
+        Raises what else ``body`` raised.
         """
         under_way = self._under_way.get(key)
-        if under_way is not None:
-            started, future = under_way
-            if not future.done():
-                return None
-            del self._under_way[key]
-            if started == name:
-                result: T = future.result()
-                return result
-        future = self._pool.submit(body)
-        self._under_way[key] = name, future
-        future.add_done_callback(lambda _: self._changed(key[0]))
-        return None
+        if under_way is None:
+            if not self._failing.waits(key):
+                future = self._pool.submit(body)
+                self._under_way[key] = name, future
+                future.add_done_callback(lambda _: self._changed(key[0]))
+            return None
+        started, future = under_way
+        if not future.done():
+            return None
+        del self._under_way[key]
+        try:
+            result: T = future.result()
+        except StoreUnavailable as error:
+            self._failing.failed(key, f"job {key[0]}: {error}")
+            return None
+        self._failing.worked(key)
+        return result if started == name else self.result(key, name, body)
+
+    def trouble(self, key: Key) -> str | None:
+        """Why the store could not be used for the attempt the last time; None where it could."""
+        return said.removeprefix(f"job {key[0]}: ") if (said := self._failing.said(key)) else None
+
+    def pause(self, key: Key) -> float:
+        """Seconds until the store is tried again for the attempt; infinity while a call is under way."""
+        return inf if key in self._under_way else self._failing.pause(key)
 
     def forget(self, key: Key) -> None:
         """The attempt is closed."""
         self._under_way.pop(key, None)
+        self._failing.worked(key)

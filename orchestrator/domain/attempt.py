@@ -194,8 +194,8 @@ class Observed:
 
 
 @dataclass(frozen=True)
-class StopDelayed:
-    """The gang can't be stopped now; the engine is asked again."""
+class Delayed:
+    """The store can't be used now, or the gang can't be stopped; that is tried again."""
 
     reason: str
 
@@ -213,16 +213,7 @@ class Gone:
 
 
 Event = (
-    Due
-    | Prepared
-    | PrepareRefused
-    | Launched
-    | LaunchDelayed
-    | LaunchRefused
-    | Preempted
-    | Observed
-    | StopDelayed
-    | Gone
+    Due | Prepared | PrepareRefused | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | Delayed | Gone
 )
 
 
@@ -231,7 +222,7 @@ Event = (
 
 @dataclass(frozen=True)
 class Prepare:
-    """Create the run where it is missing, and give it to the attempt: → Prepared or PrepareRefused, or nothing yet."""
+    """Create the run where it is missing, and give it to the attempt: → Prepared, PrepareRefused or Delayed, or nothing yet."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +249,7 @@ class Keep:
 
 @dataclass(frozen=True)
 class Observe:
-    """Look at the gang: → Observed, or nothing before the engine's first look."""
+    """Look at the gang: → Observed or Delayed, or nothing before the engine's first look."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +295,7 @@ class Save:
 
 @dataclass(frozen=True)
 class Stop:
-    """Have the gang stopped, with this grace time [s], unless that is under way: → StopDelayed, Gone, or nothing yet."""
+    """Have the gang stopped, with this grace time [s], unless that is under way: → Delayed, Gone, or nothing yet."""
 
     grace: float
 
@@ -381,7 +372,7 @@ def step(state: State, event: Event) -> Instructions:
             return (Observe(),)
         case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Observed():
             return _observed(state, event)
-        case Phase.ENDING, StopDelayed(reason):
+        case _, Delayed(reason):
             return (Explain(reason),)
         case _, Gone() if state.verdict is not None:
             return (_close(state, state.verdict, event),)

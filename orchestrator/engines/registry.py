@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 from orchestrator import machine
@@ -146,6 +147,11 @@ class EngineSet:
             again: Whether to try again where the last try has left nothing.
         """
         return self._runner(engine_of(hosts[0])).launch(gang, plan, again).text()
+
+    def launch_pause(self, gang: str, host: str) -> float:
+        """Seconds until the launch of a gang may be tried again; infinity while it is under way."""
+        runner = self._runners.get(engine_of(host))
+        return inf if runner is None else runner.launch_pause(gang)
 
     def observe(self, handle: str) -> GangStatus | None:
         """The newest picture of a gang; None before the first. Does not wait, and raises nothing.

@@ -13,6 +13,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from math import inf
 from typing import Any, TypeVar
 
 from orchestrator import machine
@@ -173,6 +174,10 @@ class Runner:
         except NotYet as error:
             self._refused[gang] = error
             raise
+
+    def launch_pause(self, gang: str) -> float:
+        """Seconds until the launch of a gang may be tried again; infinity while it is under way."""
+        return inf if gang in self._launches else self._backoff.pause(("launch", gang))
 
     def observe(self, handle: Handle) -> GangStatus | None:
         """The newest status of a gang, of which :meth:`look` asks for newer ones from now on; None before the first.

@@ -52,6 +52,11 @@ class Backoff:
         trouble = self._troubles.get(subject)
         return trouble is not None and machine.monotonic() < trouble.next
 
+    def pause(self, subject: Hashable) -> float:
+        """Seconds until the next try of a subject; 0 where it may be tried now."""
+        trouble = self._troubles.get(subject)
+        return max(0.0, trouble.next - machine.monotonic()) if trouble else 0.0
+
     def said(self, subject: Hashable) -> str | None:
         """The last failure; None where the subject works."""
         trouble = self._troubles.get(subject)

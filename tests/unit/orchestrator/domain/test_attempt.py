@@ -39,7 +39,7 @@ from orchestrator.domain.attempt import (
     Silence,
     State,
     Stop,
-    StopDelayed,
+    Delayed,
     TakeEpoch,
     Terms,
     WindUp,
@@ -228,8 +228,8 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         seen(stale="Slurm to answer"),
         [Explain("why; waits for Slurm to answer"), Stop(5.0)],
     ),
-    "a stop that fails is told": (ending(Ending.FAILED), StopDelayed("not allowed"), [Explain("not allowed")]),
-    "but not of a gang that runs": (RUNNING, StopDelayed("not allowed"), []),
+    "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [Explain("not allowed")]),
+    "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [Explain("the store is away")]),
     "a gang does not go before its end is decided": (RUNNING, Gone(T, MAIN_LAST, ""), []),
 }
 
@@ -313,7 +313,7 @@ EVENTS = (
         Preempted("why"),
         seen(),
     ),
-    *(StopDelayed("why"), Gone(T, MAIN_LAST, "")),
+    *(Delayed("why"), Gone(T, MAIN_LAST, "")),
 )
 
 

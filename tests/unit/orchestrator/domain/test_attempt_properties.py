@@ -31,7 +31,7 @@ prepares = st.one_of(prepared, prepared, prepared, st.none(), st.just(attempt.Pr
 launches = st.one_of(*[st.just(attempt.Launched("handle"))] * 4, delays, st.just(attempt.LaunchRefused("refused")))
 looks = st.builds(attempt.Observed, moments, both, silences, words, words, words)
 gone = st.builds(attempt.Gone, moments, both | st.just([]), words)
-stops = st.one_of(gone, gone, gone, st.none(), st.just(attempt.StopDelayed("not allowed")))
+stops = st.one_of(gone, gone, gone, st.none(), st.just(attempt.Delayed("not allowed")))
 
 
 @dataclass(frozen=True)
