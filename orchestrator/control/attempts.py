@@ -168,8 +168,8 @@ class Attempts:
         state = self._state(job, attempt)
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
-        elif self._errands.trouble(key):
-            pause = self._errands.pause(key)
+        elif (waits := self._errands.pause(key)) > 0:
+            pause = waits
         elif memory.stop is not None or memory.stopped is not None:
             pause = _LATER
         elif state.done_since is not None:

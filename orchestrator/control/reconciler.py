@@ -24,7 +24,7 @@ from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import RunStore
-from orchestrator.control.snapshot import open_attempts, take_snapshot
+from orchestrator.control.snapshot import holding_of, open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
@@ -47,8 +47,8 @@ _SETTLED_A_TICK = 1000
 """The same in one pass: a large array that ends must not delay the looks at running gangs."""
 _GATHERING = 0.02
 """Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
-_PASS_INTERVAL = 1.0
-"""Seconds between scheduling passes while nothing changes: shares decay and limits run out by themselves."""
+_PASS_INTERVAL, _LONGEST_PASS_INTERVAL = 1.0, 16.0
+"""Seconds between scheduling passes while nothing changes, at first and at most: shares decay and limits run out by themselves."""
 _PASS_SHARE = 0.2
 """Share of one CPU that passes may take."""
 _WITHOUT_DATABASE = 1.0
@@ -102,6 +102,7 @@ class Reconciler:
         self._report: WaitReport | None = None
         self._leading: Mapping[str, Leading] = {}
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
+        self._pass_interval = _PASS_INTERVAL
         self._swept = self._kept = 0.0
         self._wake, self._ending = threading.Event(), threading.Event()
         self._ticking: int | None = None
@@ -129,7 +130,10 @@ class Reconciler:
 
     def _gang_changed(self, gang: str) -> None:
         """Look at a gang now, by its name or that of its job; empty: what an engine has, changed."""
-        self.work_queue.hurry(gang.partition("/")[0])
+        if gang:
+            self.work_queue.hurry(gang.partition("/")[0])
+        else:
+            self.work_queue.version += 1  # a pass depends on it
         self.wake()
 
     def close(self) -> None:
@@ -286,8 +290,10 @@ class Reconciler:
         version, at, took = self._passed
         pause = took / _PASS_SHARE
         idle = machine.monotonic() - at
-        if idle < pause or (version == self.work_queue.version and idle < _PASS_INTERVAL):
+        if idle < pause or (version == self.work_queue.version and idle < self._pass_interval):
             return
+        same = version == self.work_queue.version
+        self._pass_interval = min(2 * self._pass_interval, _LONGEST_PASS_INTERVAL) if same else _PASS_INTERVAL
         started, version = machine.monotonic(), self.work_queue.version
         waiting = self.work_queue.waiting()
         if self._backoff:  # seldom: there may be very many of them
@@ -296,13 +302,14 @@ class Reconciler:
             self._report, self._passed = None, (version, started, 0.0)
             return
         unknown = self.engine.unknown()  # before the capacity: an engine may tell it in between
-        with self.database.session() as session:
+        with self._loaded.session() as session:
+            holding = holding_of(self._loaded.jobs(session, self.work_queue.active()).values())
             snapshot = take_snapshot(
                 session,
                 self.clock,
                 self.engine.capacity(),
                 waiting,
-                self.work_queue.active(),
+                holding,
                 self._leading,
                 self.engine.names[0],
                 unknown,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
@@ -41,7 +41,7 @@ def take_snapshot(
     clock: Clock,
     capacities: Mapping[str, Capacity],
     waiting: Sequence[Waiting],
-    active: Sequence[str],
+    holding: Sequence[tuple[Job, Attempt]],
     leading: Mapping[str, Leading] | None = None,
     first: str = "local",
     unknown: Mapping[str, str] | None = None,
@@ -53,7 +53,7 @@ def take_snapshot(
         clock: Tells what time it is.
         capacities: All that the engines have, by their names.
         waiting: The jobs that wait for room.
-        active: Ids of the jobs that may hold some.
+        holding: The jobs whose gang holds some, with that attempt.
         leading: The job that the last pass found at the head of each queue.
         first: The controller's first engine.
         unknown: Why an engine has not told what it has, by name; asked for before ``capacities``, which count.
@@ -65,7 +65,6 @@ def take_snapshot(
         each.name: read_compute_environment(each, first, unknown)
         for each in session.scalars(select(models.ComputeEnvironment))
     }
-    holding = open_attempts(session, active)
     # what runs on an engine that queues by itself takes nothing away from what is handed to it
     queueing = {name for name, capacity in capacities.items() if isinstance(capacity, Queued)}
     counted = [(job, attempt) for job, attempt in holding if engine_of(attempt.nodes[0].host) not in queueing]
@@ -89,13 +88,13 @@ def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Atte
     for start in range(0, len(jobs), _LOADED_AT_ONCE):
         some = select(Job).where(Job.id.in_(jobs[start : start + _LOADED_AT_ONCE])).options(selectinload(Job.attempts))
         known |= {job.id: job for job in session.scalars(some)}
-    found = []
-    for job_id in jobs:
-        job = known.get(job_id)
-        # a damaged row has no nodes: what it holds is not known, and the controller says so of the job
-        if job is not None and (attempt := job.open_attempt) is not None and attempt.nodes:
-            found.append((job, attempt))
-    return found
+    return holding_of(known[job_id] for job_id in jobs if job_id in known)
+
+
+def holding_of(jobs: Iterable[Job]) -> list[tuple[Job, Attempt]]:
+    """Those of these jobs whose gang exists or may exist, with that attempt."""
+    # a damaged row has no nodes: what it holds is not known, and the controller says so of the job
+    return [(job, attempt) for job in jobs if (attempt := job.open_attempt) is not None and attempt.nodes]
 
 
 def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:

@@ -78,7 +78,7 @@ class Runner:
         """By gang: launches whose end has not been collected."""
         self._refused: dict[str, NotYet] = {}
         """By gang: what its last launch has to wait for."""
-        self._observed: set[Handle] = set()
+        self._observed: dict[Handle, None] = {}
         """Handles of the gangs whose status the controller wants."""
         self._looks: set[Handle] = set()
         """Those that are being looked at."""
@@ -186,7 +186,7 @@ class Runner:
         """
         subject = ("look", handle)
         if handle not in self._observed:
-            self._observed.add(handle)
+            self._observed[handle] = None
             self.look([handle])
         seen, _ = self._seen.get(handle, (None, 0.0))
         if trouble := self.silence or self._backoff.said(subject):
@@ -224,7 +224,7 @@ class Runner:
         with self._lock:
             self._refused.pop(gang, None)
             if handle is not None:
-                self._observed.discard(handle)
+                self._observed.pop(handle, None)
                 self._seen.pop(handle, None)
         self._backoff.worked(("launch", gang))
         self._backoff.worked(("look", handle))

@@ -6,14 +6,25 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from orchestrator.domain.hosts import Capacity, Host, Hosts
-from orchestrator.engines.api import Cause, Gang, GangStatus, Handle, NodePhase, NodeStatus, Plan, Traits, node_plans
+from orchestrator.engines.api import (
+    Cause,
+    Gang,
+    GangStatus,
+    Handle,
+    NodePhase,
+    NodeStatus,
+    NotYet,
+    Plan,
+    Traits,
+    node_plans,
+)
 from orchestrator.engines.toolkit.endings import ended
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
 
-HOSTS = 12
-CORES = 4.0
+HOSTS = 6
+CORES = 2.0
 
 
 @dataclass
@@ -84,6 +95,8 @@ class SimulatedEngine:
     def launch(self, plan: Plan[Gang]) -> Handle:
         self._reach()
         gang = plan.request
+        if self._simulation.pulls(gang):
+            raise NotYet("pulling the image")
         self._simulation.crash("before a launch")
         self._simulation.launch(gang)
         self._simulation.crash("after a launch")

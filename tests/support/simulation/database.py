@@ -12,6 +12,7 @@ from typing import Any
 from sqlalchemy import StaticPool, create_engine
 
 from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database, _read_document
 
 
@@ -48,6 +49,7 @@ def _template() -> sqlite3.Connection:
         database = Database.at(Path(folder))
         with database.session() as session:
             ensure_compute_environments(session, ["simulated"])
+            session.add(JobQueue(name="urgent", priority=10, compute_environments=["simulated"]))
         database.close()
         file = sqlite3.connect(Path(folder) / "muster.db")
         file.backup(memory)

@@ -19,6 +19,10 @@ class Crash(BaseException):
     """The controller's process is killed at this point."""
 
 
+class LoopWaits(BaseException):
+    """The controller's loop waits for a call."""
+
+
 class SimulatedMachine(Machine):
     """Clocks, events in the order of their times, and pools whose calls are events."""
 
@@ -61,8 +65,10 @@ class SimulatedMachine(Machine):
         body()
 
     def sleep(self, seconds: float) -> None:
-        """Let the present call take so long. On a pool's greenlet alone."""
+        """Let the present call take so long. Raises LoopWaits where the loop itself makes it."""
         current = greenlet.getcurrent()
+        if current is self._hub:
+            raise LoopWaits
         self.after(seconds, current.switch)
         self._hub.switch()
 

@@ -25,7 +25,7 @@ from shared_store.outcomes import EX_TEMPFAIL, Outcome
 from tests.support.simulation.bus import SimulatedBus
 from tests.support.simulation.cluster import SimulatedEngine, SimulatedGang, SimulatedNode
 from tests.support.simulation.database import SimulatedDatabase, new_memory
-from tests.support.simulation.machine import Crash, SimulatedMachine
+from tests.support.simulation.machine import Crash, LoopWaits, SimulatedMachine
 from tests.support.simulation.store import SimulatedDisk, SimulatedRunStore, Volume
 
 JOBS = 50
@@ -58,6 +58,10 @@ class SimulatedJob:
     """Seconds of an attempt after which it fails by itself, by attempt."""
     attempts: int
     timeout: int | None
+    urgent: bool
+    """It is in a queue that preempts."""
+    pulling: float
+    """Seconds for which its image is pulled before it can be launched."""
     id: str = ""
     """Once its submission was acknowledged."""
     stop_asked: bool = False
@@ -71,7 +75,13 @@ class SimulatedJob:
 
 @cache
 def _definition(nodes: int) -> dict[str, Any]:
-    document = {"name": "job", "nodes": nodes, "resources": {"cpus": 1, "memory": "16MiB"}, "command": ["true"]}
+    document = {
+        "name": "job",
+        "nodes": nodes,
+        "resources": {"cpus": 1, "memory": "16MiB"},
+        "command": ["true"],
+        "preemptible": True,
+    }
     properties: dict[str, Any] = compile_definition(validate(document, "job"), "/")["nodeProperties"]
     return properties
 
@@ -97,6 +107,9 @@ class Simulation:
         """How many more writes the process survives."""
         self._next_tick = 0.0
         self._committed = False
+        self._pulled: dict[str, int] = {}
+        """The process that asked for each gang first."""
+        self._asked: dict[str, float] = {}
         self._jobs = [self._draw_job(index) for index in range(jobs)]
         self._faults = faults
 
@@ -152,6 +165,8 @@ class Simulation:
         except Crash:
             self._die()
             return
+        except LoopWaits:
+            raise Violation("the loop waits for a call") from None
         self._next_tick = self.machine.time + TICK
         self._schedule_tick()
         self._look()
@@ -220,7 +235,9 @@ class Simulation:
         code = 0 if rng.random() < 0.8 else rng.choice((1, 2))
         breaks = [rng.uniform(1, 200) if rng.random() < 0.2 else 1e9 for _ in range(attempts + 20)]
         timeout = rng.choice((60, 300)) if rng.random() < 0.1 else None
-        return SimulatedJob(f"j{index}", rng.choice((1, 1, 2, 3)), rng.uniform(5, 400), code, breaks, attempts, timeout)
+        pulling = rng.uniform(5, 120) if rng.random() < 0.2 else 0.0
+        work, nodes, urgent = rng.uniform(5, 300), rng.choice((1, 1, 2, 3)), rng.random() < 0.15
+        return SimulatedJob(f"j{index}", nodes, work, code, breaks, attempts, timeout, urgent, pulling)
 
     def _submit(self, job: SimulatedJob) -> None:
         if self.reconciler is None or self.reconciler.trouble is not None:
@@ -231,7 +248,7 @@ class Simulation:
             row = Job(
                 id=f"{self.seed}-{job.name}",
                 name=job.name,
-                queue="default",
+                queue="urgent" if job.urgent else "default",
                 definition="job:1",
                 kind="multinode",
                 request={},
@@ -267,6 +284,12 @@ class Simulation:
 
     # -- nodes --------------------------------------------------------------------------------------------------------
 
+    def pulls(self, gang: Gang) -> bool:
+        """Whether its image is still being pulled: since it was asked for."""
+        self._pulled.setdefault(gang.name, self.machine.process)
+        since = self._asked.setdefault(gang.name, self.machine.time)
+        return gang.name not in self.gangs and self.machine.time - since < self._job(gang.job).pulling
+
     def launch(self, gang: Gang) -> None:
         """What the engine does once for a name."""
         if gang.name in self.gangs:
@@ -274,6 +297,11 @@ class Simulation:
         for other in self.gangs.values():
             if other.run == gang.run and any(self._can_write(node) for node in other.running):
                 raise Violation(f"{gang.name} is launched while {other.name} runs")
+        ending = self.memory.execute(
+            "SELECT ending FROM attempts WHERE job_id = ? AND number = ?", (gang.job, gang.attempt)
+        ).fetchone()[0]
+        if ending is not None and self._pulled.get(gang.name) == self.machine.process:
+            raise Violation(f"{gang.name} is launched, although it is {ending}")
         found = SimulatedGang(gang.name, gang.job, gang.attempt, gang.epoch, gang.run, self.router, self.machine.time)
         found.nodes = [SimulatedNode(found, index, each.host) for index, each in enumerate(gang.placements)]
         self.gangs[gang.name] = found
@@ -354,7 +382,7 @@ class Simulation:
             )
             run.outcomes[gang.job, gang.attempt, node.index] = outcome
         node.alive, node.exit_code = False, code
-        if node.index == 0 and not node.asked:
+        if node.index == 0 and code != EX_TEMPFAIL:
             self._job(gang.job).main_ends.append((gang.attempt, code))
         self._notice(node, 0.2)
         if node.index == 0 and code == 0:
@@ -544,7 +572,12 @@ class Simulation:
         for node in gang.nodes:
             if node.silent_since is not None and self.machine.time - node.silent_since > LOST_AFTER - 5:
                 return
-        raise Violation(f"{gang.name} is ended at {self.machine.time:.1f} without a cause")
+        ending, reason = self.memory.execute(
+            "SELECT ending, status_reason FROM attempts WHERE job_id = ? AND number = ?", (gang.job, gang.attempt)
+        ).fetchone()
+        if ending == "preempted" and not job.urgent:
+            return
+        raise Violation(f"{gang.name} is ended at {self.machine.time:.1f} without a cause: {ending}, {reason}")
 
     def _look(self) -> None:
         """What a user sees now."""
@@ -569,6 +602,8 @@ class Simulation:
     def _check_end(self, job: SimulatedJob, status: str, reason: str) -> None:
         """An end is the true end."""
         succeeded = any(code == 0 for _, code in job.main_ends)
+        if status == Status.SUCCEEDED and job.name not in self.volume.runs:
+            raise Violation(f"{job.name} is SUCCEEDED, and the store does not have its run")
         if status == Status.SUCCEEDED and not succeeded:
             raise Violation(f"{job.name} is SUCCEEDED, and its main node did not end with 0: {job.main_ends}")
         if status == Status.FAILED and succeeded and not job.stop_asked and job.timeout is None:

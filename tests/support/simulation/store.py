@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
 
 
+_NOTICED = 5.0
+"""Seconds after which the controller knows of a volume that can't be used."""
+
+
 @dataclass
 class SimulatedRun:
     """What the volume holds of a run."""
@@ -121,6 +125,8 @@ class SimulatedDisk:
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
+        self._since: float | None = None
+        """Since when a volume can't be used, as far as was looked."""
 
     def start(self) -> None:
         """Nothing has to be started."""
@@ -129,7 +135,9 @@ class SimulatedDisk:
         """Nothing has to be stopped."""
 
     def shortage(self, purpose: str | None = None) -> str | None:
-        volume = self._simulation.volume
-        if purpose == "database" or not (volume.stalled or volume.full or volume.absent):
+        volume, machine = self._simulation.volume, self._simulation.machine
+        bad = volume.stalled or volume.full or volume.absent
+        self._since = (self._since if self._since is not None else machine.time) if bad else None
+        if purpose == "database" or self._since is None or machine.time - self._since < _NOTICED:
             return None
         return "the volume of the store does not answer, is full, or is another one"
