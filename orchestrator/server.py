@@ -30,6 +30,7 @@ from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
 from orchestrator.control.presence import LOST_AFTER, Presence
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.store_identity import recognise
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
@@ -64,6 +65,7 @@ class Server:
         host: str = "127.0.0.1",
         port: int = 0,
         store: str | None = None,
+        adopt_store: bool = False,
         token: str | None = None,
         cpus: float | None = None,
         gpus: Sequence[str] | None = None,
@@ -85,6 +87,7 @@ class Server:
         the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of jobs is kept;
         None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
         first.
+        ``adopt_store``: take what is at the store's path, although the database knows another store.
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
         ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`).
@@ -110,22 +113,30 @@ class Server:
             if store is None:
                 with suppress(OSError):  # said by open()
                     (home / "store").mkdir(mode=0o700)
-            self.store = Store(store or home / "store").open()
+            self.store = Store(store or home / "store")
             try:
                 found = Database(_database_url(database)) if database else Database.at(home)
                 stack.callback(found.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
+                    identity = recognise(session, self.store, adopt_store)
                     ensure_compute_environments(session, nodes.names)
             except (DatabaseError, SecretsError) as error:
                 raise ServerError(str(error)) from None
             self.bus = Bus(home, nodes.addresses, Presence(lost_after))
             stack.callback(self.bus.close)
-            self.peers = Peers(self.store, home)
+            self.peers = Peers(self.store, home, identity.check)
             stack.callback(self.peers.close)
             try:
                 self.reconciler = Reconciler(
-                    found, nodes, self.store, self.bus, self.peers, retention=retention, min_free=min_free
+                    found,
+                    nodes,
+                    self.store,
+                    self.bus,
+                    self.peers,
+                    retention=retention,
+                    min_free=min_free,
+                    identity=identity,
                 )
             except DatabaseError as error:
                 raise ServerError(str(error)) from None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
+import time
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,6 +18,9 @@ FORMAT = 1
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 """Valid names of runs: a name becomes a directory."""
+
+_NAMING_TRIES = 20
+"""Tenths of a second to wait for another controller that is naming the store."""
 
 LARGEST_DESCRIPTION = 128 << 10
 """Bytes of ``run.json`` and of an evaluation, which the API returns."""
@@ -149,17 +154,27 @@ class Store:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         object.__setattr__(self, "path", Path(path).expanduser().absolute())
 
+    def identity(self) -> str | None:
+        """What tells this store from all others; None for a store of an older Muster.
+
+        Raises FileNotFoundError where there is no store, OSError or ValueError where ``store.json`` can't be read.
+        """
+        found = read_json(self.path / "store.json")
+        if found is None:
+            raise FileNotFoundError(f"{self.path / 'store.json'}: no such file")
+        identity = found.get("id")
+        return identity if isinstance(identity, str) and identity else None
+
     def open(self) -> Store:
-        """Create a missing layout and check that it can be written.
+        """Create a missing layout, give the store an identity, and check that it can be written.
 
         Raises StoreError for a path that can't be created or written, or that holds a newer format.
         """
         try:
             (self.path / "runs").mkdir(parents=True, exist_ok=True)
             description = read_json(self.path / "store.json")
-            if description is None:
-                write_json(self.path / "store.json", {"format": FORMAT})
-                description = {"format": FORMAT}
+            if description is None or (description.get("format") == FORMAT and not description.get("id")):
+                description = self._name(description or {"format": FORMAT})
             probe = self.path / "runs" / f".probe-{os.getpid()}"
             probe.write_bytes(b"")
             probe.unlink()
@@ -174,6 +189,26 @@ class Store:
                 f"store {self.path}: has format {description.get('format')}, this Muster reads up to {FORMAT}; upgrade Muster"
             )
         return self
+
+    def _name(self, description: dict[str, Any]) -> dict[str, Any]:
+        """Give the store an identity. Of several controllers that do so at once, the first one's stays."""
+        claim = self.path / ".naming"
+        try:
+            with open(claim, "xb") as file:
+                file.write(secrets.token_hex(16).encode())
+                file.flush()
+                os.fsync(file.fileno())
+        except FileExistsError:
+            pass
+        for _ in range(_NAMING_TRIES):
+            if named := claim.read_bytes().decode():
+                break
+            time.sleep(0.1)
+        else:  # who made it died before it wrote
+            named = secrets.token_hex(16)
+        described = {**description, "id": named}
+        write_json(self.path / "store.json", described)
+        return described
 
     def run(self, name: str) -> Run:
         """The run called ``name``, whether it exists or not. Raises StoreError for a name that can't be a directory."""

@@ -84,6 +84,13 @@ def serve(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free port.")] = 8080,
     store: StoreOption = None,
+    adopt_store: Annotated[
+        bool,
+        typer.Option(
+            "--adopt-store",
+            help="Take what is at the store's path as the store of this controller, which knows another one.",
+        ),
+    ] = False,
     cpus: CpusOption = None,
     engine: EngineOption = None,
     database: Annotated[
@@ -150,6 +157,7 @@ def serve(
         host=host,
         port=port,
         store=store,
+        adopt_store=adopt_store,
         token=os.environ.get("MUSTER_TOKEN"),
         cpus=cpus,
         engines=engine or ("local",),

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import re
 import threading
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+
+from orchestrator import machine
 
 _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _INTERVAL = 0.5
@@ -54,6 +56,7 @@ class _Volume:
     name: str
     path: Path
     short: str | None = None
+    absent: str | None = None
     asked: tuple[float, float] | None = None
     """Start of the look under way, by the monotonic clock [s] and in Unix time [s]."""
 
@@ -61,9 +64,18 @@ class _Volume:
 class Disk:
     """Watches volumes by directories on them. Any thread may ask, and none ever waits for a volume."""
 
-    def __init__(self, volumes: Mapping[str, Path], minimum: MinFree = DEFAULT) -> None:
-        """Look once at each volume. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``."""
+    def __init__(
+        self,
+        volumes: Mapping[str, Path],
+        minimum: MinFree = DEFAULT,
+        checks: Mapping[str, Callable[[], str | None]] | None = None,
+    ) -> None:
+        """Look once at each volume. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``.
+
+        ``checks``: by purpose, what says that another volume is in its place; may hang.
+        """
         self._volumes, self._minimum = [_Volume(*each) for each in volumes.items()], minimum
+        self._checks = checks or {}
         self._ended = threading.Event()
         for volume in self._volumes:
             volume.short = self._look(volume)
@@ -76,7 +88,7 @@ class Disk:
     def start(self) -> None:
         """Look at each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
         for volume in self._volumes:
-            threading.Thread(target=self._watch, args=(volume,), name=f"volume {volume.name}", daemon=True).start()
+            machine.thread(f"volume {volume.name}", partial(self._watch, volume))
 
     def close(self) -> None:
         """Stop looking; a look that hangs is abandoned."""
@@ -88,12 +100,16 @@ class Disk:
         ``purpose``: of the volume for this alone.
         """
         of = (volume for volume in self._volumes if purpose in (None, volume.name))
-        return next((said for volume in of if (said := self._silence(volume) or volume.short)), None)
+        return next((said for volume in of if (said := self._silence(volume) or volume.absent or volume.short)), None)
+
+    def absent(self, purpose: str) -> str | None:
+        """Why the volume of this purpose is not there; None where it is, as far as was seen."""
+        return next((volume.absent for volume in self._volumes if volume.name == purpose), None)
 
     @staticmethod
     def _silence(volume: _Volume) -> str | None:
         asked = volume.asked
-        if asked is None or time.monotonic() - asked[0] < _PATIENCE:
+        if asked is None or machine.monotonic() - asked[0] < _PATIENCE:
             return None
         since = datetime.fromtimestamp(asked[1], UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         return (
@@ -103,11 +119,14 @@ class Disk:
 
     def _watch(self, volume: _Volume) -> None:
         while not self._ended.wait(_INTERVAL):
-            volume.asked = (time.monotonic(), time.time())
+            volume.asked = (machine.monotonic(), machine.wall())
             volume.short = self._look(volume)
             volume.asked = None
 
     def _look(self, volume: _Volume) -> str | None:
+        """How much too little space is free; notes whether another volume is in its place."""
+        check = self._checks.get(volume.name)
+        volume.absent = check() if check else None
         try:
             found = os.statvfs(volume.path)
         except OSError:  # an operation that needs it says so

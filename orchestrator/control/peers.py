@@ -12,10 +12,11 @@ import logging
 import os
 import socket
 import threading
-import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from orchestrator import machine
 from shared_store.epoch import read_claim, read_epoch
 from shared_store.files import read_json, write_json
 from shared_store.layout import NAME, Run, Store
@@ -50,8 +51,9 @@ class Peer:
 class Peers:
     """This controller's heartbeat, in a thread of its own, and those of the others."""
 
-    def __init__(self, store: Store, home: Path) -> None:
-        self.store = store
+    def __init__(self, store: Store, home: Path, check: Callable[[], None] = lambda: None) -> None:
+        """``check``: raises OSError where another volume is in the store's place."""
+        self.store, self._check = store, check
         self.id = hashlib.sha256(f"{socket.gethostname()}\0{home}".encode()).hexdigest()[:16]
         self._home, self._directory = home, store.path / "controllers"
         self._lock = threading.Lock()
@@ -92,7 +94,7 @@ class Peers:
     def _present(self, controller: str) -> Peer | None:
         with self._lock:
             peer, heard = self._seen.get(controller, (None, None))
-        return peer if heard is not None and time.monotonic() - heard < GONE else None
+        return peer if heard is not None and machine.monotonic() - heard < GONE else None
 
     @property
     def _path(self) -> Path:
@@ -105,8 +107,9 @@ class Peers:
     def _look(self) -> None:
         """Leave a heartbeat and read the others'; where the store is unavailable, the next heartbeat makes up for it."""
         self._beat += 1
-        own = Peer(str(self._home), socket.gethostname(), os.getpid(), self._beat, time.time())
+        own = Peer(str(self._home), socket.gethostname(), os.getpid(), self._beat, machine.wall())
         try:
+            self._check()
             write_json(self._path, asdict(own))
             names = [name.removesuffix(".json") for name in os.listdir(self._directory)]
         except OSError:
@@ -129,8 +132,8 @@ class Peers:
             before, heard = self._seen.get(name, (None, None))
             if before == peer:
                 return
-            outdated = before is None and abs(time.time() - peer.time) > _OUTDATED
-            self._seen[name] = peer, None if outdated else time.monotonic()
+            outdated = before is None and abs(machine.wall() - peer.time) > _OUTDATED
+            self._seen[name] = peer, None if outdated else machine.monotonic()
         if outdated:  # left by one that was killed; one that lives writes it again
             with contextlib.suppress(OSError):
                 (self._directory / f"{name}.json").unlink(missing_ok=True)

@@ -25,6 +25,7 @@ from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import RunStore
 from orchestrator.control.snapshot import holding_of, open_attempts, take_snapshot
+from orchestrator.control.store_identity import StoreAbsent, StoreIdentity
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
@@ -75,23 +76,31 @@ class Reconciler:
         retention: float | None = None,
         clock: Clock | None = None,
         min_free: MinFree = DEFAULT,
+        identity: StoreIdentity | None = None,
         runs: RunStore | None = None,
         disk: Disk | None = None,
     ) -> None:
         """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
+        ``identity``: of the store; without it whatever is at its path is the store.
         ``min_free``: free space that the volumes of the store and the database need for something new to start.
         """
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval, self.retention = interval, retention
         volumes = {"store": store.path, "database": database.volume}
-        self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
+        checks = {"store": identity.problem} if identity else {}
+        self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
         self._short, self._is_cut_off = False, False
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
         self.clock = clock or Clock()
         self.monitoring = Monitoring()
         self.attempts = Attempts(
-            engine, runs or RunStore(store, peers), bus, self.clock, self.monitoring, self._gang_changed
+            engine,
+            runs or RunStore(store, peers, *([identity.check] if identity else [])),
+            bus,
+            self.clock,
+            self.monitoring,
+            self._gang_changed,
         )
         self.writing = threading.Lock()
         """Held while something is registered, submitted or changed: checks must still hold at the commit."""
@@ -354,11 +363,13 @@ class Reconciler:
     def check_writable(self, *, adds: bool) -> None:
         """Whether a request may change the database, to which it ``adds`` something or not.
 
-        Raises DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
+        Raises StoreAbsent for an addition while the store is not there, DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
         little room for an addition.
         """
         if (trouble := self.trouble) is not None and (adds or not self._is_full):
             raise DatabaseError(trouble)
+        if adds and (absent := self.disk.absent("store")):
+            raise StoreAbsent(absent)
         if adds and (shortage := self.disk.shortage("database")):
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
 
@@ -368,7 +379,7 @@ class Reconciler:
         if job.status in (Status.STARTING, Status.RUNNING):
             failed = self._backoff.said(("preempt", job.id)) if report and report.preempts(job.id) else None
             said = failed.removeprefix(f"job {job.id}: ") if failed else job.status_reason
-            return f"{said}; {shortage}" if shortage is not None else failed and said
+            return f"{said}; {shortage}" if shortage is not None and shortage not in (said or "") else failed and said
         if job.status != Status.RUNNABLE or self.work_queue.since(job.id) is None:
             return None
         if shortage is not None or report is None:

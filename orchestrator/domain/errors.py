@@ -7,6 +7,10 @@ class ServerError(Exception):
     """A controller can't start; the message says why and what to do."""
 
 
+class Unavailable(Exception):
+    """Something that the controller needs can't be used now; the message says what, why, and what to do."""
+
+
 class UsageError(ServerError):
     """An option or argument can't be used; the message says why and what to give instead."""
 

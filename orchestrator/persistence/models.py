@@ -408,6 +408,15 @@ class ClockState(Base):
     """Wall-clock time less steady time [ms]."""
 
 
+class KnownStore(Base):
+    """The one row of the store that this database belongs to (:mod:`orchestrator.control.store_identity`)."""
+
+    __tablename__ = "store"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    identity: Mapped[str]
+    """As its ``store.json`` has it."""
+
+
 class ShareUsage(Base):
     """A share's use of a queue, decayed to ``as_of`` (steady time [ms])."""
 

@@ -23,6 +23,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.models import Attempt, Job
 from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
 
@@ -36,7 +37,7 @@ _CONTROLLER_LOCK = 0x6D7573746572
 log = logging.getLogger("muster.controller")
 
 
-class DatabaseError(Exception):
+class DatabaseError(Unavailable):
     """The database can't be used; the message says why and what to do."""
 
 

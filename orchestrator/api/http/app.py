@@ -26,6 +26,7 @@ from orchestrator.api.native import routes as native
 from orchestrator.control import monitoring
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
@@ -57,15 +58,15 @@ def create_app(
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _refused_by_database)
-    app.add_exception_handler(DatabaseError, _database_away)
+    app.add_exception_handler(Unavailable, _unavailable)
     app.add_exception_handler(DamagedFile, _damaged_file)
 
     @app.get("/healthz")
     def healthz() -> JSONResponse:
-        """Alive, and which version; 503 with the reason while the database can't be used."""
+        """Alive, and which version; 503 with the reason while the database or the store can't be used."""
         try:
             reconciler.database.check()
-            trouble = reconciler.trouble
+            trouble = reconciler.trouble or reconciler.disk.absent("store")
         except DatabaseError as error:
             trouble = str(error)
         if trouble is not None:
@@ -151,5 +152,5 @@ async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
     return error_response(f"the store holds a damaged file: {error}", 409)
 
 
-async def _database_away(request: Request, error: Exception) -> JSONResponse:
+async def _unavailable(request: Request, error: Exception) -> JSONResponse:
     return error_response(str(error), 503, "ServerException")

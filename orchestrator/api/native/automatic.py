@@ -22,13 +22,12 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import submit
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import AutomaticEvaluation, Job
 from orchestrator.persistence.ownership import is_of_earlier_run
-from orchestrator.persistence.session import DatabaseError
 from orchestrator.spec.evaluations import (
     AUTOMATIC_TAG,
     Counted,
@@ -106,7 +105,7 @@ class AutomaticEvaluations:
         try:
             body()
             self._backoff.worked(subject)
-        except DatabaseError:
+        except Unavailable:
             pass  # said by the controller
         except (OSError, ValueError, DamagedCheckpoint) as error:
             self._backoff.failed(subject, f"automatic evaluations, {subject}: {' '.join(str(error).split())}")
