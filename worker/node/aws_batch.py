@@ -62,11 +62,10 @@ class AwsSupervisor(supervisor.Supervisor):
         return replace(outcome, exit_code=code, signal=None, reason=self._loss.reason, error=None, asked=True)
 
     def _commit(self, outcome: Outcome) -> int:
-        code = super()._commit(outcome)
         if isinstance(self._line, ChildEnd):
             self._line.tell(outcome.exit_code, outcome.reason)
         _say(format_line(time.time(), None, "o", OUTCOME_LINE + json.dumps(asdict(outcome))))
-        return code
+        return super()._commit(outcome)
 
 
 def _say(line: str) -> None:

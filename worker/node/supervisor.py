@@ -8,6 +8,7 @@ is the node's voice on the bus. One thread, one selector, no torch.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import selectors
@@ -20,7 +21,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
-from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
+from shared_store.epoch import StaleEpoch, check_epoch, find_epoch, read_epoch
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store, StoreError
 from shared_store.log_files import LogWriter, left_out
@@ -49,6 +50,12 @@ _COMPLAINTS = 60.0
 """Seconds between two lines on standard error about a log that can't be written."""
 _PATIENCE = 1800.0
 """Seconds that a training may take to start, and to finish after its last iteration."""
+_FINAL = (errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
+"""Errors of an outcome's path that stay: a job has put something else there."""
+_COMMIT_INTERVAL = 1.0
+"""Seconds between two tries to write an outcome."""
+_LAST_WORDS = 2.0
+"""Seconds before its end of grace at which a node leaves whose outcome can't be written: its exit code must be its own."""
 _ASKED = "asked to leave"
 _STATES = {
     "R": "it runs",
@@ -199,6 +206,8 @@ class Supervisor:
 
     def _serve_bus(self) -> None:
         """Carry out the commands that came, and tell how the node is."""
+        if not self.ranks:
+            return
         self.bus.tend(self.ranks[0].progress)
         while not self.bus.commands.empty():
             command = self.bus.commands.get()
@@ -334,16 +343,41 @@ class Supervisor:
         """Some engines send SIGTERM to the ranks themselves, too: one may be gone before this process knows."""
         return rank.asked or (self.stopping == _ASKED and rank.signal_name == "SIGTERM")
 
+    def _is_deleted(self) -> bool:
+        """Whether the store is there and the run is not any more: it must not come back in part."""
+        store = self.run.path.parent.parent
+        return not os.path.lexists(self.run.path) and os.path.lexists(store / "store.json")
+
     def _commit(self, outcome: Outcome) -> int:
+        """Write the outcome until it stands, or the node is asked to leave; returns its exit code, by which the engine knows it too.
+
+        Raises StaleEpoch.
+        """
         with contextlib.suppress(OSError):
             self._log.sync()
-        if not self.run.path.exists():
-            return outcome.exit_code  # the run was deleted: it must not come back in part
-        try:
-            write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
-        except (OSError, DamagedFile) as error:
-            why = getattr(error, "strerror", None) or error
-            _tell(f"outcome of node {outcome.node} can't be written: {why}")
+        if (
+            self.stopping != _ASKED
+        ):  # the time that ranks had to leave is over; whoever asks the node to leave gives it more
+            self.stopping = self.deadline = None
+        trouble = ""
+        while not self._is_deleted():
+            try:
+                if not read_epoch(self.run):  # an empty directory is in the place of the volume: it would take the outcome
+                    raise OSError(f"run {self.run.name} is not in the store; see whether its volume is mounted")
+                write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
+                break
+            except (OSError, DamagedFile) as error:
+                why = f"outcome of node {outcome.node} can't be written: {getattr(error, 'strerror', None) or error}"
+                if not isinstance(error, OSError) or error.errno in _FINAL:
+                    _tell(why)
+                    break
+            if why != trouble:
+                _tell(f"{why}; trying again until it can, or the node is asked to leave")
+                trouble = why
+            if self.deadline is not None and time.monotonic() > self.deadline - _LAST_WORDS:
+                break
+            self._read(timeout=_COMMIT_INTERVAL)
+            self._serve_bus()
         return outcome.exit_code
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import importlib.util
 import json
 import os
@@ -14,14 +13,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from shared_store.logs import parse_line
 from tests.conftest import PATIENCE, wait_for
-from tests.support.faults.full_disk import small_volume
+from tests.support.faults.full_disk import full_volume
 from tests.support.worker.node import Node, Nodes
 
 # -- output -----------------------------------------------------------------------------------------------------------
@@ -74,16 +72,6 @@ def test_of_a_progress_bar_the_last_state_is_kept(node: Nodes) -> None:
     n = node()
     assert n.shell(r"printf '10%%\r20%%\r30%%\nwindows\r\n50%%\r60%%\r'") == 0
     assert n.output() == ["30%", "windows", "60%"]
-
-
-@contextlib.contextmanager
-def full_volume(directory: Path) -> Iterator[None]:
-    """A volume at ``directory`` without a free byte."""
-    with small_volume(directory, 1 << 16):
-        with contextlib.suppress(OSError), open(directory / "ballast", "wb", buffering=0) as file:
-            while file.write(bytes(4096)):
-                pass
-        yield
 
 
 def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> None:

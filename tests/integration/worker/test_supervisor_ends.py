@@ -16,8 +16,9 @@ from shared_store.contract import sealed
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import LONGEST_TEXT
 from tests.conftest import PATIENCE, wait_for
+from tests.support.faults.full_disk import full_volume
 from tests.support.processes import alive, await_end
-from tests.support.worker.node import Nodes
+from tests.support.worker.node import Node, Nodes
 
 # -- ends -------------------------------------------------------------------------------------------------------------
 
@@ -330,3 +331,48 @@ def test_an_epoch_that_can_not_be_read_for_a_while_does_not_stop_the_ranks(node:
     (n.run.path / "EPOCH").mkdir()  # reading it fails, as it does on a volume that is away
     assert n.wait() == 0
     assert n.output() == ["ready", "done"]
+
+
+# -- a store that can't be written --------------------------------------------------------------------------------------
+
+
+def test_on_a_full_volume_the_outcome_is_written_again_until_it_stands(node: Nodes) -> None:
+    n = node()
+    outcomes = n.run.outcome("job", 1, 0).parent
+    with full_volume(outcomes) as ballast:
+        n.start("sh", "-c", "exit 4")
+        wait_for(lambda: "No space left on device; trying again" in n.stderr.read_text(), 20, "a refused write")
+        assert n.process.poll() is None and n.outcome is None
+        ballast.unlink()
+        assert n.wait() == 4
+        assert n.ended().exit_code == 4
+    assert n.stderr.read_text().count("outcome of node 0") == 1
+
+
+def test_who_is_asked_to_leave_before_the_outcome_stands_leaves_with_the_true_exit_code(node: Nodes) -> None:
+    n = node(grace=3.0)
+    with full_volume(n.run.outcome("job", 1, 0).parent):
+        n.start("sh", "-c", "exit 0")
+        wait_for(lambda: "trying again" in n.stderr.read_text(), 20, "a refused write")
+        n.process.send_signal(signal.SIGTERM)
+        assert n.wait() == 0 and n.outcome is None
+
+
+def test_while_the_store_is_away_the_node_waits_and_its_outcome_is_in_the_store_that_comes_back(tmp_path: Path) -> None:
+    store, away, go = tmp_path / "store", tmp_path / "away", tmp_path / "go"
+    n = Node(store)
+    n.stderr = tmp_path / "stderr"
+    n.start("sh", "-c", f"echo ready; while [ ! -e {go} ]; do sleep 0.05; done; exit 3")
+    try:
+        n.wait_for_output("ready")
+        store.rename(away)
+        store.mkdir()
+        go.touch()
+        wait_for(lambda: "trying again" in n.stderr.read_text(), 20, "a refused write")
+        assert list(store.iterdir()) == []
+        store.rmdir()
+        away.rename(store)
+        assert n.wait() == 3 and n.ended().exit_code == 3
+    finally:
+        n.process.kill()
+        n.process.wait()

@@ -43,6 +43,13 @@ def small_volume(directory: Path, size: int = VOLUME) -> Iterator[Path]:
         subprocess.run(["umount", "-l", directory], check=True)
 
 
+@contextlib.contextmanager
+def full_volume(directory: Path) -> Iterator[Path]:
+    """A volume at ``directory`` without a free byte, and the file that fills it."""
+    with small_volume(directory, 1 << 16):
+        yield fill(directory)
+
+
 def fill(volume: Path) -> Path:
     """Take all the space that is left."""
     filler = volume / "filler"
