@@ -114,6 +114,7 @@ class Server:
                 with suppress(OSError):  # said by open()
                     (home / "store").mkdir(mode=0o700)
             self.store = Store(store or home / "store")
+            self.store.check_writable()
             try:
                 found = Database(_database_url(database)) if database else Database.at(home)
                 stack.callback(found.close)

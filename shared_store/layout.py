@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import secrets
@@ -165,6 +166,17 @@ class Store:
         identity = found.get("id")
         return identity if isinstance(identity, str) and identity else None
 
+    def check_writable(self) -> None:
+        """Raises StoreError where this user can't write at the path, or can't create it. Makes nothing."""
+        present = next(each for each in (self.path, *self.path.parents) if os.path.exists(each))
+        if not present.is_dir():
+            raise self._not_writable(os.strerror(errno.ENOTDIR))
+        if not os.access(present, os.W_OK | os.X_OK):
+            raise self._not_writable(os.strerror(errno.EACCES))
+
+    def _not_writable(self, why: str) -> StoreError:
+        return StoreError(f"store {self.path}: not writable ({why}); choose another with --store")
+
     def open(self) -> Store:
         """Create a missing layout, give the store an identity, and check that it can be written.
 
@@ -179,9 +191,7 @@ class Store:
             probe.write_bytes(b"")
             probe.unlink()
         except OSError as error:
-            raise StoreError(
-                f"store {self.path}: not writable ({error.strerror or error}); choose another with --store"
-            ) from error
+            raise self._not_writable(error.strerror or str(error)) from error
         except ValueError as error:
             raise StoreError(f"store {self.path}: store.json is damaged ({error})") from error
         if not isinstance(description.get("format"), int) or description["format"] > FORMAT:

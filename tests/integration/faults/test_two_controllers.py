@@ -88,7 +88,7 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
         named = f"written by job {writer[:8]} (attempt 1) of the controller of {tmp_path}/a on "
         (tmp_path / "free").touch()  # the job that was accepted before learns it when it starts
         reason = second.wait(waiting)["statusReason"]
-        assert "can't prepare run shared: it is being " + named in reason and reason.endswith("stop that job first")
+        assert reason.startswith("run shared is being " + named) and reason.endswith("stop that job first")
         with pytest.raises(ApiError) as refused:
             second.gang(WAIT, env={"MUSTER_RUN": "shared", **end})
         assert "run shared is being " + named in str(refused.value)

@@ -167,19 +167,20 @@ def test_a_database_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path: Path, how: str) -> None:
     path = tmp_path / "m.db"
     (tmp_path / "link.db").symlink_to(path)
+    store = tmp_path / "store"
     before = os.umask(0o022)
     try:
-        first = Server(tmp_path / "a", database=how.format(path))
+        first = Server(tmp_path / "a", store=store, database=how.format(path))
         for other in (path, tmp_path / "link.db"):
             with pytest.raises(ServerError) as refused:
-                Server(tmp_path / "b", database=how.format(other))
+                Server(tmp_path / "b", store=store, database=how.format(other))
             said = f"database sqlite:///{other}: another controller has it; use that one, or stop it first"
             assert str(refused.value) == said
         modes = {name: (tmp_path / name).stat().st_mode & 0o777 for name in ("m.db", "m.db-wal", "m.db-shm")}
         assert set(modes.values()) == {0o600}, modes
         first.close()
         path.chmod(0o644)
-        Server(tmp_path / "b", database=how.format(path)).close()
+        Server(tmp_path / "b", store=store, database=how.format(path)).close()
         assert path.stat().st_mode & 0o777 == 0o600
     finally:
         os.umask(before)
@@ -280,19 +281,17 @@ def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Da
         assert session.scalars(select(Attempt.job_id)).all() == session.scalars(select(Node.job_id)).all() == []
 
 
-def test_an_attempt_is_charged_for_its_use_and_losses(opened: Callable[[], Database], tmp_path: Path) -> None:
-    run = Store(tmp_path / "store").open().run("r")
-
+def test_an_attempt_is_charged_for_its_use_and_losses(opened: Callable[[], Database]) -> None:
     def nodes() -> list[Node]:
         return [Node(host="h", gpus=gpus, cpus=4.0, memory=1) for gpus in (("0", "1"), ("2", "3"))]
 
     facts = {"job_id": "a", "created_at": 10_000}
     failed = Attempt(**facts, number=1, epoch=1, nodes=nodes(), stopped_at=70_000, ending="failed")
-    charge(failed, run, 70_000)
+    charge(failed, None, 70_000)
     assert (failed.gpu_seconds, failed.cpu_seconds) == (240.0, 480.0)
     assert (failed.wasted_gpu_seconds, failed.wasted_cpu_seconds) == (240.0, 480.0), "it had saved nothing"
     done = Attempt(**facts, number=2, epoch=2, nodes=nodes(), stopped_at=20_000, ending="succeeded")
-    charge(done, run, 20_000)
+    charge(done, None, 20_000)
     assert (done.gpu_seconds, done.wasted_gpu_seconds) == (40.0, 0.0)
     assert resource_seconds(failed, 70_000) == 240.0
 

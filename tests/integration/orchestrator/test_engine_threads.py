@@ -23,7 +23,7 @@ from orchestrator.domain.errors import ApiError
 from orchestrator.domain.hosts import Host, Limit, Placement, Queued
 from orchestrator.domain.resources import Resources
 from orchestrator.engines import registry, runner
-from orchestrator.engines.api import Engine, EngineError, Gang, Handle, NotYet, Setting, Transient, read_handle
+from orchestrator.engines.api import Engine, EngineError, Gang, GangStatus, Handle, NotYet, Setting, Transient, read_handle
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
@@ -67,6 +67,12 @@ def launched(several: EngineSet, what: Gang) -> str:
     return handle
 
 
+def observed(several: EngineSet, handle: str) -> GangStatus | None:
+    """The newest status, after a request for a newer one, as in a pass of the controller."""
+    several.look()
+    return several.observe(handle)
+
+
 @pytest.mark.parametrize(
     ("number", "final"),
     [
@@ -90,12 +96,12 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
     fake = FakeEngine()
     with engines(fake) as several:
         handle = launched(several, gang(tmp_path))
-        wait_for(lambda: several.observe(handle), 10, "the first picture")
+        wait_for(lambda: observed(several, handle), 10, "the first picture")
         fake.answers.clear()
         before = time.monotonic()
 
         def says() -> str:
-            [node] = several.observe(handle) or []
+            [node] = observed(several, handle) or []
             assert node.running and node.address == "10.0.0.1"
             return node.words
 
@@ -118,14 +124,14 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
     fake = FakeEngine()
     with engines(fake) as several:
         handle = launched(several, gang(tmp_path))
-        wait_for(lambda: several.observe(handle), 10, "the first picture")
+        wait_for(lambda: observed(several, handle), 10, "the first picture")
         for error, said in (
             (OSError(errno.EMFILE, "Too many"), "can't look at the gang now ([Errno 24] Too many)"),
             (RuntimeError("no\nwords"), "failed to look at the gang (RuntimeError: no words)"),
         ):
             fake.error = error
             [node] = wait_for(
-                lambda said=said: (s := several.observe(handle)) and said in s[0].words and s,
+                lambda said=said: (s := observed(several, handle)) and said in s[0].words and s,
                 20,
                 said,
             )
@@ -133,7 +139,7 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
             with pytest.raises(EngineError, match="trying again"):
                 several.stop(handle, 0)
         fake.error = None
-        wait_for(lambda: (s := several.observe(handle)) and not s[0].words, 20, "that it is seen again")
+        wait_for(lambda: (s := observed(several, handle)) and not s[0].words, 20, "that it is seen again")
         assert [node.running for node in several.stop(handle, 0)] == [False]
     looks = [record for record in caplog.records if "look at the gang" in record.getMessage()]
     assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
@@ -144,7 +150,7 @@ def test_without_descriptors_no_gang_counts_as_dead_and_no_half_gang_is_started(
     engine = LocalEngine(tmp_path, cpus=4)
     with engines(engine) as several:
         handle = launched(several, gang(tmp_path, "running", "localhost"))
-        wait_for(lambda: several.observe(handle), 10, "the first picture")
+        wait_for(lambda: observed(several, handle), 10, "the first picture")
         taken = []
         before = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 20, before[1]))
@@ -171,7 +177,7 @@ def test_without_descriptors_no_gang_counts_as_dead_and_no_half_gang_is_started(
                 os.close(descriptor)
             resource.setrlimit(resource.RLIMIT_NOFILE, before)
         try:
-            [node] = wait_for(lambda: (s := several.observe(handle)) and not s[0].words and s, 60, "that it is seen")
+            [node] = wait_for(lambda: (s := observed(several, handle)) and not s[0].words and s, 60, "that it is seen")
             assert node.running
             names = {member.gang for member in gang_members(tmp_path)}
             assert names <= {"running/1/1", f"half-{spare}/1/1"} and spare > 0, (names, spare)

@@ -67,6 +67,7 @@ class FakeController(Generic[E]):
     def submit(self, *names: str, **facts: Any) -> None:
         with self.database.session() as session:
             session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
+        self.reconciler.wake()
 
     def job(self, name: str) -> Job:
         with self.database.session() as session:

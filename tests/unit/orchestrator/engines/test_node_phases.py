@@ -168,6 +168,7 @@ def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
     for words in ("", "what the engine says"):
         end = seen_end(NodeStatus(ENDED, "", words, cause, code), True, 5.0)
         assert (end.lost, end.exit_code, end.ended) == (lost, code or 137, 5.0)
-        assert end.reason == (words or "the supervisor died without an outcome")
+        told = f"exit {code}, outcome not written{words and f' ({words})'}" if cause is Cause.EXIT else words
+        assert end.reason == (told or "the supervisor died without an outcome")
     preempted = seen_end(NodeStatus(ENDED, "", "preempted by Slurm", Cause.PREEMPTED, 75), False, 5.0)
     assert (preempted.lost, preempted.exit_code) == (True, 137), "a job of the Batch API has lost its host"

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from orchestrator import machine
 from orchestrator.engines import runner
 from orchestrator.engines.api import EngineError, Handle, NotYet, Transient
 from orchestrator.engines.runner import Runner
@@ -21,7 +22,6 @@ from orchestrator.engines.slurm import commands
 from orchestrator.engines.slurm import engine as slurm
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.testing.rigs import make_gang
-from orchestrator.engines.toolkit import backoff as module
 from orchestrator.engines.toolkit import log_copy
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.engines.toolkit.environment import PRIVATE, inherited
@@ -132,7 +132,7 @@ def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     moment = 0.0
-    monkeypatch.setattr(module.time, "monotonic", lambda: moment)
+    monkeypatch.setattr(machine, "monotonic", lambda: moment)
     backoff = Backoff(logging.getLogger("test"), first=1.0, most=60.0)
     for pause in (1.0, 2.0, 4.0):
         backoff.failed("job", "can't end")
