@@ -15,19 +15,18 @@ if TYPE_CHECKING:
 class SimulatedBus:
     endpoint = "tcp/127.0.0.1:7447"
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, world: Simulation) -> None:
         self.presence = Presence()
         self.presence.hear_itself(True)
         self.changed: Callable[[str], None] = lambda _: None
-        self._simulation = simulation
-        self._process = simulation.machine.process
+        self._world = world
 
     def expect(self, job: str, attempt: int, nodes: int) -> None:
         self.presence.expect(job, attempt, nodes)
-        for gang in self._simulation.gangs.values():
+        for gang in self._world.cluster.gangs.values():
             if (gang.job, gang.attempt) == (job, attempt):
                 for node in gang.nodes:
-                    self._simulation.connect(node)
+                    self.notice(node)
 
     def forget(self, job: str, attempt: int) -> None:
         self.presence.forget(job, attempt)
@@ -37,7 +36,7 @@ class SimulatedBus:
 
     def notice(self, node: SimulatedNode) -> None:
         """A node's connection may have come or gone."""
-        here = self._simulation.hears(node)
+        here = self._world.hears(node)
         silent = self.presence.is_silent(node.key)
         if here and (silent or not self.presence.met(node.key)):
             self.presence.came(node.key)

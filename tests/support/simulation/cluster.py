@@ -1,30 +1,20 @@
-"""Hosts, and the gangs on them, as they truly are; and the engine that tells the controller of them, when it answers."""
+"""Hosts, and the gangs on them, as they truly are: they work, save and end, whether or not a controller is there."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from orchestrator.domain.hosts import Capacity, Host, Hosts
-from orchestrator.engines.api import (
-    Cause,
-    Gang,
-    GangStatus,
-    Handle,
-    NodePhase,
-    NodeStatus,
-    NotYet,
-    Plan,
-    Traits,
-    node_plans,
-)
-from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.api import Gang
+from shared_store.outcomes import EX_TEMPFAIL, Outcome
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
 
-HOSTS = 6
-CORES = 2.0
+_SAVING = 30.0
+"""Seconds of work between two checkpoints."""
+_TRIES = 60
+"""Seconds for which a node tries to write its outcome."""
 
 
 @dataclass
@@ -44,13 +34,21 @@ class SimulatedNode:
     """Of its own; None while it runs, and for one that was killed or vanished."""
     killed: bool = False
     asked: bool = False
-    """It was told to end."""
+    """It was asked to end."""
     silent_since: float | None = None
-    """Since when it is frozen, isolated or dead by itself."""
+    """Since when it is frozen or isolated [s]."""
+
+    def __str__(self) -> str:
+        return f"{self.gang.name} node {self.index}"
 
     @property
     def key(self) -> tuple[str, int, int]:
         return self.gang.job, self.gang.attempt, self.index
+
+    @property
+    def acts(self) -> bool:
+        """Whether it can reach the others and the volume."""
+        return self.alive and not (self.frozen or self.isolated or self.host_lost)
 
 
 @dataclass
@@ -66,65 +64,127 @@ class SimulatedGang:
     """The address of the controller's bus that it knows."""
     launched: float
     nodes: list[SimulatedNode] = field(default_factory=list)
-    ran: float = 0.0
-    """Seconds of work since the last save."""
 
     @property
     def running(self) -> list[SimulatedNode]:
         return [node for node in self.nodes if node.alive]
 
 
-class SimulatedEngine:
-    """Speaks with the cluster for one process of the controller."""
+class Cluster:
+    """All gangs that were ever launched."""
 
-    name = "simulated"
-    traits = Traits()
-    address: str | None = None
+    def __init__(self, world: Simulation) -> None:
+        self._world, self._machine, self._rng = world, world.machine, world.rng
+        self.gangs: dict[str, SimulatedGang] = {}
+        self._asked: dict[str, tuple[float, int]] = {}
+        """When each launch was asked for first, and by which process of the controller."""
 
-    def __init__(self, simulation: Simulation) -> None:
-        self._simulation = simulation
+    @property
+    def running(self) -> list[SimulatedNode]:
+        return [node for gang in self.gangs.values() for node in gang.running]
 
-    def capacity(self) -> Capacity:
-        self._reach()
-        return Hosts([Host(f"{self.name}/h{index}", CORES, (), 64_000) for index in range(HOSTS)])
+    def pulls(self, gang: Gang) -> bool:
+        """Whether its image is still being pulled: since its launch was asked for."""
+        since, _ = self._asked.setdefault(gang.name, (self._machine.time, self._machine.process))
+        return gang.name not in self.gangs and self._machine.time - since < self._world.job(gang.job).pulling
 
-    def plan(self, gang: Gang) -> Plan[Gang]:
-        addresses = [f"10.0.0.{index + 1}" for index in range(len(gang.commands))]
-        return Plan(gang, node_plans(gang, addresses, 29500), gang)
+    def launch(self, gang: Gang) -> None:
+        """Start it, once for a name."""
+        if gang.name in self.gangs:
+            return
+        self._world.invariants.check_launch(gang, same_process=self._asked[gang.name][1] == self._machine.process)
+        found = SimulatedGang(
+            gang.name, gang.job, gang.attempt, gang.epoch, gang.run, self._world.router, self._machine.time
+        )
+        found.nodes = [SimulatedNode(found, index, each.host) for index, each in enumerate(gang.placements)]
+        self.gangs[gang.name] = found
+        for node in found.nodes:
+            self._world.notice(node, self._rng.uniform(0.5, 3.0))
+        self._machine.after(self._world.job(gang.job).breaks[gang.attempt - 1], lambda: self._break(found))
+        self._work(found)
 
-    def launch(self, plan: Plan[Gang]) -> Handle:
-        self._reach()
-        gang = plan.request
-        if self._simulation.pulls(gang):
-            raise NotYet("pulling the image")
-        self._simulation.crash("before a launch")
-        self._simulation.launch(gang)
-        self._simulation.crash("after a launch")
-        self._reach()  # the answer may be lost
-        return Handle(self.name, gang.name, len(plan.nodes), {})
+    def stop(self, name: str, grace: float) -> None:
+        """Ask its nodes to end, wait, and kill them. On a greenlet that may sleep."""
+        gang = self.gangs.get(name)
+        if gang is None:
+            return
+        self._world.invariants.check_cause(gang)
+        deadline = self._machine.time + grace
+        for node in gang.running:
+            node.asked = True
+            self._machine.after(self._rng.uniform(0.1, 4.0), lambda node=node: self._leave(node))
+        while gang.running and self._machine.time < deadline:
+            self._machine.sleep(0.5)
+        for node in gang.running:
+            node.alive, node.killed = False, True
+            self._world.notice(node, 0.2)
 
-    def observe(self, handle: Handle) -> GangStatus:
-        self._reach()
-        found = self._simulation.gangs.get(handle.gang)
-        return [ended("", None)] * handle.nodes if found is None else [self._status(node) for node in found.nodes]
+    def can_write(self, node: SimulatedNode) -> bool:
+        """Whether it could write to its run."""
+        return node.acts and self._world.volume.epoch(node.gang.run) <= node.gang.epoch
 
-    def stop(self, handle: Handle, grace: float) -> None:
-        self._reach()
-        self._simulation.stop(handle.gang, grace)
+    def _work(self, gang: SimulatedGang) -> None:
+        """Work until the next save, or the end."""
+        job = self._world.job(gang.job)
+        left = job.work - job.done
+        if left <= 0:
+            self._finish(gang.nodes[0], job.code)
+            return
+        piece = min(left, _SAVING)
+        self._machine.after(piece, lambda: self._save(gang, piece))
 
-    def close(self) -> None:
-        """Gangs go on."""
+    def _save(self, gang: SimulatedGang, piece: float) -> None:
+        if not all(node.alive for node in gang.nodes):
+            return
+        volume = self._world.volume
+        if volume.unusable or not all(node.acts for node in gang.nodes):
+            self._machine.after(5.0, lambda: self._save(gang, piece))  # the others wait for it
+            return
+        if volume.epoch(gang.run) > gang.epoch:
+            for node in gang.nodes:
+                self._finish(node, 1)  # fenced
+            return
+        job = self._world.job(gang.job)
+        job.done += piece
+        run = volume.runs[gang.run]
+        run.iteration, run.saved[gang.epoch] = int(job.done), self._machine.wall()
+        self._work(gang)
 
-    def _reach(self) -> None:
-        if self._simulation.engine_down:
-            raise OSError("the simulated engine can't be reached")
+    def _break(self, gang: SimulatedGang) -> None:
+        """A fault of the job itself: one node fails, and the others' collectives break."""
+        if not all(node.alive and not node.frozen for node in gang.nodes):
+            return
+        first = self._rng.choice(gang.nodes)
+        self._finish(first, 1)
+        for node in gang.nodes:
+            if node is not first:
+                self._machine.after(self._rng.uniform(0.5, 5.0), lambda node=node: self._finish(node, 1))
 
-    def _status(self, node: SimulatedNode) -> NodeStatus:
-        address = f"10.0.0.{node.index + 1}"
-        if node.alive:
-            return NodeStatus(NodePhase.RUNNING, address)
-        if node.host_lost:
-            return ended(address, None)
-        if node.killed:
-            return NodeStatus(NodePhase.ENDED, address, cause=Cause.STOPPED, exit_code=137)
-        return ended(address, node.exit_code)
+    def _leave(self, node: SimulatedNode) -> None:
+        """Save and leave with 75."""
+        if node.acts:
+            self._finish(node, EX_TEMPFAIL)
+
+    def _finish(self, node: SimulatedNode, code: int, tries: int = _TRIES) -> None:
+        """The node ends: it writes its outcome until that stands, or leaves without one after a while."""
+        if not node.alive:
+            return
+        if not node.acts:
+            self._machine.after(5.0, lambda: self._finish(node, code, tries))
+            return
+        gang, volume = node.gang, self._world.volume
+        can_write = not volume.unusable and gang.run in volume.runs
+        if not can_write and tries and not node.asked:
+            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1))
+            return
+        if can_write:
+            wall, words = self._machine.wall(), f"exit {code}"
+            outcome = Outcome(node.index, gang.epoch, code, None, words, None, wall - 1, wall, asked=node.asked)
+            volume.runs[gang.run].outcomes[gang.job, gang.attempt, node.index] = outcome
+        node.alive, node.exit_code = False, code
+        if node.index == 0 and code != EX_TEMPFAIL:
+            self._world.job(gang.job).main_ends.append((gang.attempt, code))
+        self._world.notice(node, 0.2)
+        if node.index == 0 and code == 0:
+            for other in gang.running:
+                self._machine.after(self._rng.uniform(0.1, 12.0), lambda other=other: self._finish(other, 0))

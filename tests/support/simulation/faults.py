@@ -1,100 +1,155 @@
-"""Faults that the control plane once had, put back: each must be found within a few seeds."""
+"""What befalls a controller, its network, its volumes and its nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import replace
-from typing import Any
-from unittest import mock
+from collections.abc import Callable
+from random import Random
+from typing import TYPE_CHECKING
 
-from orchestrator.control import attempts, endings
-from orchestrator.control.presence import Presence
-from orchestrator.control.run_store import Errands, RunStore
-from orchestrator.domain import attempt as rules
-from orchestrator.domain.attempt import Silence
-from orchestrator.domain.job import NodeEnd
-from orchestrator.engines.api import Cause, NodeStatus
-from shared_store.bus import Node
+from tests.support.simulation.cluster import SimulatedNode
+from tests.support.simulation.jobs import SUBMITTING
 
-Fault = AbstractContextManager[Any]
+if TYPE_CHECKING:
+    from tests.support.simulation.run import Simulation
+
+_LEASE = 4.0
+"""Seconds until the bus notices that a node is silent."""
+
+Fault = Callable[["Simulation", Random], None]
 
 
-def silence_alone_counts() -> Fault:
-    """B1: a node counts as dead when it is silent for 20 s, whatever its engine says, and however many others are."""
-
-    def silence(self: Presence, node: Node, asked: float | None) -> Silence | None:
-        heard = self._nodes.get(node)
-        if heard is None or heard.gone is None:
-            return None
-        seconds = self._monotonic() - heard.gone
-        return Silence(seconds, heard.since, seconds > 20.0)
-
-    return mock.patch.object(Presence, "silence", silence)
+def draw_fault(seed: int, index: int) -> tuple[float, Fault, Random]:
+    """Fault number ``index`` of a seed, the same whichever others there are: when [s], what, and the source of its extent."""
+    rng = Random(f"{seed} fault {index}")
+    return rng.uniform(0, SUBMITTING), rng.choice(KINDS), rng
 
 
-def those_whom_another_router_met_are_silent() -> Fault:
-    """B2: after a start or a move, nodes that do not come count as silent since the start."""
-    expect = Presence.expect
-
-    def expected(self: Presence, job: str, attempt: int, nodes: int) -> None:
-        expect(self, job, attempt, nodes)
-        for index in range(nodes):
-            self.left((job, attempt, index))
-
-    return mock.patch.object(Presence, "expect", expected)
+def _during(world: Simulation, seconds: float, name: str, of: object | None = None) -> None:
+    """Set a flag for a while."""
+    target = world if of is None else of
+    world.note(f"{name} for {seconds:.0f} s")
+    setattr(target, name, True)
+    world.machine.after(seconds, lambda: setattr(target, name, False))
 
 
-def the_loop_reads_the_store() -> Fault:
-    """B4: the loop waits for the volume."""
-
-    def result(self: Errands, key: object, name: str, body: Callable[[], Any]) -> Any:
-        return body()
-
-    return mock.patch.object(Errands, "result", result)
+def _seconds(rng: Random) -> float:
+    return rng.choice((5.0, 30.0, 90.0, 300.0, 600.0)) * rng.uniform(0.7, 1.0)
 
 
-def what_is_to_end_is_launched() -> Fault:
-    """B9: a gang that is preempted before its launch is launched all the same."""
-    step = rules.step
-
-    def stepped(state: rules.State, event: rules.Event) -> rules.Instructions:
-        if state.phase is rules.Phase.LAUNCHING and state.verdict is not None:
-            if isinstance(event, rules.Due):
-                return (rules.Launch(),)
-            if isinstance(event, rules.LaunchDelayed):
-                return (rules.Explain(event.reason),)
-        return step(state, event)
-
-    return mock.patch.object(attempts, "step", stepped)
+def crash_at_a_write(world: Simulation, rng: Random) -> None:
+    """The controller's process is killed at one of its next writes."""
+    world.writes_left = rng.choice((1, 2, 3, 5, 8, 13, 21))
+    world.note(f"the controller dies at its write number {world.writes_left}")
 
 
-def any_volume_is_the_store() -> Fault:
-    """T1: what is missing on another volume counts as missing."""
-    init = RunStore.__init__
-
-    def made(self: RunStore, store: Any, peers: Any, check: Any = None) -> None:
-        init(self, store, peers)
-
-    return mock.patch.object(RunStore, "__init__", made)
+def move(world: Simulation, rng: Random) -> None:
+    """The controller is stopped, and started at another address: nodes look for it at the old one."""
+    world.note("the controller moves")
+    world.router += 1
+    world.die()
 
 
-def without_an_outcome_is_killed() -> Fault:
-    """T2: a node that ended with 0 and could not write its outcome counts as killed."""
-    seen_end = endings.seen_end
-
-    def seen(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
-        end = seen_end(node, is_native, moment)
-        return replace(end, exit_code=end.exit_code or 137) if node.cause is Cause.EXIT else end
-
-    return mock.patch.object(endings, "seen_end", seen)
+def partition(world: Simulation, rng: Random) -> None:
+    """The controller alone is cut off: from its engine, and from all nodes."""
+    seconds = _seconds(rng)
+    _during(world, seconds, "engine_down")
+    _break_bus(world, seconds)
 
 
-FAULTS: Mapping[str, Callable[[], Fault]] = {
-    "B1": silence_alone_counts,
-    "B2": those_whom_another_router_met_are_silent,
-    "B4": the_loop_reads_the_store,
-    "B9": what_is_to_end_is_launched,
-    "T1": any_volume_is_the_store,
-    "T2": without_an_outcome_is_killed,
-}
+def engine_outage(world: Simulation, rng: Random) -> None:
+    _during(world, _seconds(rng), "engine_down")
+
+
+def bus_outage(world: Simulation, rng: Random) -> None:
+    _break_bus(world, _seconds(rng))
+
+
+def _break_bus(world: Simulation, seconds: float) -> None:
+    def notice() -> None:
+        for node in world.cluster.running:
+            world.notice(node, world.rng.uniform(0.5, _LEASE))
+
+    _during(world, seconds, "bus_down")
+    notice()
+    world.machine.after(seconds + 0.1, notice)
+
+
+def database_outage(world: Simulation, rng: Random) -> None:
+    _during(world, rng.uniform(1, 60), "database_down")
+
+
+def stall_volume(world: Simulation, rng: Random) -> None:
+    _during(world, _seconds(rng), "stalled", world.volume)
+
+
+def fill_volume(world: Simulation, rng: Random) -> None:
+    _during(world, _seconds(rng), "full", world.volume)
+
+
+def unmount_volume(world: Simulation, rng: Random) -> None:
+    _during(world, _seconds(rng), "absent", world.volume)
+
+
+def break_volume(world: Simulation, rng: Random) -> None:
+    _during(world, rng.uniform(1, 60), "failing", world.volume)
+
+
+def step_clock(world: Simulation, rng: Random) -> None:
+    seconds = rng.choice((-3600.0, -5.0, 5.0, 3600.0))
+    world.note(f"the wall clock steps by {seconds:.0f} s")
+    world.machine.offset += seconds
+
+
+def freeze_node(world: Simulation, rng: Random) -> None:
+    _silence(world, rng, "frozen")
+
+
+def isolate_node(world: Simulation, rng: Random) -> None:
+    _silence(world, rng, "isolated")
+
+
+def _silence(world: Simulation, rng: Random, how: str) -> None:
+    if (node := _some_node(world, rng)) is None:
+        return
+    seconds = _seconds(rng)
+    world.note(f"{node} is {how} for {seconds:.0f} s")
+    setattr(node, how, True)
+    node.silent_since = world.machine.time
+    world.notice(node, _LEASE)
+
+    def back() -> None:
+        setattr(node, how, False)
+        node.silent_since = None
+        world.notice(node, rng.uniform(0.2, 5.0))
+
+    world.machine.after(seconds, back)
+
+
+def lose_host(world: Simulation, rng: Random) -> None:
+    """A host dies, and its engine notices that."""
+    if (node := _some_node(world, rng)) is None:
+        return
+    world.note(f"host {node.host} dies")
+    for each in world.cluster.running:
+        if each.host == node.host:
+            each.host_lost, each.alive = True, False
+            world.notice(each, _LEASE)
+
+
+def kill_node(world: Simulation, rng: Random) -> None:
+    if (node := _some_node(world, rng)) is None or node.frozen:
+        return
+    world.note(f"{node} is killed")
+    node.alive, node.killed = False, True
+    world.notice(node, 0.2)
+
+
+def _some_node(world: Simulation, rng: Random) -> SimulatedNode | None:
+    nodes = world.cluster.running
+    return rng.choice(nodes) if nodes else None
+
+
+KINDS: tuple[Fault, ...] = (
+    *(crash_at_a_write, crash_at_a_write, move, partition, engine_outage, bus_outage, database_outage, step_clock),
+    *(stall_volume, fill_volume, unmount_volume, break_volume, freeze_node, isolate_node, lose_host, kill_node),
+)

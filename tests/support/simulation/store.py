@@ -44,6 +44,14 @@ class Volume:
     """An empty directory is in its place."""
     failing: bool = False
 
+    @property
+    def unusable(self) -> bool:
+        return self.stalled or self.full or self.absent or self.failing
+
+    def epoch(self, name: str) -> int:
+        """The epoch of a run, as it truly is."""
+        return self.runs[name].epoch if name in self.runs else 0
+
     def read(self, name: str) -> SimulatedRun:
         """Raises OSError."""
         if self.failing:
@@ -69,48 +77,48 @@ class SimulatedPeers:
 class SimulatedRunStore(RunStore):
     """The calls, with the real rules of what an answer is worth."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, world: Simulation) -> None:
         super().__init__(Store("/simulated"), SimulatedPeers(), self._check_volume)  # type: ignore[arg-type]
-        self._simulation = simulation
+        self._world = world
 
     def _check_volume(self) -> None:
         self._wait()
-        if self._simulation.volume.absent:
+        if self._world.volume.absent:
             raise OSError("the store is not the one that the database knows")
 
     def _wait(self) -> None:
-        while self._simulation.volume.stalled:
-            self._simulation.machine.sleep(1.0)
+        while self._world.volume.stalled:
+            self._world.machine.sleep(1.0)
 
     def examine(self, name: str) -> RunFacts:
         with self._using(f"read run {name}"):
             self._wait()
-            run = self._simulation.volume.read(name)
+            run = self._world.volume.read(name)
             return RunFacts(name, run.description is None, run.description, epoch=run.epoch)
         raise AssertionError
 
     def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
         with self._using(f"prepare run {name}"):
             self._wait()
-            run = self._simulation.volume.write(name)
+            run = self._world.volume.write(name)
             run.description = run.description or description
-            self._simulation.crash("before an epoch")
+            self._world.write("before an epoch")
             run.epoch = max(run.epoch, after) + 1
-            self._simulation.crash("after an epoch")
+            self._world.write("after an epoch")
             return run.epoch
         raise AssertionError
 
     def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
         with self._using("read outcomes"):
             self._wait()
-            found = self._simulation.volume.read(name).outcomes
+            found = self._world.volume.read(name).outcomes
             return {node: found[job, attempt, node] for node in nodes if (job, attempt, node) in found}
         raise AssertionError
 
     def progress(self, name: str, epoch: int) -> Progress:
         with self._using(f"read the checkpoints of run {name}"):
             self._wait()
-            run = self._simulation.volume.read(name)
+            run = self._world.volume.read(name)
             return Progress(run.iteration, run.saved.get(epoch))
         raise AssertionError
 
@@ -123,8 +131,8 @@ class SimulatedDisk:
 
     names = ("store", "database")
 
-    def __init__(self, simulation: Simulation) -> None:
-        self._simulation = simulation
+    def __init__(self, world: Simulation) -> None:
+        self._world = world
         self._since: float | None = None
         """Since when a volume can't be used, as far as was looked."""
 
@@ -135,7 +143,7 @@ class SimulatedDisk:
         """Nothing has to be stopped."""
 
     def shortage(self, purpose: str | None = None) -> str | None:
-        volume, machine = self._simulation.volume, self._simulation.machine
+        volume, machine = self._world.volume, self._world.machine
         bad = volume.stalled or volume.full or volume.absent
         self._since = (self._since if self._since is not None else machine.time) if bad else None
         if purpose == "database" or self._since is None or machine.time - self._since < _NOTICED:

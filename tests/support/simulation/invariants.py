@@ -1,0 +1,118 @@
+"""What must hold in every history: of each launch, of each stop, and of all that a user sees."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from orchestrator.control.presence import LOST_AFTER
+from orchestrator.domain.job import TERMINAL, Status
+from orchestrator.engines.api import Gang
+from tests.support.simulation.cluster import SimulatedGang
+from tests.support.simulation.engine import AWAY
+from tests.support.simulation.jobs import SimulatedJob
+
+if TYPE_CHECKING:
+    from tests.support.simulation.run import Simulation
+
+_TOLD = 150.0
+"""Seconds within which a controller notices whether its engine answers: the longest pause between two looks, and some more."""
+_SLACK = 5.0
+"""Seconds by which an end may be early: as long as clocks and leases are rounded."""
+
+
+class Violation(AssertionError):
+    """Something does not hold that always must."""
+
+
+class Invariants:
+    """Checks, by what is true in the cluster and what the database says. Each raises :class:`Violation`."""
+
+    def __init__(self, world: Simulation) -> None:
+        self._world = world
+        self._state: tuple[int, bool, bool] | None = None
+        """The controller's process, and whether its engine and its database are away."""
+        self._since: float | None = None
+        """Since when that is so [s]; None once it was checked."""
+
+    def check_launch(self, gang: Gang, same_process: bool) -> None:
+        """Never two writers; and nothing starts that is to end (another process of the controller can't take back its request)."""
+        for other in self._world.cluster.gangs.values():
+            if other.run == gang.run and any(self._world.cluster.can_write(node) for node in other.running):
+                raise Violation(f"{gang.name} is launched while {other.name} runs")
+        ending, _ = self._attempt(gang.job, gang.attempt)
+        if ending is not None and same_process:
+            raise Violation(f"{gang.name} is launched, although it is {ending}")
+
+    def check_cause(self, gang: SimulatedGang) -> None:
+        """No gang is ended without a cause."""
+        job, moment = self._world.job(gang.job), self._world.machine.time
+        if job.stop_asked or not all(node.alive for node in gang.nodes):
+            return
+        if job.timeout is not None and moment - gang.launched > job.timeout - _SLACK:
+            return
+        silences = [node.silent_since for node in gang.nodes if node.silent_since is not None]
+        if any(moment - since > LOST_AFTER - _SLACK for since in silences):
+            return
+        ending, reason = self._attempt(gang.job, gang.attempt)
+        if ending != "preempted" or job.urgent:
+            raise Violation(f"{gang.name} is ended without a cause: {ending}, {reason}")
+
+    def look(self) -> None:
+        """What a user sees now: nothing acknowledged is lost, and each state has a reason."""
+        found = self._world.memory.execute("SELECT id, status, status_reason FROM jobs").fetchall()
+        rows = {job_id: (status, reason) for job_id, status, reason in found}
+        for job in self._world.jobs:
+            if not job.acknowledged:
+                continue
+            if job.id not in rows:
+                raise Violation(f"{job.name} was acknowledged, and is lost")
+            status, reason = rows[job.id]
+            if job.final and status != job.final:
+                raise Violation(f"{job.name} was {job.final}, and is {status} ({reason})")
+            if not reason and status != Status.SUBMITTED:
+                raise Violation(f"{job.name} is {status} and does not say why")
+            if status in TERMINAL and not job.final:
+                job.final = status
+                self._check_end(job, status, reason)
+
+    def _check_end(self, job: SimulatedJob, status: str, reason: str) -> None:
+        """Every end is the true end, and a job that failed has spent its attempts."""
+        succeeded = any(code == 0 for _, code in job.main_ends)
+        if status == Status.SUCCEEDED and job.name not in self._world.volume.runs:
+            raise Violation(f"{job.name} is SUCCEEDED, and the store does not have its run")
+        if status == Status.SUCCEEDED and not succeeded:
+            raise Violation(f"{job.name} is SUCCEEDED, and its main node did not end with 0: {job.main_ends}")
+        if status != Status.FAILED or job.stop_asked or job.timeout is not None:
+            return
+        if succeeded:
+            raise Violation(f"{job.name} is FAILED ({reason}), and its main node ended with 0")
+        query = "SELECT count(*) FROM attempts WHERE job_id = ? AND spent"
+        spent = self._world.memory.execute(query, (job.id,)).fetchone()[0]
+        if spent < job.attempts:
+            raise Violation(f"{job.name} is FAILED ({reason}) after {spent} of {job.attempts} attempts")
+
+    def check_reachable(self, process: int) -> None:
+        """Once the engine has answered, or not, for a while: a RUNNING gang says that it does not, and only then."""
+        world = self._world
+        state = process, world.engine_down, world.database_down
+        if state != self._state:
+            self._state, self._since = state, world.machine.time
+        if self._since is None or world.machine.time - self._since < _TOLD:
+            return
+        began, self._since = self._since, None
+        rows = world.memory.execute(
+            "SELECT jobs.name, jobs.status_reason, attempts.running_since FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
+            " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NULL AND attempts.ending IS NULL"
+        ).fetchall()
+        for name, reason, running in rows:
+            job = world.job(name)
+            seen = [gang for gang in world.cluster.gangs.values() if gang.run == name and gang.launched < began - _TOLD]
+            if running is None or not seen or job.stop_asked:
+                continue
+            if (AWAY in reason) != world.engine_down:
+                raise Violation(f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_down or 'answers'}")
+
+    def _attempt(self, job_id: str, number: int) -> tuple[str | None, str | None]:
+        query = "SELECT ending, status_reason FROM attempts WHERE job_id = ? AND number = ?"
+        ending, reason = self._world.memory.execute(query, (job_id, number)).fetchone()
+        return ending, reason

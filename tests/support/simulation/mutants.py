@@ -1,0 +1,100 @@
+"""Faults that the control plane once had, put back: each is found within 200 seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any
+from unittest import mock
+
+from orchestrator.control import attempts, endings
+from orchestrator.control.presence import Presence
+from orchestrator.control.run_store import Errands, RunStore
+from orchestrator.domain import attempt as rules
+from orchestrator.domain.attempt import Silence
+from orchestrator.domain.job import NodeEnd
+from orchestrator.engines.api import Cause, NodeStatus
+from shared_store.bus import Node
+
+Mutant = AbstractContextManager[Any]
+
+
+def silence_alone_counts() -> Mutant:
+    """B1: a node counts as dead when it is silent for 20 s, whatever its engine says, and however many others are."""
+
+    def silence(self: Presence, node: Node, asked: float | None) -> Silence | None:
+        heard = self._nodes.get(node)
+        if heard is None or heard.gone is None:
+            return None
+        seconds = self._monotonic() - heard.gone
+        return Silence(seconds, heard.since, seconds > 20.0)
+
+    return mock.patch.object(Presence, "silence", silence)
+
+
+def those_whom_another_router_met_are_silent() -> Mutant:
+    """B2: after a start or a move, nodes that do not come count as silent since the start."""
+    expect = Presence.expect
+
+    def expected(self: Presence, job: str, attempt: int, nodes: int) -> None:
+        expect(self, job, attempt, nodes)
+        for index in range(nodes):
+            self.left((job, attempt, index))
+
+    return mock.patch.object(Presence, "expect", expected)
+
+
+def the_loop_reads_the_store() -> Mutant:
+    """B4: the loop waits for the volume."""
+
+    def result(self: Errands, key: object, name: str, body: Callable[[], Any]) -> Any:
+        return body()
+
+    return mock.patch.object(Errands, "result", result)
+
+
+def what_is_to_end_is_launched() -> Mutant:
+    """B9: a gang that is preempted before its launch is launched all the same."""
+    step = rules.step
+
+    def stepped(state: rules.State, event: rules.Event) -> rules.Instructions:
+        if state.phase is rules.Phase.LAUNCHING and state.verdict is not None:
+            if isinstance(event, rules.Due):
+                return (rules.Launch(),)
+            if isinstance(event, rules.LaunchDelayed):
+                return (rules.Explain(event.reason),)
+        return step(state, event)
+
+    return mock.patch.object(attempts, "step", stepped)
+
+
+def any_volume_is_the_store() -> Mutant:
+    """T1: what is missing on another volume counts as missing."""
+    init = RunStore.__init__
+
+    def made(self: RunStore, store: Any, peers: Any, check: Any = None) -> None:
+        init(self, store, peers)
+
+    return mock.patch.object(RunStore, "__init__", made)
+
+
+def without_an_outcome_is_killed() -> Mutant:
+    """T2: a node that ended with 0 and could not write its outcome counts as killed."""
+    seen_end = endings.seen_end
+
+    def seen(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
+        end = seen_end(node, is_native, moment)
+        return replace(end, exit_code=end.exit_code or 137) if node.cause is Cause.EXIT else end
+
+    return mock.patch.object(endings, "seen_end", seen)
+
+
+MUTANTS: Mapping[str, Callable[[], Mutant]] = {
+    "B1": silence_alone_counts,
+    "B2": those_whom_another_router_met_are_silent,
+    "B4": the_loop_reads_the_store,
+    "B9": what_is_to_end_is_launched,
+    "T1": any_volume_is_the_store,
+    "T2": without_an_outcome_is_killed,
+}
