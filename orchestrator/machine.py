@@ -115,9 +115,15 @@ class Machine:
         """An identifier of this boot of the machine: it stays while the monotonic clock runs."""
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
-    def thread(self, name: str, body: Callable[[], None]) -> None:
+    def sleep(self, seconds: float) -> None:
+        """Let the present thread wait."""
+        time.sleep(seconds)
+
+    def thread(self, name: str, body: Callable[[], None]) -> threading.Thread:
         """Start ``body`` on a daemon thread."""
-        threading.Thread(target=body, name=name, daemon=True).start()
+        thread = threading.Thread(target=body, name=name, daemon=True)
+        thread.start()
+        return thread
 
     def result(self, future: Future[T], seconds: float) -> T:
         """The result of a pool's call. Raises TimeoutError where it is not there in time."""
@@ -157,9 +163,14 @@ def boot() -> str:
     return _current.boot()
 
 
-def thread(name: str, body: Callable[[], None]) -> None:
+def sleep(seconds: float) -> None:
+    """Let the present thread wait."""
+    _current.sleep(seconds)
+
+
+def thread(name: str, body: Callable[[], None]) -> threading.Thread:
     """Start ``body`` on a daemon thread."""
-    _current.thread(name, body)
+    return _current.thread(name, body)
 
 
 def result(future: Future[T], seconds: float) -> T:

@@ -61,7 +61,17 @@ from orchestrator.domain.attempt import (
 )
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict, lost_host
-from orchestrator.engines.api import EngineError, EngineFault, Gang, GangStatus, NodePhase, NodeStatus, NotYet, Plan
+from orchestrator.engines.api import (
+    CannotStart,
+    EngineError,
+    EngineFault,
+    Gang,
+    GangStatus,
+    NodePhase,
+    NodeStatus,
+    NotYet,
+    Plan,
+)
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node, SchedulingPolicy, now
@@ -302,7 +312,7 @@ class Attempts:
         except NotYet as wait:
             return LaunchDelayed(str(wait), wait.unknown)
         except EngineError as error:
-            return LaunchRefused(str(error))
+            return LaunchRefused(str(error), is_final=not isinstance(error, CannotStart))
 
     def gang(self, session: Session, job: Job, attempt: Attempt, spec: GangSpec) -> Gang:
         """The gang that the engine starts for an attempt."""

@@ -10,17 +10,18 @@ import asyncio
 import json
 import logging
 import threading
-import time
 import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import httpx
 from sqlalchemy import ColumnElement, event, func, select, update
 from sqlalchemy.orm import Session
 
+from orchestrator import machine
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from orchestrator.engines.toolkit.backoff import Backoff
@@ -56,10 +57,7 @@ class Deliveries:
         self._wake = {name: threading.Event() for name in self.webhooks}
         self._timeout = TIMEOUT
         self._tls = httpx.create_ssl_context() if webhooks else True  # made once: it takes a while
-        self._threads = [
-            threading.Thread(target=self._loop, args=(webhook,), name=f"webhook {webhook.name}", daemon=True)
-            for webhook in webhooks
-        ]
+        self._threads: list[threading.Thread] = []
         if webhooks:
             self._database.ended = self.note
 
@@ -71,8 +69,8 @@ class Deliveries:
                 said = "no webhook is called so any more"
                 session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
                 self._name_unknown_queues(session.scalars(select(JobQueue.name)).all())
-        for thread in self._threads:
-            thread.start()
+        for webhook in self.webhooks.values():
+            self._threads.append(machine.thread(f"webhook {webhook.name}", partial(self._loop, webhook)))
 
     def _name_unknown_queues(self, known: Sequence[str]) -> None:
         """Warn of unknown queues in the file; a warning only, since a queue may be created later."""
@@ -88,8 +86,7 @@ class Deliveries:
         for wake in self._wake.values():
             wake.set()
         for thread in self._threads:
-            if thread.is_alive():
-                thread.join(timeout=1)
+            thread.join(timeout=1)
 
     def note(self, session: Session, job: Job) -> None:
         """Add the messages about the end of a job to the transaction that ends it."""
@@ -192,7 +189,7 @@ class Deliveries:
         It has an event loop of its own: that way a try can be cancelled at any point, such as while a receiver sends a byte a second. Nothing
         of the answer is read behind its header.
         """
-        headers = {"user-agent": f"muster/{__version__}", **webhook.headers(identity, int(time.time()), body)}
+        headers = {"user-agent": f"muster/{__version__}", **webhook.headers(identity, int(machine.wall()), body)}
 
         async def deliver() -> str | None:
             async with (

@@ -61,17 +61,17 @@ class Peers:
         """By id: the newest heartbeat, and when it came (monotonic [s]); None where it was outdated at first sight."""
         self._beat = 0
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._loop, name="peers", daemon=True)
+        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Leave the first heartbeat; log a warning for each other controller that is present, now and later."""
         self._look()
-        self._thread.start()
+        self._thread = machine.thread("peers", self._loop)
 
     def close(self) -> None:
         """Withdraw the heartbeat."""
         self._ending.set()
-        if self._thread.is_alive():
+        if self._thread is not None:
             self._thread.join(BEAT)
         with contextlib.suppress(OSError):  # a volume that is away: the heartbeat goes out of date
             self._path.unlink(missing_ok=True)

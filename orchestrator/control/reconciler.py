@@ -122,7 +122,7 @@ class Reconciler:
         """Whether its volume is full; jobs are ended all the same."""
         self._backoff = Backoff(log)
         """Failures, by the part of the pass, or by the action on a job and the job's id."""
-        self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
+        self._thread: threading.Thread | None = None
         with database.session() as session:
             self.clock.restore(session)
             self.work_queue.load(session)
@@ -131,7 +131,7 @@ class Reconciler:
 
     def start(self) -> None:
         self.disk.start()
-        self._thread.start()
+        self._thread = machine.thread("controller", self._loop)
 
     def wake(self) -> None:
         """Look now instead of at the next interval, since something changed."""
@@ -150,7 +150,7 @@ class Reconciler:
         self._ending.set()
         self.disk.close()
         self._wake.set()
-        if self._thread.is_alive():
+        if self._thread is not None:
             self._thread.join()
         self.attempts.close()
 

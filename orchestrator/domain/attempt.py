@@ -163,9 +163,11 @@ class LaunchDelayed:
 
 @dataclass(frozen=True)
 class LaunchRefused:
-    """The engine refuses the gang for good."""
+    """The engine does not start the gang."""
 
     reason: str
+    is_final: bool = True
+    """It refuses the gang for good; else this attempt has failed, and another one may start."""
 
 
 @dataclass(frozen=True)
@@ -364,8 +366,10 @@ def step(state: State, event: Event) -> Instructions:
             return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
         case Phase.LAUNCHING, LaunchDelayed(reason) if reason:
             return (Explain(reason),)
-        case Phase.LAUNCHING, LaunchRefused(reason):
+        case Phase.LAUNCHING, LaunchRefused(reason, True):
             return Decide(Verdict(Ending.FATAL, f"can't start the gang: {reason}")), WindUp()
+        case Phase.LAUNCHING, LaunchRefused(reason):
+            return Decide(Verdict(Ending.FAILED, reason)), WindUp()
         case _, Preempted(reason) if state.verdict is None:
             return (Decide(Verdict(Ending.PREEMPTED, reason)),)
         case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Due():

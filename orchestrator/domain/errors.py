@@ -22,6 +22,9 @@ class SpecError(Exception):
 class RequestError(Exception):
     """A request can't be carried out as it stands; nothing has changed."""
 
+    status = 400
+    """Of the HTTP answer."""
+
 
 class ApiError(Exception):
     """The controller refused a request; ``status`` is the HTTP status."""

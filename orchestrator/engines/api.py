@@ -20,6 +20,10 @@ class EngineError(Exception):
     """The engine can't do what was asked; the message is the reason that the job is given."""
 
 
+class CannotStart(EngineError):
+    """The engine tried to start a node and failed, so the attempt has failed; another one may start. AWS: CannotStartContainerError."""
+
+
 class NotYet(EngineError):
     """A launch has to wait, for the reason in the message. It will be tried again."""
 

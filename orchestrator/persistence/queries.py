@@ -7,8 +7,12 @@ from collections.abc import Collection, Iterable
 from sqlalchemy import ColumnElement, and_, select, update
 from sqlalchemy.orm import Session
 
+from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import TERMINAL
 from orchestrator.persistence.models import Job
+
+_NAMED = 5
+"""Jobs that a refusal names."""
 
 
 def note_changed(session: Session, ids: Iterable[str]) -> None:
@@ -31,11 +35,12 @@ def short_id(job: str) -> str:
 
 
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
-    """The job with this id, else the newest one with this name, else the one whose id starts so (if it is the only one).
+    """The job with this id, else the newest one with this name, else the one whose id starts so.
 
     ``REFERENCE:3`` is the child with index 3 of the array that REFERENCE names.
 
     ``queues``: only jobs of these are looked for by name or by the start of an id; None: all jobs.
+    Raises RequestError where several ids start so.
     """
     job = session.get(Job, reference)
     if job:
@@ -52,5 +57,9 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
         return named
     if len(reference) < 4:
         return None
-    prefixed = session.scalars(among.where(Job.id.startswith(reference, autoescape=True)).limit(2)).all()
-    return prefixed[0] if len(prefixed) == 1 else None
+    prefixed = session.scalars(among.where(Job.id.startswith(reference, autoescape=True)).limit(_NAMED + 1)).all()
+    if len(prefixed) > 1:
+        shown = ", ".join(f"{each.id} ({each.name})" for each in prefixed[:_NAMED])
+        more = ", …" * (len(prefixed) > _NAMED)
+        raise RequestError(f"several jobs have an id that starts with {reference}: {shown}{more}; write more of it")
+    return prefixed[0] if prefixed else None

@@ -362,7 +362,9 @@ class Supervisor:
         trouble = ""
         while not self._is_deleted():
             try:
-                if not read_epoch(self.run):  # an empty directory is in the place of the volume: it would take the outcome
+                if not read_epoch(
+                    self.run
+                ):  # an empty directory is in the place of the volume: it would take the outcome
                     raise OSError(f"run {self.run.name} is not in the store; see whether its volume is mounted")
                 write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
                 break

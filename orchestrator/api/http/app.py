@@ -26,7 +26,7 @@ from orchestrator.api.native import routes as native
 from orchestrator.control import monitoring
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.errors import Unavailable
+from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
@@ -54,7 +54,7 @@ def create_app(
     app.include_router(native.router)
     app.state.access, app.state.limit = access or Access(), limit or RateLimit()
     app.add_middleware(Guard, access=app.state.access, limit=app.state.limit)
-    app.add_exception_handler(ClientError, _client_error)
+    app.add_exception_handler(RequestError, _client_error)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _refused_by_database)
@@ -126,7 +126,7 @@ async def _body(request: Request) -> Any:
 
 
 async def _client_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ClientError)
+    assert isinstance(error, RequestError)
     return error_response(str(error), error.status, kind_of(error))
 
 

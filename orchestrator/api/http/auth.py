@@ -33,6 +33,7 @@ from orchestrator.api.http.access import Access, identity_of
 from orchestrator.api.http.callers import Caller, user_name
 from orchestrator.api.http.limits import Body, RateLimit
 from orchestrator.api.permissions import BY_LOWER_NAME, Identity, Refusal, current_identity
+from orchestrator.domain.errors import RequestError
 from orchestrator.domain.excerpts import LONGEST_ERROR, excerpt
 
 log = logging.getLogger("muster.api")
@@ -388,7 +389,7 @@ def _refused(request: _Request, refusal: ClientError) -> Response:
     return error_response(str(refusal), refusal.status, kind_of(refusal))
 
 
-def kind_of(error: ClientError) -> str:
+def kind_of(error: RequestError) -> str:
     """AWS's name of an error."""
     return error.kind if isinstance(error, Refusal) else "ClientException"
 

@@ -32,6 +32,7 @@ from docker.types import IPAMConfig, IPAMPool
 
 from orchestrator.domain.hosts import HERE, Host, Hosts
 from orchestrator.engines.api import (
+    CannotStart,
     Cause,
     EngineError,
     Gang,
@@ -196,7 +197,7 @@ class DockerEngine:
             # 500: it has tried, and said why it can't; beyond that nobody has
             if isinstance(error, APIError) and (error.status_code or 500) <= 500:
                 why = f"CannotStartContainerError: Error response from daemon: {error.explanation}"
-                raise EngineError(why) from error
+                raise CannotStart(why) from error
             raise
         return handle
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
+from orchestrator import machine
 from orchestrator.engines.api import NotYet, Transient
 
 
@@ -22,7 +22,7 @@ def stop_within(seconds: float, step: Callable[[], str], *, engine: str, gang: s
     Raises:
         Transient: The time is over; one line with the last answer.
     """
-    deadline = time.monotonic() + seconds
+    deadline = machine.monotonic() + seconds
     while True:
         try:
             answer = step()
@@ -30,8 +30,8 @@ def stop_within(seconds: float, step: Callable[[], str], *, engine: str, gang: s
             answer = str(error)
         if not answer:
             return
-        if time.monotonic() >= deadline:
+        if machine.monotonic() >= deadline:
             raise Transient(
                 f"the {engine} engine has not ended gang {gang} within {seconds:.3g} s; last answer: {answer}"
             )
-        time.sleep(pause)
+        machine.sleep(pause)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from math import inf
 from typing import Generic, TypeVar
 
+from orchestrator import machine
 from orchestrator.engines.api import EngineError
 
 T = TypeVar("T")
@@ -35,7 +35,7 @@ class View(Generic[T]):
     @property
     def age(self) -> float:
         """Seconds since the last answer; infinite before the first."""
-        return time.monotonic() - self.taken
+        return machine.monotonic() - self.taken
 
     @property
     def trouble(self) -> str | None:
@@ -45,14 +45,14 @@ class View(Generic[T]):
     def answered(self, value: T, taken: float | None = None) -> None:
         """Keep an answer, unless a newer one is there; ``taken``: when it was asked for [monotonic s], now by default."""
         with self._lock:
-            at = time.monotonic() if taken is None else taken
+            at = machine.monotonic() if taken is None else taken
             if at > self.taken:
                 self._answer, self._missed = (value, at), None
 
     def missed(self, why: str) -> None:
         """Note that no answer came; the last value stays, and is stale."""
         with self._lock:
-            self._missed = why, time.monotonic()
+            self._missed = why, machine.monotonic()
 
 
 class CachedView(View[T]):
@@ -78,7 +78,7 @@ class CachedView(View[T]):
 
     def read(self) -> T:
         """The value as it is now, read on the caller's thread. Raises EngineError."""
-        started = time.monotonic()
+        started = machine.monotonic()
         try:
             value = self._read()
         except EngineError as error:
@@ -93,7 +93,7 @@ class CachedView(View[T]):
         ``patience``: seconds to wait for that one, at most. Where ``trouble`` says why there is none, the value is stale.
         """
         tried = max(self.taken, self._missed[1] if self._missed else -inf)
-        if time.monotonic() - tried > age:
+        if machine.monotonic() - tried > age:
             self.refresh(patience)
         return self.value
 
@@ -102,7 +102,7 @@ class CachedView(View[T]):
         with self._lock:
             if self._idle.is_set():
                 self._idle.clear()
-                threading.Thread(target=self._run, name=self._name, daemon=True).start()
+                machine.thread(self._name, self._run)
         if patience and not self._late and not self._idle.wait(patience):
             self._late = True
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+
+from orchestrator import machine
 
 
 def wait_until(condition: Callable[[], bool], seconds: float, pause: float = 0.05) -> bool:
     """Look again and again until the condition holds; whether it did within that time. Looks once at least."""
-    deadline = time.monotonic() + seconds
+    deadline = machine.monotonic() + seconds
     while not condition():
-        if time.monotonic() >= deadline:
+        if machine.monotonic() >= deadline:
             return False
-        time.sleep(pause)
+        machine.sleep(pause)
     return True

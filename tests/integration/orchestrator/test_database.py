@@ -17,7 +17,7 @@ from sqlalchemy.exc import IntegrityError
 
 from orchestrator.control.usage import add_usage, charge, forget_before, resource_seconds, usage_at
 from orchestrator.control.work_queue import WorkQueue
-from orchestrator.domain.errors import ApiError, ServerError
+from orchestrator.domain.errors import ApiError, RequestError, ServerError
 from orchestrator.persistence.models import (
     Attempt,
     Base,
@@ -33,7 +33,6 @@ from orchestrator.persistence.queries import find_job
 from orchestrator.persistence.schema import NEWEST
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from shared_store.layout import Store
 from tests.conftest import Serving, wait_for
 from tests.support.orchestrator import postgres
 from tests.support.orchestrator.databases import connected, migrate
@@ -309,9 +308,13 @@ def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) 
     with opened().session() as session:
         session.add_all([job("aaaa1111", name="x"), job("aaaa2222", name="y"), job("aaaa2222:0", parent="aaaa2222")])
         session.flush()
-        texts = ("aaaa1111", "y", "aaaa2", "aaaa", "aaa", "aaaa2222:0")
+        texts = ("aaaa1111", "y", "aaaa2", "aaa", "aaaa2222:0")
         found = [(each := find_job(session, text)) and each.id for text in texts]
-    assert found == ["aaaa1111", "aaaa2222", "aaaa2222", None, None, "aaaa2222:0"]
+        with pytest.raises(
+            RequestError, match=r"^several .* starts with aaaa: aaaa1111 \(x\), aaaa2222 \(y\); write more of it$"
+        ):
+            find_job(session, "aaaa")
+    assert found == ["aaaa1111", "aaaa2222", "aaaa2222", None, "aaaa2222:0"]
 
 
 def test_a_controller_with_a_lost_lock_takes_it_again_or_names_its_owner(postgresql: postgres.Server) -> None:

@@ -23,7 +23,17 @@ from orchestrator.domain.errors import ApiError
 from orchestrator.domain.hosts import Host, Limit, Placement, Queued
 from orchestrator.domain.resources import Resources
 from orchestrator.engines import registry, runner
-from orchestrator.engines.api import Engine, EngineError, Gang, GangStatus, Handle, NotYet, Setting, Transient, read_handle
+from orchestrator.engines.api import (
+    Engine,
+    EngineError,
+    Gang,
+    GangStatus,
+    Handle,
+    NotYet,
+    Setting,
+    Transient,
+    read_handle,
+)
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet

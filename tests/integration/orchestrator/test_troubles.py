@@ -132,7 +132,7 @@ def test_a_start_that_fails_stops_no_other_and_is_tried_again(home: Path, caplog
         blocked.parent.mkdir(exist_ok=True)
         blocked.write_text("a file where the run's directory belongs")
         first = submit_gang(client, "print('here')", env={"MUSTER_RUN": "blocked"})
-        said = f"store {home / 'store'}: can't prepare run blocked now ([Errno 20] Not a directory"
+        said = f"store {home / 'store'}: can't read run blocked now ([Errno 20] Not a directory"
         wait_for(lambda: status_reason(home, first).startswith(said), 30, "the reason")
         await_status(client, submit_gang(client, "print('here')", cpus="2"), "SUCCEEDED")
         blocked.unlink()

@@ -43,7 +43,9 @@ def _many(first: int, last: int, mutant: str | None) -> int:
                 if mutant:
                     break
             if done % 100 == 0:
-                print(f"{done} seeds, {failed} failed, {done / (time.monotonic() - began) * 60:.0f} a minute", flush=True)
+                print(
+                    f"{done} seeds, {failed} failed, {done / (time.monotonic() - began) * 60:.0f} a minute", flush=True
+                )
     print(f"{done} seeds, {failed} failed, {time.monotonic() - began:.0f} s on {os.cpu_count()} cores")
     return failed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 from orchestrator.engines.api import Gang
@@ -112,7 +113,7 @@ class Cluster:
         deadline = self._machine.time + grace
         for node in gang.running:
             node.asked = True
-            self._machine.after(self._rng.uniform(0.1, 4.0), lambda node=node: self._leave(node))
+            self._machine.after(self._rng.uniform(0.1, 4.0), partial(self._leave, node))
         while gang.running and self._machine.time < deadline:
             self._machine.sleep(0.5)
         for node in gang.running:
@@ -158,7 +159,7 @@ class Cluster:
         self._finish(first, 1)
         for node in gang.nodes:
             if node is not first:
-                self._machine.after(self._rng.uniform(0.5, 5.0), lambda node=node: self._finish(node, 1))
+                self._machine.after(self._rng.uniform(0.5, 5.0), partial(self._finish, node, 1))
 
     def _leave(self, node: SimulatedNode) -> None:
         """Save and leave with 75."""
@@ -187,4 +188,4 @@ class Cluster:
         self._world.notice(node, 0.2)
         if node.index == 0 and code == 0:
             for other in gang.running:
-                self._machine.after(self._rng.uniform(0.1, 12.0), lambda other=other: self._finish(other, 0))
+                self._machine.after(self._rng.uniform(0.1, 12.0), partial(self._finish, other, 0))

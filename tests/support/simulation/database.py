@@ -22,7 +22,7 @@ class Memory(sqlite3.Connection):
     hook: Callable[[str], None] = staticmethod(lambda _: None)
     """Called with each statement, and with COMMIT and COMMITTED before and after a commit; raises where that fails."""
 
-    def cursor(self, *_: Any) -> sqlite3.Cursor:
+    def cursor(self, *_: Any) -> sqlite3.Cursor:  # type: ignore[override]
         return super().cursor(_Cursor)
 
     def close(self) -> None:
@@ -35,10 +35,11 @@ class Memory(sqlite3.Connection):
 
 
 class _Cursor(sqlite3.Cursor):
-    def execute(self, statement: str, *parameters: Any) -> sqlite3.Cursor:
+    def execute(self, statement: str, *parameters: Any) -> _Cursor:
         assert isinstance(self.connection, Memory)
         self.connection.hook(statement)
-        return super().execute(statement, *parameters)
+        super().execute(statement, *parameters)
+        return self
 
 
 @cache

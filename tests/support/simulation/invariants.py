@@ -110,7 +110,9 @@ class Invariants:
             if running is None or not seen or job.stop_asked:
                 continue
             if (AWAY in reason) != world.engine_down:
-                raise Violation(f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_down or 'answers'}")
+                raise Violation(
+                    f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_down or 'answers'}"
+                )
 
     def _attempt(self, job_id: str, number: int) -> tuple[str | None, str | None]:
         query = "SELECT ending, status_reason FROM attempts WHERE job_id = ? AND number = ?"

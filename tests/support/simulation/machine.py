@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Callable
 from concurrent.futures import Future
 from random import Random
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import greenlet
 
@@ -48,7 +48,7 @@ class SimulatedMachine(Machine):
     def boot(self) -> str:
         return "boot"
 
-    def thread(self, name: str, body: Callable[[], None]) -> None:
+    def thread(self, name: str, body: Callable[[], None]) -> Any:
         self.after(0.0, body)
 
     def pool(self, name: str, threads: int, waiting: int | None = None) -> Pool:

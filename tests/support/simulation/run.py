@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 from collections.abc import Sequence
+from functools import partial
 from random import Random
 from typing import Any
 
@@ -45,7 +46,7 @@ class Simulation:
         self.machine = SimulatedMachine(self.rng)
         self.machine.latency = self._latency
         self.memory = new_memory()
-        self.memory.hook = self._on_statement  # type: ignore[method-assign]
+        self.memory.hook = self._on_statement
         self.volume = Volume()
         self.cluster = Cluster(self)
         self.invariants = Invariants(self)
@@ -69,11 +70,11 @@ class Simulation:
             try:
                 self._start()
                 for job in self.jobs:
-                    self.machine.after(job.submitted_at, lambda job=job: self._submit(job))
+                    self.machine.after(job.submitted_at, partial(self._submit, job))
                     if job.stopped_at is not None:
-                        self.machine.after(job.stopped_at, lambda job=job: self._ask_to_stop(job))
+                        self.machine.after(job.stopped_at, partial(self._ask_to_stop, job))
                 for moment, fault, rng in self._faults:
-                    self.machine.after(moment, lambda fault=fault, rng=rng: fault(self, rng))
+                    self.machine.after(moment, partial(fault, self, rng))
                 self._go_on()
             finally:
                 if self._reconciler is not None:

@@ -17,7 +17,9 @@ def violation(seed: int, jobs: Sequence[int] = JOBS, faults: Sequence[int] = FAU
     return None
 
 
-def shrink(seed: int, jobs: Sequence[int] = JOBS, faults: Sequence[int] = FAULTS) -> tuple[Sequence[int], Sequence[int]]:
+def shrink(
+    seed: int, jobs: Sequence[int] = JOBS, faults: Sequence[int] = FAULTS
+) -> tuple[Sequence[int], Sequence[int]]:
     """The jobs and faults that are left once none can be taken away without the violation's going away too."""
     faults = _smallest(faults, lambda some: violation(seed, jobs, some) is not None)
     jobs = _smallest(jobs, lambda some: violation(seed, some, faults) is not None)
@@ -27,7 +29,9 @@ def shrink(seed: int, jobs: Sequence[int] = JOBS, faults: Sequence[int] = FAULTS
 def command(seed: int, jobs: Sequence[int] = JOBS, faults: Sequence[int] = FAULTS) -> str:
     """How to see it again."""
     named = {"jobs": (jobs, JOBS), "faults": (faults, FAULTS)}
-    parts = [f"--{name}={','.join(map(str, some))}" for name, (some, every) in named.items() if list(some) != list(every)]
+    parts = [
+        f"--{name}={','.join(map(str, some))}" for name, (some, every) in named.items() if list(some) != list(every)
+    ]
     return " ".join(["python -m tests.support.simulation", str(seed), *parts])
 
 

@@ -17,6 +17,7 @@ from orchestrator.domain.attempt import (
     AwaitChildren,
     Close,
     Decide,
+    Delayed,
     Due,
     Event,
     Explain,
@@ -39,7 +40,6 @@ from orchestrator.domain.attempt import (
     Silence,
     State,
     Stop,
-    Delayed,
     TakeEpoch,
     Terms,
     WindUp,
@@ -138,6 +138,11 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "one that is not needed is given up": (asked(LAUNCHING), LaunchDelayed("full", False), [Decide(STOPPED), WindUp()]),
     "unless something may run": (asked(LAUNCHING), LaunchDelayed("silent", True), [Explain("silent")]),
     "a refusal is final": (LAUNCHING, LaunchRefused("no such image"), [Decide(REFUSED), WindUp()]),
+    "a start that failed is an attempt that failed": (
+        LAUNCHING,
+        LaunchRefused("CannotStartContainerError: a driver", is_final=False),
+        [Decide(Verdict(Ending.FAILED, "CannotStartContainerError: a driver")), WindUp()],
+    ),
     "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),
     # -- what is told
     "what is launched is looked at": (STARTING, Due(), [Observe()]),
