@@ -22,7 +22,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
 from orchestrator.control.endings import node_end
 from orchestrator.control.monitoring import Monitoring
-from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore
+from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
 from orchestrator.domain.attempt import (
@@ -57,6 +57,7 @@ from orchestrator.domain.attempt import (
     TakeEpoch,
     Terms,
     WindUp,
+    Withdraw,
     step,
 )
 from orchestrator.domain.gang import GangSpec
@@ -132,10 +133,13 @@ class Attempts:
         clock: Clock,
         monitoring: Monitoring,
         changed: Callable[[str], None],
+        withdrawn: Callable[[str, str], None],
     ) -> None:
-        """``changed``: called, from any thread, with a job whose attempt should be looked at."""
+        """``changed``: called, from any thread, with a job whose attempt should be looked at; ``withdrawn``: with one that can't start
+        now, and why.
+        """
         self.engine, self.runs, self.bus = engine, runs, bus
-        self.clock, self.monitoring, self.changed = clock, monitoring, changed
+        self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
         self._memories: dict[tuple[str, int], _Memory] = {}
         self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
         """Why the engine could not stop an attempt's gang when it was last asked."""
@@ -161,8 +165,6 @@ class Attempts:
         )
         attempt.held_since = self.clock.now()
         job.attempts.append(attempt)
-        waited = attempt.held_since - (job.queued_since or attempt.held_since)
-        self.monitoring.begun(session, job, attempt, waited / 1000)
         job.move(Status.STARTING, f"starting {self._state(job, attempt).terms.size}")
         session.commit()
         self._happened(session, job, attempt, Due())
@@ -170,7 +172,7 @@ class Attempts:
     def advance(self, session: Session, job: Job, attempt: Attempt) -> float:
         """One look at an open attempt; returns the seconds until the next one, if nothing changes."""
         self._happened(session, job, attempt, Due())
-        return self._pause(job, attempt)
+        return self._pause(job, attempt) if attempt in job.attempts else _LATER
 
     def _pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
@@ -243,7 +245,11 @@ class Attempts:
                 return self._prepare(session, job, attempt)
             case TakeEpoch(epoch):
                 attempt.epoch = epoch
+                waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
+                self.monitoring.begun(session, job, attempt, waited / 1000)
                 job.first_epoch = job.first_epoch or epoch
+            case Withdraw(reason):
+                self._withdraw(session, job, attempt, reason)
             case Launch(again):
                 return self._launch(session, job, attempt, again)
             case Keep(handle):
@@ -276,9 +282,9 @@ class Attempts:
         memory, key = self._memory(attempt), (job.id, attempt.number)
         try:
             if memory.run is None:
-                memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run))
+                memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run), again=False)
             if (run := memory.run) is None:
-                return self._delayed(key)
+                return None
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
             known = list(session.scalars(select(Attempt.epoch).join(Job).where(Job.run == job.run)))
             if run.epoch not in known and run.writer:
@@ -289,14 +295,12 @@ class Attempts:
             description = first_description(run, job, record.owner, record.queue)
             claim = Claim(self.runs.peers.id, job.id, attempt.number)
             taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim)
-            epoch = self._errands.result(key, "claim", taking)
+            epoch = self._errands.result(key, "claim", taking, again=False)
+        except StoreUnavailable as error:
+            return Delayed(str(error))
         except (RunRefused, ValueError) as error:
             return PrepareRefused(str(error))
-        if epoch is not None:
-            return Prepared(epoch)
-        if (delayed := self._delayed(key)) is not None:
-            memory.run = None  # whoever took it meanwhile is found by another look
-        return delayed
+        return Prepared(epoch) if epoch is not None else None
 
     def _delayed(self, key: Key) -> Delayed | None:
         return Delayed(trouble) if (trouble := self._errands.trouble(key)) else None
@@ -477,6 +481,14 @@ class Attempts:
         iteration = memory.progress.iteration
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
         return Gone(self.clock.now(), self._ends(job, attempt, status), progress)
+
+    def _withdraw(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
+        job.attempts.remove(attempt)
+        job.move(Status.RUNNABLE, reason)
+        session.commit()
+        self._memories.pop((job.id, attempt.number), None)
+        self._errands.forget((job.id, attempt.number))
+        self.withdrawn(job.id, reason)
 
     def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> None:
         memory, key = self._memory(attempt), (job.id, attempt.number)

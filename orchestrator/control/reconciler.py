@@ -101,6 +101,7 @@ class Reconciler:
             self.clock,
             self.monitoring,
             self._gang_changed,
+            self._withdrawn,
         )
         self.writing = threading.Lock()
         """Held while something is registered, submitted or changed: checks must still hold at the commit."""
@@ -144,6 +145,10 @@ class Reconciler:
         else:
             self.work_queue.version += 1  # a pass depends on it
         self.wake()
+
+    def _withdrawn(self, job_id: str, reason: str) -> None:
+        """A job can't start now: it is tried again at growing intervals."""
+        self._backoff.failed(("start", job_id), f"job {job_id}: {reason}")
 
     def close(self) -> None:
         """Leave the loop; running gangs continue, and the next controller on this database finds them."""

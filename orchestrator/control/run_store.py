@@ -143,11 +143,17 @@ class Errands:
         self._under_way: dict[Key, tuple[str, Future[Any]]] = {}
         self._failing = Backoff(log)
 
-    def result(self, key: Key, name: str, body: Callable[[], T]) -> T | None:
-        """The result of ``body``, once; None until it is there. Where it raises StoreUnavailable, it is called again later.
+    def result(self, key: Key, name: str, body: Callable[[], T], again: bool = True) -> T | None:
+        """The result of ``body``, once; None until it is there.
 
-        ``name``: tells the errands of an attempt apart; another one that is under way is waited for, and its result dropped.
-        Raises what else ``body`` raised.
+        Args:
+            key: The attempt.
+            name: Tells the errands of an attempt apart; another one that is under way is waited for, and its result dropped.
+            body: The call.
+            again: Call it again later where it raises StoreUnavailable.
+
+        Raises:
+            Exception: What else ``body`` raised.
         """
         under_way = self._under_way.get(key)
         if under_way is None:
@@ -163,6 +169,8 @@ class Errands:
         try:
             result: T = future.result()
         except StoreUnavailable as error:
+            if not again:
+                raise
             self._failing.failed(key, f"job {key[0]}: {error}")
             return None
         self._failing.worked(key)

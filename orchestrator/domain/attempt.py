@@ -235,6 +235,13 @@ class TakeEpoch:
 
 
 @dataclass(frozen=True)
+class Withdraw:
+    """Take the attempt back: it has used nothing, and what it holds is for other jobs until it is tried again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
 class Launch:
     """Ask the engine to launch the gang, which it does once for an epoch: → Launched, LaunchDelayed or LaunchRefused."""
 
@@ -333,6 +340,7 @@ Instruction = (
     | Save
     | Stop
     | WindUp
+    | Withdraw
     | Close
 )
 Instructions = tuple[Instruction, ...]
@@ -354,6 +362,8 @@ def step(state: State, event: Event) -> Instructions:
             return (Prepare(),)
         case Phase.PREPARING, Prepared(epoch):
             return TakeEpoch(epoch), Save(), Launch()
+        case Phase.PREPARING, Delayed(reason):
+            return (Withdraw(reason),)
         case Phase.PREPARING, PrepareRefused(reason):
             return Decide(Verdict(Ending.FATAL, reason)), WindUp()
         case Phase.LAUNCHING, Due():

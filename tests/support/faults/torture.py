@@ -4,7 +4,7 @@ A job is run straight, once for each size of its gang. Then the same job is run 
 SIGSTOP, hits its ranks, supervisors, writers and the controller at moments drawn from the seed, some of them inside a commit.
 Every run must end as the straight one did: tensors bit for bit, metrics iteration by iteration, with every attempt accounted for
 and no process or file left. Then come the other classes: hostile jobs, a full disk, a wall clock that
-jumps, a second controller. The table goes to ``benchmarks/torture.md``; exit code 1 where anything was wrong.
+jumps, a second controller, outages of the network and the store. The table goes to ``benchmarks/torture.md``; exit code 1 where anything was wrong.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from tests.support.faults.fire import Fire, Result, run_straight
 from tests.support.faults.full_disk import full_disk_round
 from tests.support.faults.home import Home
 from tests.support.faults.hostile import hostile_round
+from tests.support.faults.outages import outage_round
 from tests.support.faults.schedule import JOB_NODES, SHARES, draw_plan
 from tests.support.faults.second_controller import second_controller_round
 from tests.support.faults.wall_clock import wall_clock_round
@@ -45,6 +46,7 @@ ROUNDS: dict[str, Callable[[Path, int], tuple[Counter[str], list[str]]]] = {
     "full disk": full_disk_round,
     "wall clock": wall_clock_round,
     "second controller": second_controller_round,
+    "outages": outage_round,
 }
 """What is done besides killing. Each class is a function ``(directory, seed)`` that brings up a real home below the directory and does its
 worst as the seed says; it returns what it did, counted by name, and what was wrong afterwards, one line each."""
@@ -228,7 +230,9 @@ doubled; attempts, launches and epochs must agree; every attempt must have its r
 ## Besides killing
 
 Each round brings up a controller of its own and does its worst: jobs that fork, flood, ignore signals and try to escape; a volume without
-a free byte; a wall clock that jumps by up to 90 days; a second controller that takes the same run at the same moment.
+a free byte; a wall clock that jumps by up to 90 days; a second controller that takes the same run at the same moment; outages under
+which the only attempt of a run must end with the straight run's bits: a network that is cut between controller and nodes, a store that is
+frozen, replaced by an empty directory, or full, and a controller that moves to another address.
 
 {classes}
 {found}""")

@@ -43,6 +43,7 @@ from orchestrator.domain.attempt import (
     TakeEpoch,
     Terms,
     WindUp,
+    Withdraw,
     step,
 )
 from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
@@ -120,6 +121,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         PrepareRefused("it is damaged"),
         [Decide(Verdict(Ending.FATAL, "it is damaged")), WindUp()],
     ),
+    "while its run can't be read, others may have its room": (PREPARING, Delayed("away"), [Withdraw("away")]),
     "one that is not needed takes nothing": (asked(PREPARING), Due(), [Decide(STOPPED), WindUp()]),
     "nor one that was preempted": (ending(Ending.PREEMPTED, of=PREPARING), Due(), [WindUp()]),
     "the scheduler may take its place": (PREPARING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
