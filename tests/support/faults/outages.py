@@ -149,7 +149,7 @@ def _run(
     run = home.run(f"torture-{submitted['jobId'][:8]}")
     for name in blows:
         before = reached(run, 1)
-        wait_for(lambda: reached(run, 1) > before or _is_over(home, run), 60, "the run goes on")
+        wait_for(lambda before=before: reached(run, 1) > before or _is_over(home, run), 60, "the run goes on")
         if _is_over(home, run):
             break
         with OUTAGES[name](home):
