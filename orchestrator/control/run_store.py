@@ -174,7 +174,7 @@ class Errands:
             self._failing.failed(key, f"job {key[0]}: {error}")
             return None
         self._failing.worked(key)
-        return result if started == name else self.result(key, name, body)
+        return result if started == name else self.result(key, name, body, again)
 
     def trouble(self, key: Key) -> str | None:
         """Why the store could not be used for the attempt the last time; None where it could."""
