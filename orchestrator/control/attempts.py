@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,66 +20,59 @@ from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
-from orchestrator.control.endings import node_end
 from orchestrator.control.monitoring import Monitoring
+from orchestrator.control.observer import Observer
 from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
-from orchestrator.domain.attempt import (
-    FINISHING,
+from orchestrator.domain.attempt import FINISHING, Phase, State, Terms, step
+from orchestrator.domain.attempt_events import (
+    Delayed,
+    Due,
+    Event,
+    Gone,
+    LaunchDelayed,
+    Launched,
+    LaunchRefused,
+    Preempted,
+    Prepared,
+    PrepareRefused,
+)
+from orchestrator.domain.attempt_instructions import (
     AwaitCause,
     AwaitChildren,
     Close,
     Decide,
-    Delayed,
-    Due,
-    Event,
     Explain,
-    Gone,
     Instruction,
     Keep,
     Launch,
-    LaunchDelayed,
-    Launched,
-    LaunchRefused,
     MarkRunning,
     Observe,
-    Observed,
-    Phase,
-    Preempted,
     Prepare,
-    Prepared,
-    PrepareRefused,
     Save,
-    Silence,
-    State,
     Stop,
     TakeEpoch,
-    Terms,
     WindUp,
     Withdraw,
-    step,
 )
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict, lost_host
+from orchestrator.domain.job import Ending, Status, Verdict
 from orchestrator.engines.api import (
     CannotStart,
     EngineError,
     EngineFault,
     Gang,
     GangStatus,
-    NodePhase,
-    NodeStatus,
     NotYet,
     Plan,
 )
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.persistence.models import Attempt, Job, JobQueue, Node, SchedulingPolicy, now
+from orchestrator.persistence.models import Attempt, Job, JobQueue, SchedulingPolicy, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
 from shared_store.epoch import Claim
-from shared_store.outcomes import Outcome
 
 log = logging.getLogger("muster.controller")
 
@@ -92,7 +85,7 @@ _READERS = 16
 _STOPPERS = 128
 """Threads for stops: each waits for its gang's grace time."""
 _CHECK_INTERVAL = 5.0
-"""Seconds between two looks for the outcomes of nodes that can't be seen or heard."""
+"""Seconds between two looks at a gang of which a node is silent, or whose cause is not known yet."""
 _LEAST, _LATER = 0.02, 60.0
 """Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
 _STOP_AGAIN, _STOP_RARELY = 2.0, 30.0
@@ -108,12 +101,6 @@ class _Memory:
     cause_since: int | None = None
     done_since: int | None = None
     """As in :class:`orchestrator.domain.attempt.State`."""
-    outcomes: dict[int, Outcome | None] = field(default_factory=dict)
-    """Of nodes that have ended, by index; None for one that has left none."""
-    asked: tuple[float, list[int]] | None = None
-    """The outcomes that are being read: since when (monotonic [s]), and of which nodes."""
-    checked: float | None = None
-    """When the outcomes were read last (monotonic [s])."""
     stop: Future[GangStatus] | None = None
     """The stop that is under way."""
     stopped: GangStatus | None = None
@@ -145,6 +132,7 @@ class Attempts:
         """Why the engine could not stop an attempt's gang when it was last asked."""
         self._pool = machine.pool("store", _READERS)
         self._errands = Errands(self._pool, changed)
+        self._observer = Observer(engine, runs, self._errands, bus, clock)
         self._stops = machine.pool("stop", _STOPPERS)
 
     def close(self) -> None:
@@ -255,7 +243,7 @@ class Attempts:
             case Keep(handle):
                 attempt.handle = handle
             case Observe():
-                return self._observe(job, attempt)
+                return self._observer.observe(job, attempt)
             case Explain(reason):
                 job.status_reason = reason
             case MarkRunning(reason, moment):
@@ -301,9 +289,6 @@ class Attempts:
         except (RunRefused, ValueError) as error:
             return PrepareRefused(str(error))
         return Prepared(epoch) if epoch is not None else None
-
-    def _delayed(self, key: Key) -> Delayed | None:
-        return Delayed(trouble) if (trouble := self._errands.trouble(key)) else None
 
     def _launch(self, session: Session, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:
@@ -352,89 +337,6 @@ class Attempts:
             options=engine_options(session, attempt.environment, job.queue),
         )
 
-    def _observe(self, job: Job, attempt: Attempt) -> Observed | Delayed | None:
-        assert attempt.handle is not None
-        status = self.engine.observe(attempt.handle)
-        if status is None:
-            return None  # the engine's first look is under way
-        if not self._know_outcomes(job, attempt, status):
-            return self._delayed((job.id, attempt.number))
-        ends = self._ends(job, attempt, status)
-        head = status[job.gang.main]
-        return Observed(
-            moment=self.clock.now(),
-            ends=ends,
-            silences=[self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)],
-            waits=head.words
-            if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
-            else "",
-            words=head.words if head.running else "",
-            stale=next((node.stale for node in status if node.stale), ""),
-        )
-
-    def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
-        """The silence of a node; it counts only where its engine says that it runs, and it has left no outcome."""
-        assert attempt.handle is not None
-        checked = self._memory(attempt).checked
-        is_seen = status.phase is not NodePhase.UNREACHABLE and not status.stale
-        asked = self.engine.asked(attempt.handle) if is_seen and checked is not None else None
-        if asked is not None and checked is not None:
-            asked = max(asked, machine.monotonic() - checked)
-        return self.bus.presence.silence((attempt.job_id, attempt.number, node.index), asked)
-
-    def _know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
-        """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
-
-        Returns whether those of the nodes that have ended are known.
-        """
-        memory, presence, moment = self._memory(attempt), self.bus.presence, machine.monotonic()
-        ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
-        hidden = [
-            index
-            for index, node in enumerate(status)
-            if node.running
-            and memory.outcomes.get(index) is None
-            and (
-                node.phase is NodePhase.UNREACHABLE or node.stale or presence.is_silent((job.id, attempt.number, index))
-            )
-        ]
-        if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < _CHECK_INTERVAL)):
-            return True
-        memory.asked = memory.asked or (moment, [*ended, *hidden])
-        began, nodes = memory.asked
-        reading = partial(self.runs.outcomes, job.run, job.id, attempt.number, nodes)
-        found = self._errands.result((job.id, attempt.number), "outcomes", reading)
-        if found is None:
-            if self._errands.trouble((job.id, attempt.number)):
-                memory.asked = None
-            return not ended
-        memory.asked, memory.checked = None, began
-        memory.outcomes |= {index: found.get(index) for index in nodes if index in ended or index in found}
-        return all(index in memory.outcomes for index in ended)
-
-    def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
-        """The end of each node; noted in the attempt's record with the other facts about its nodes."""
-        outcomes, ends = self._memory(attempt).outcomes, list[NodeEnd | None]()
-        for record, node in zip(attempt.nodes, status, strict=True):
-            end, key = None, (job.id, attempt.number, record.index)
-            outcome = outcomes.get(record.index)
-            if outcome is not None or not node.running:
-                end, stopped = node_end(outcome, node, job.gang.options.is_native, now())
-                record.exit_code, record.reason, record.error = end.exit_code, end.reason, end.error
-                if record.stopped_at is None:
-                    record.stopped_at = stopped
-                    if attempt.ending is None:  # by itself: no one ended the gang
-                        record.status_reason = lost_host(record.host) if end.lost else AWS_EXITED
-                self.bus.presence.ended(key)
-            elif self.bus.presence.met(key):
-                record.met = True
-            ends.append(end)
-            if node.gpus:
-                record.devices = tuple(node.gpus)
-            record.host = node.host or record.host
-            record.address = node.address or record.address or ""  # of a node that can't be seen it stays known
-        return ends
-
     @staticmethod
     def _mark_running(session: Session, job: Job, attempt: Attempt, reason: str, moment: int) -> None:
         job.started_at = attempt.started_at = now()
@@ -471,24 +373,29 @@ class Attempts:
     def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""
         memory, key = self._memory(attempt), (job.id, attempt.number)
-        if not self._know_outcomes(job, attempt, status):
-            return self._delayed(key)
+        if not self._observer.know_outcomes(job, attempt, status):
+            return self._errands.delayed(key)
         if memory.progress is None:
             reading = partial(self.runs.progress, job.run, attempt.epoch)
             memory.progress = self._errands.result(key, "progress", reading)
         if memory.progress is None:
-            return self._delayed(key)
+            return self._errands.delayed(key)
         iteration = memory.progress.iteration
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
-        return Gone(self.clock.now(), self._ends(job, attempt, status), progress)
+        return Gone(self.clock.now(), self._observer.ends(job, attempt, status), progress)
 
     def _withdraw(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
         job.attempts.remove(attempt)
         job.move(Status.RUNNABLE, reason)
         session.commit()
-        self._memories.pop((job.id, attempt.number), None)
-        self._errands.forget((job.id, attempt.number))
+        self._forget((job.id, attempt.number))
         self.withdrawn(job.id, reason)
+
+    def _forget(self, key: Key) -> None:
+        self._memories.pop(key, None)
+        self._denied.worked(key)
+        self._errands.forget(key)
+        self._observer.forget(key)
 
     def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> None:
         memory, key = self._memory(attempt), (job.id, attempt.number)
@@ -503,10 +410,8 @@ class Attempts:
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
         session.commit()
-        self._memories.pop(key, None)
-        self._denied.worked(key)
+        self._forget(key)
         self.bus.forget(*key)
-        self._errands.forget(key)
         if attempt.epoch != NO_EPOCH:
             self._pool.submit(partial(self.runs.release, job.run, attempt.epoch))
         self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)

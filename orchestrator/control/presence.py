@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from orchestrator import machine
-from orchestrator.domain.attempt import UNHEARD, Silence
+from orchestrator.domain.attempt import UNHEARD
+from orchestrator.domain.attempt_events import Silence
 from shared_store.bus import Node
 
 LOST_AFTER = 120.0

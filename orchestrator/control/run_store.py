@@ -15,6 +15,7 @@ from math import inf
 from typing import Any, TypeVar
 
 from orchestrator.control.peers import Peers
+from orchestrator.domain.attempt_events import Delayed
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.machine import Pool
 from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
@@ -175,6 +176,10 @@ class Errands:
             return None
         self._failing.worked(key)
         return result if started == name else self.result(key, name, body, again)
+
+    def delayed(self, key: Key) -> Delayed | None:
+        """That the store could not be used for the attempt the last time, as an event."""
+        return Delayed(trouble) if (trouble := self.trouble(key)) else None
 
     def trouble(self, key: Key) -> str | None:
         """Why the store could not be used for the attempt the last time; None where it could."""

@@ -10,6 +10,39 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from orchestrator.domain.attempt_events import (
+    Delayed,
+    Due,
+    Event,
+    Gone,
+    LaunchDelayed,
+    Launched,
+    LaunchRefused,
+    Observed,
+    Preempted,
+    Prepared,
+    PrepareRefused,
+    Silence,
+)
+from orchestrator.domain.attempt_instructions import (
+    AwaitCause,
+    AwaitChildren,
+    Close,
+    Decide,
+    Explain,
+    Instruction,
+    Instructions,
+    Keep,
+    Launch,
+    MarkRunning,
+    Observe,
+    Prepare,
+    Save,
+    Stop,
+    TakeEpoch,
+    WindUp,
+    Withdraw,
+)
 from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws, lost_host
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.domain.retry import retries
@@ -109,244 +142,6 @@ class State:
         if self.verdict is not None:
             return Phase.ENDING
         return Phase.RUNNING if self.started else Phase.STARTING
-
-
-@dataclass(frozen=True)
-class Silence:
-    """That the bus does not hear a node that it knew."""
-
-    seconds: float
-    since: str
-    """When it was heard last, for people."""
-    is_lost: bool
-    """Whether that proves that the node is lost; else it is unreachable, and waited for."""
-    cause: str = ""
-    """Why it may be the controller that is cut off; empty where it is not."""
-
-
-# -- events ---------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Due:
-    """It is time for a look at the attempt."""
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """The run belongs to the attempt."""
-
-    epoch: int
-
-
-@dataclass(frozen=True)
-class PrepareRefused:
-    """The run can't be used for good."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class Launched:
-    handle: str
-
-
-@dataclass(frozen=True)
-class LaunchDelayed:
-    """The launch has to wait."""
-
-    reason: str
-    """Empty where there is nothing to say yet."""
-    unknown: bool
-    """Whether something of the gang may run already."""
-
-
-@dataclass(frozen=True)
-class LaunchRefused:
-    """The engine does not start the gang."""
-
-    reason: str
-    is_final: bool = True
-    """It refuses the gang for good; else this attempt has failed, and another one may start."""
-
-
-@dataclass(frozen=True)
-class Preempted:
-    """The scheduler needs the resources for another job."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class Observed:
-    """A look at the gang."""
-
-    moment: int
-    """Steady time [ms]."""
-    ends: Sequence[NodeEnd | None]
-    """By node index; None for a node that has not ended."""
-    silences: Sequence[Silence | None]
-    """By node index; None for a node that the bus hears, or never knew."""
-    waits: str = ""
-    """Why the main node does not run yet or can't be seen; empty once it runs or has ended."""
-    words: str = ""
-    """What the engine says of a main node that runs."""
-    stale: str = ""
-    """Why this is an older picture, where it is."""
-
-
-@dataclass(frozen=True)
-class Delayed:
-    """The store can't be used now, or the gang can't be stopped; that is tried again."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class Gone:
-    """Nothing of the gang runs any more."""
-
-    moment: int
-    """Steady time [ms]."""
-    ends: Sequence[NodeEnd | None]
-    """By node index; empty for a gang that was never launched."""
-    progress: str
-    """The last checkpoint, as a part of a reason; empty where there is none."""
-
-
-Event = (
-    Due | Prepared | PrepareRefused | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | Delayed | Gone
-)
-
-
-# -- instructions ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Prepare:
-    """Create the run where it is missing, and give it to the attempt: → Prepared, PrepareRefused or Delayed, or nothing yet."""
-
-
-@dataclass(frozen=True)
-class TakeEpoch:
-    """Note the attempt's epoch."""
-
-    epoch: int
-
-
-@dataclass(frozen=True)
-class Withdraw:
-    """Take the attempt back: it has used nothing, and what it holds is for other jobs until it is tried again."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class Launch:
-    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, LaunchDelayed or LaunchRefused."""
-
-    again: bool = True
-    """Whether to try again where nothing of the gang can run yet."""
-
-
-@dataclass(frozen=True)
-class Keep:
-    """Note the handle of the gang."""
-
-    handle: str
-
-
-@dataclass(frozen=True)
-class Observe:
-    """Look at the gang: → Observed or Delayed, or nothing before the engine's first look."""
-
-
-@dataclass(frozen=True)
-class Explain:
-    """Give the job this reason."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class MarkRunning:
-    """The job is RUNNING, for this reason, since this moment (steady time [ms])."""
-
-    reason: str
-    moment: int
-
-
-@dataclass(frozen=True)
-class AwaitCause:
-    """Wait for the node that was the cause, since this moment (steady time [ms])."""
-
-    since: int
-
-
-@dataclass(frozen=True)
-class AwaitChildren:
-    """Wait for the children of a main node that is done, since this moment (steady time [ms])."""
-
-    since: int
-
-
-@dataclass(frozen=True)
-class Decide:
-    """Note how the attempt ends."""
-
-    verdict: Verdict
-
-
-@dataclass(frozen=True)
-class Save:
-    """Make what was noted durable before anything else is done."""
-
-
-@dataclass(frozen=True)
-class Stop:
-    """Have the gang stopped, with this grace time [s], unless that is under way: → Delayed, Gone, or nothing yet."""
-
-    grace: float
-
-
-@dataclass(frozen=True)
-class WindUp:
-    """There is nothing to stop: → Gone."""
-
-
-@dataclass(frozen=True)
-class Close:
-    """Close the attempt: account for it and move the job on."""
-
-    moment: int
-    """Steady time [ms]."""
-    spent: bool
-    """Whether it counts against the job's attempts."""
-    status: Status
-    reason: str
-
-
-Instruction = (
-    Prepare
-    | TakeEpoch
-    | Launch
-    | Keep
-    | Observe
-    | Explain
-    | MarkRunning
-    | AwaitCause
-    | AwaitChildren
-    | Decide
-    | Save
-    | Stop
-    | WindUp
-    | Withdraw
-    | Close
-)
-Instructions = tuple[Instruction, ...]
-
-
-# -- the tables -----------------------------------------------------------------------------------------------------------
 
 
 def step(state: State, event: Event) -> Instructions:

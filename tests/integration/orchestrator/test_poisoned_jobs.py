@@ -20,7 +20,9 @@ from orchestrator.control.compute_environments import ensure_compute_environment
 from orchestrator.control.monitoring import exposition
 from orchestrator.control.peers import Peers
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.attempt import Event, Instructions, Phase, State, after, step
+from orchestrator.domain.attempt import Phase, State, after, step
+from orchestrator.domain.attempt_events import Event
+from orchestrator.domain.attempt_instructions import Instructions
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, NodePhase, NodeStatus, NotYet, Plan

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -149,7 +150,7 @@ def _run(
     run = home.run(f"torture-{submitted['jobId'][:8]}")
     for name in blows:
         before = reached(run, 1)
-        wait_for(lambda before=before: reached(run, 1) > before or _is_over(home, run), 60, "the run goes on")
+        wait_for(partial(_went_on, home, run, before), 60, "the run goes on")
         if _is_over(home, run):
             break
         with OUTAGES[name](home):
@@ -161,6 +162,10 @@ def _run(
     judge(verdict, home, run, reference, controller_kills=0)
     done["runs"] += 1
     return verdict
+
+
+def _went_on(home: Home, run: Run, before: int) -> bool:
+    return reached(run, 1) > before or _is_over(home, run)
 
 
 def _is_over(home: Home, run: Run) -> bool:

@@ -12,7 +12,8 @@ from orchestrator.control import attempts, endings
 from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, RunStore
 from orchestrator.domain import attempt as rules
-from orchestrator.domain.attempt import Silence
+from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Silence
+from orchestrator.domain.attempt_instructions import Explain, Instructions, Launch
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
 from shared_store.bus import Node
@@ -58,12 +59,12 @@ def what_is_to_end_is_launched() -> Mutant:
     """B9: a gang that is preempted before its launch is launched all the same."""
     step = rules.step
 
-    def stepped(state: rules.State, event: rules.Event) -> rules.Instructions:
+    def stepped(state: rules.State, event: Event) -> Instructions:
         if state.phase is rules.Phase.LAUNCHING and state.verdict is not None:
-            if isinstance(event, rules.Due):
-                return (rules.Launch(),)
-            if isinstance(event, rules.LaunchDelayed):
-                return (rules.Explain(event.reason),)
+            if isinstance(event, Due):
+                return (Launch(),)
+            if isinstance(event, LaunchDelayed):
+                return (Explain(event.reason),)
         return step(state, event)
 
     return mock.patch.object(attempts, "step", stepped)

@@ -8,43 +8,38 @@ from typing import Any
 
 import pytest
 
-from orchestrator.domain.attempt import (
-    CAUSE_PATIENCE,
-    FINISHING,
-    SHORTEST_REQUEUE,
-    UNHEARD,
+from orchestrator.domain.attempt import CAUSE_PATIENCE, FINISHING, SHORTEST_REQUEUE, UNHEARD, Phase, State, Terms, step
+from orchestrator.domain.attempt_events import (
+    Delayed,
+    Due,
+    Event,
+    Gone,
+    LaunchDelayed,
+    Launched,
+    LaunchRefused,
+    Observed,
+    Preempted,
+    Prepared,
+    PrepareRefused,
+    Silence,
+)
+from orchestrator.domain.attempt_instructions import (
     AwaitCause,
     AwaitChildren,
     Close,
     Decide,
-    Delayed,
-    Due,
-    Event,
     Explain,
-    Gone,
     Instruction,
     Keep,
     Launch,
-    LaunchDelayed,
-    Launched,
-    LaunchRefused,
     MarkRunning,
     Observe,
-    Observed,
-    Phase,
-    Preempted,
     Prepare,
-    Prepared,
-    PrepareRefused,
     Save,
-    Silence,
-    State,
     Stop,
     TakeEpoch,
-    Terms,
     WindUp,
     Withdraw,
-    step,
 )
 from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions

@@ -6,25 +6,19 @@ from dataclasses import replace
 
 import pytest
 
-from orchestrator.domain.attempt import (
-    SHORTEST_REQUEUE,
+from orchestrator.domain.attempt import SHORTEST_REQUEUE, Phase, State, Terms, after, step
+from orchestrator.domain.attempt_events import Gone, Observed
+from orchestrator.domain.attempt_instructions import (
     AwaitCause,
     AwaitChildren,
     Close,
     Decide,
     Explain,
-    Gone,
     Keep,
     MarkRunning,
-    Observed,
-    Phase,
     Save,
-    State,
     Stop,
     TakeEpoch,
-    Terms,
-    after,
-    step,
 )
 from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions

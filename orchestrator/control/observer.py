@@ -1,0 +1,132 @@
+"""What the controller knows of a gang: by its engine, by the bus, and by the outcomes that its nodes leave in the store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+
+from orchestrator import machine
+from orchestrator.control.bus import Bus
+from orchestrator.control.clock import Clock
+from orchestrator.control.endings import node_end
+from orchestrator.control.run_store import Errands, Key, RunStore
+from orchestrator.domain.attempt_events import Delayed, Observed, Silence
+from orchestrator.domain.job import AWS_EXITED, NodeEnd, lost_host
+from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
+from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.models import Attempt, Job, Node, now
+from shared_store.outcomes import Outcome
+
+_CHECK_INTERVAL = 5.0
+"""Seconds between two looks for the outcomes of nodes that can't be seen or heard."""
+
+
+@dataclass
+class _Seen:
+    """What is known of the outcomes of a gang."""
+
+    outcomes: dict[int, Outcome | None] = field(default_factory=dict)
+    """Of nodes that have ended, by index; None for one that has left none."""
+    asked: tuple[float, list[int]] | None = None
+    """Those that are being read: since when (monotonic [s]), and of which nodes."""
+    checked: float | None = None
+    """When they were read last (monotonic [s])."""
+
+
+class Observer:
+    """Looks at gangs. On the controller's thread alone, which never waits here for an engine or the store."""
+
+    def __init__(self, engine: EngineSet, runs: RunStore, errands: Errands, bus: Bus, clock: Clock) -> None:
+        self._engine, self._runs, self._errands, self._bus, self._clock = engine, runs, errands, bus, clock
+        self._seen: dict[Key, _Seen] = {}
+
+    def forget(self, key: Key) -> None:
+        """The attempt is closed."""
+        self._seen.pop(key, None)
+
+    def observe(self, job: Job, attempt: Attempt) -> Observed | Delayed | None:
+        """A look at a gang that was launched; None before its engine's first look, and while its outcomes are read."""
+        assert attempt.handle is not None
+        status = self._engine.observe(attempt.handle)
+        if status is None:
+            return None  # the engine's first look is under way
+        if not self.know_outcomes(job, attempt, status):
+            return self._errands.delayed((job.id, attempt.number))
+        ends = self.ends(job, attempt, status)
+        head = status[job.gang.main]
+        return Observed(
+            moment=self._clock.now(),
+            ends=ends,
+            silences=[self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)],
+            waits=head.words
+            if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
+            else "",
+            words=head.words if head.running else "",
+            stale=next((node.stale for node in status if node.stale), ""),
+        )
+
+    def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
+        """The silence of a node; it counts only where its engine says that it runs, and it has left no outcome."""
+        assert attempt.handle is not None
+        checked = self._of(attempt).checked
+        is_seen = status.phase is not NodePhase.UNREACHABLE and not status.stale
+        asked = self._engine.asked(attempt.handle) if is_seen and checked is not None else None
+        if asked is not None and checked is not None:
+            asked = max(asked, machine.monotonic() - checked)
+        return self._bus.presence.silence((attempt.job_id, attempt.number, node.index), asked)
+
+    def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
+        """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
+
+        Returns whether those of the nodes that have ended are known.
+        """
+        memory, presence, moment = self._of(attempt), self._bus.presence, machine.monotonic()
+        ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
+        hidden = [
+            index
+            for index, node in enumerate(status)
+            if node.running
+            and memory.outcomes.get(index) is None
+            and (
+                node.phase is NodePhase.UNREACHABLE or node.stale or presence.is_silent((job.id, attempt.number, index))
+            )
+        ]
+        if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < _CHECK_INTERVAL)):
+            return True
+        memory.asked = memory.asked or (moment, [*ended, *hidden])
+        began, nodes = memory.asked
+        reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, nodes)
+        found = self._errands.result((job.id, attempt.number), "outcomes", reading)
+        if found is None:
+            if self._errands.trouble((job.id, attempt.number)):
+                memory.asked = None
+            return not ended
+        memory.asked, memory.checked = None, began
+        memory.outcomes |= {index: found.get(index) for index in nodes if index in ended or index in found}
+        return all(index in memory.outcomes for index in ended)
+
+    def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
+        """The end of each node; noted in the attempt's record with the other facts about its nodes."""
+        outcomes, ends = self._of(attempt).outcomes, list[NodeEnd | None]()
+        for record, node in zip(attempt.nodes, status, strict=True):
+            end, key = None, (job.id, attempt.number, record.index)
+            outcome = outcomes.get(record.index)
+            if outcome is not None or not node.running:
+                end, stopped = node_end(outcome, node, job.gang.options.is_native, now())
+                record.exit_code, record.reason, record.error = end.exit_code, end.reason, end.error
+                if record.stopped_at is None:
+                    record.stopped_at = stopped
+                    if attempt.ending is None:  # by itself: no one ended the gang
+                        record.status_reason = lost_host(record.host) if end.lost else AWS_EXITED
+                self._bus.presence.ended(key)
+            elif self._bus.presence.met(key):
+                record.met = True
+            ends.append(end)
+            if node.gpus:
+                record.devices = tuple(node.gpus)
+            record.host = node.host or record.host
+            record.address = node.address or record.address or ""  # of a node that can't be seen it stays known
+        return ends
+
+    def _of(self, attempt: Attempt) -> _Seen:
+        return self._seen.setdefault((attempt.job_id, attempt.number), _Seen())

@@ -1,0 +1,113 @@
+"""What happens to an attempt: the events of :func:`orchestrator.domain.attempt.step`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from orchestrator.domain.job import NodeEnd
+
+
+@dataclass(frozen=True)
+class Silence:
+    """That the bus does not hear a node that it knew."""
+
+    seconds: float
+    since: str
+    """When it was heard last, for people."""
+    is_lost: bool
+    """Whether that proves that the node is lost; else it is unreachable, and waited for."""
+    cause: str = ""
+    """Why it may be the controller that is cut off; empty where it is not."""
+
+
+@dataclass(frozen=True)
+class Due:
+    """It is time for a look at the attempt."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The run belongs to the attempt."""
+
+    epoch: int
+
+
+@dataclass(frozen=True)
+class PrepareRefused:
+    """The run can't be used for good."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Launched:
+    handle: str
+
+
+@dataclass(frozen=True)
+class LaunchDelayed:
+    """The launch has to wait."""
+
+    reason: str
+    """Empty where there is nothing to say yet."""
+    unknown: bool
+    """Whether something of the gang may run already."""
+
+
+@dataclass(frozen=True)
+class LaunchRefused:
+    """The engine does not start the gang."""
+
+    reason: str
+    is_final: bool = True
+    """It refuses the gang for good; else this attempt has failed, and another one may start."""
+
+
+@dataclass(frozen=True)
+class Preempted:
+    """The scheduler needs the resources for another job."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A look at the gang."""
+
+    moment: int
+    """Steady time [ms]."""
+    ends: Sequence[NodeEnd | None]
+    """By node index; None for a node that has not ended."""
+    silences: Sequence[Silence | None]
+    """By node index; None for a node that the bus hears, or never knew."""
+    waits: str = ""
+    """Why the main node does not run yet or can't be seen; empty once it runs or has ended."""
+    words: str = ""
+    """What the engine says of a main node that runs."""
+    stale: str = ""
+    """Why this is an older picture, where it is."""
+
+
+@dataclass(frozen=True)
+class Delayed:
+    """The store can't be used now, or the gang can't be stopped; that is tried again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Gone:
+    """Nothing of the gang runs any more."""
+
+    moment: int
+    """Steady time [ms]."""
+    ends: Sequence[NodeEnd | None]
+    """By node index; empty for a gang that was never launched."""
+    progress: str
+    """The last checkpoint, as a part of a reason; empty where there is none."""
+
+
+Event = (
+    Due | Prepared | PrepareRefused | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | Delayed | Gone
+)

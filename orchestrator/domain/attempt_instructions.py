@@ -1,0 +1,131 @@
+"""What is to be done for an attempt: the instructions that :func:`orchestrator.domain.attempt.step` gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from orchestrator.domain.job import Status, Verdict
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Create the run where it is missing, and give it to the attempt: → Prepared, PrepareRefused or Delayed, or nothing yet."""
+
+
+@dataclass(frozen=True)
+class TakeEpoch:
+    """Note the attempt's epoch."""
+
+    epoch: int
+
+
+@dataclass(frozen=True)
+class Withdraw:
+    """Take the attempt back: it has used nothing, and what it holds is for other jobs until it is tried again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Launch:
+    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, LaunchDelayed or LaunchRefused."""
+
+    again: bool = True
+    """Whether to try again where nothing of the gang can run yet."""
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Note the handle of the gang."""
+
+    handle: str
+
+
+@dataclass(frozen=True)
+class Observe:
+    """Look at the gang: → Observed or Delayed, or nothing before the engine's first look."""
+
+
+@dataclass(frozen=True)
+class Explain:
+    """Give the job this reason."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class MarkRunning:
+    """The job is RUNNING, for this reason, since this moment (steady time [ms])."""
+
+    reason: str
+    moment: int
+
+
+@dataclass(frozen=True)
+class AwaitCause:
+    """Wait for the node that was the cause, since this moment (steady time [ms])."""
+
+    since: int
+
+
+@dataclass(frozen=True)
+class AwaitChildren:
+    """Wait for the children of a main node that is done, since this moment (steady time [ms])."""
+
+    since: int
+
+
+@dataclass(frozen=True)
+class Decide:
+    """Note how the attempt ends."""
+
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Save:
+    """Make what was noted durable before anything else is done."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Have the gang stopped, with this grace time [s], unless that is under way: → Delayed, Gone, or nothing yet."""
+
+    grace: float
+
+
+@dataclass(frozen=True)
+class WindUp:
+    """There is nothing to stop: → Gone."""
+
+
+@dataclass(frozen=True)
+class Close:
+    """Close the attempt: account for it and move the job on."""
+
+    moment: int
+    """Steady time [ms]."""
+    spent: bool
+    """Whether it counts against the job's attempts."""
+    status: Status
+    reason: str
+
+
+Instruction = (
+    Prepare
+    | TakeEpoch
+    | Launch
+    | Keep
+    | Observe
+    | Explain
+    | MarkRunning
+    | AwaitCause
+    | AwaitChildren
+    | Decide
+    | Save
+    | Stop
+    | WindUp
+    | Withdraw
+    | Close
+)
+Instructions = tuple[Instruction, ...]
