@@ -23,13 +23,14 @@ FORBIDDEN = {
 LIGHT_IN_WORKER = ("node", "supervisor.py", "slurm_node.py", "aws_node.py", "__init__.py")
 
 LAYERS = {
+    "machine": set[str](),
     "domain": set[str](),
     "spec": {"domain"},
     "scheduling": {"domain"},
-    "persistence": {"domain"},
-    "engines": {"domain"},
-    "control": {"domain", "spec", "scheduling", "persistence", "engines"},
-    "api": {"domain", "spec", "scheduling", "persistence", "engines", "control", "keys"},
+    "persistence": {"domain", "machine"},
+    "engines": {"domain", "machine"},
+    "control": {"domain", "machine", "spec", "scheduling", "persistence", "engines"},
+    "api": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "keys"},
     "console": {"domain", "spec", "scheduling", "persistence", "control", "api", "keys"},
     "home": {"domain"},
     "keys": {"domain"},
