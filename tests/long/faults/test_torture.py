@@ -1,4 +1,4 @@
-"""A short torture with a fixed seed; the long one is ``make torture``."""
+"""A short torture with fixed seeds; the long one is ``make torture``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tests.support.faults.fire import Fire, run_straight
 from tests.support.faults.home import Home
+from tests.support.faults.outages import OUTAGES, outage_round
 from tests.support.faults.schedule import SHARES, draw_plan
 from tests.support.processes import end_all
 
@@ -27,3 +28,9 @@ def test_a_run_under_fire_ends_with_the_bits_of_a_straight_one(tmp_path: Path) -
     assert len(result.hits) == len(PLAN.blows) and {hit.target for hit in result.hits} < SHARES.keys()
     assert result.verdict.attempts == 2 and result.verdict.checkpoints >= 3
     assert result.controller_starts >= 3
+
+
+def test_outages_of_network_and_store_and_a_moved_controller_end_nothing_and_change_no_bit(tmp_path: Path) -> None:
+    done, violations = outage_round(tmp_path, 7, sizes=(2,), blows=tuple(OUTAGES))
+    assert not violations
+    assert done == {**dict.fromkeys(OUTAGES, 1), "runs": 1}

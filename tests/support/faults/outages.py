@@ -120,17 +120,19 @@ OUTAGES: Mapping[str, Callable[[Home], AbstractContextManager[None]]] = {
 }
 
 
-def outage_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]]:
-    """One run of each size of gang under such blows: its only attempt must end as that of the straight run."""
+def outage_round(
+    directory: Path, seed: int, sizes: Sequence[int] = (1, 3), blows: Sequence[str] = ()
+) -> tuple[Counter[str], list[str]]:
+    """One run of each size of gang under these blows, drawn ones by default: its only attempt must end as that of the straight run."""
     rng = random.Random(seed)
     done, wrong = Counter[str](), list[str]()
     with loop_volume(directory / "home" / "store"):
         home = Home(directory / "home", "--lost-after", f"{LOST_AFTER:.0f}s", "--min-free", "1MiB")
         try:
             home.serve()
-            for nodes in (1, 3):
+            for nodes in sizes:
                 reference = run_straight(home, nodes, ITERATIONS)
-                verdict = _run(home, nodes, reference, rng.choices(list(OUTAGES), k=BLOWS), rng, done)
+                verdict = _run(home, nodes, reference, blows or rng.choices(list(OUTAGES), k=BLOWS), rng, done)
                 wrong += verdict.violations
                 wrong += [f"{nodes} nodes: {verdict.attempts} attempts"] * (verdict.attempts != 1)
         finally:
