@@ -120,12 +120,40 @@ def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: SlurmBench, monke
     assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
 
 
-def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: SlurmBench, tmp_path: Path) -> None:
+def test_a_stop_that_began_without_slurmctld_leaves_the_whole_grace_from_when_the_nodes_were_asked(
+    bench: SlurmBench,
+) -> None:
+    handle = bench.ready(bench.gang(POLITE, 2))
+    bench.saved(handle)
+    bench.cluster.kill("slurmctld")
+    stopping = threading.Thread(target=bench.engine.stop, args=(handle, 5.0))
+    stopping.start()
+    time.sleep(6.0)
+    bench.cluster.start("slurmctld")
+    stopping.join(60 * PATIENCE)
+    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75] and bench.log().count("saved") == 2
+
+
+def test_a_frozen_slurmctld_is_named_by_the_gangs_that_run_and_by_those_that_are_stopped(
+    bench: SlurmBench, tmp_path: Path
+) -> None:
     served = Serving(tmp_path / "home", "--engine", "slurm")
     daemon = bench.cluster.daemons["slurmctld"]
     try:
         job = served.gang("import time; print('ready', flush=True); time.sleep(600)", env={"MUSTER_DIRECTORY": "/tmp"})
         served.wait(job, "RUNNING")
+        runs = "attempt 1 runs on 1 node"
+
+        def says(words: str) -> bool:
+            reason: str = served.detail(job)["statusReason"]
+            assert reason.startswith(runs), reason
+            return words in reason if words else reason == runs
+
+        wait_for(lambda: says(""), 20, "it runs")
+        daemon.send_signal(signal.SIGSTOP)
+        wait_for(lambda: says("; Slurm: slurmctld "), 40, "its engine does not answer")
+        daemon.send_signal(signal.SIGCONT)
+        wait_for(lambda: says(""), 40, "it answers again")
         daemon.send_signal(signal.SIGSTOP)
         command = [MUSTER, "stop", job]
         stopping = subprocess.Popen(

@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +67,9 @@ _KILLING = 60.0
 _SILENCE = "slurmctld has not answered yet; see `scontrol ping`"
 _HOSTS_AGE, _JOBS_AGE = 10.0, 1.0
 """Seconds for which a view of all hosts, and of this user's jobs, holds."""
-_ANSWER = 2.0
-"""Seconds that a look at a job waits for squeue."""
+_ANSWER, _OVERDUE = 2.0, 8.0
+"""Seconds that a look at a job waits for squeue, and after which slurmctld does not answer. A look at a job that was never seen waits for
+all of them: a loaded machine answers late."""
 _PATIENCE = 5.0
 """Seconds for which a launch waits for sbatch, which tries for longer where slurmctld is away: other jobs wait meanwhile."""
 _FORGOTTEN = "0"
@@ -88,10 +90,12 @@ class SlurmEngine:
 
     def __init__(self) -> None:
         """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""
-        self._hosts = CachedView[Sequence[Host]]((), list_hosts, name="scontrol", silence=_SILENCE)
+        self._hosts = CachedView[Sequence[Host]]((), list_hosts, name="scontrol", silence=_SILENCE, overdue=_OVERDUE)
         self._hosts.read()
         self.address = address_of_this_machine()
-        self._jobs = CachedView[Mapping[str, SlurmJob]]({}, list_jobs, name="squeue", silence=_SILENCE)
+        self._jobs = CachedView[Mapping[str, SlurmJob]](
+            {}, list_jobs, name="squeue", silence=_SILENCE, overdue=_OVERDUE
+        )
         self._submitted: dict[str, float] = {}
         self._submitting = threading.Lock()
         self._pending: dict[str, Future[str]] = {}
@@ -212,8 +216,9 @@ class SlurmEngine:
     def _job(self, handle: Handle, age: float = _JOBS_AGE) -> SlurmJob | None:
         """None where Slurm has forgotten it. Raises Unreachable: no view since it was submitted."""
         number = handle.facts["slurm"]
-        job = self._jobs.get(age, _ANSWER).get(number)
-        if job is None and self._jobs.taken <= self._submitted.get(number, 0.0):
+        submitted = self._submitted.get(number, 0.0)
+        job = self._jobs.get(age, _ANSWER if self._jobs.taken > submitted else _OVERDUE).get(number)
+        if job is None and self._jobs.taken <= submitted:
             raise Unreachable(self._jobs.trouble or _SILENCE)
         return job if job is not None and job.comment == handle.gang else None
 
@@ -222,18 +227,19 @@ class _Ending:
     """The end of one job: asked by a signal, then killed."""
 
     def __init__(self, number: str, grace: float) -> None:
-        self.number = number
-        self._due, self._asked, self._killed = time.monotonic() + grace, grace <= 0, 0.0
+        self.number, self._grace, self._killed = number, grace, 0.0
+        self._due = inf if grace > 0 else 0.0
+        """When it is killed (monotonic [s]); infinity until it was asked."""
 
     def next(self, job: SlurmJob) -> str:
         """Cancel the job, where that is due; returns its state in words. Raises Unreachable."""
         now, number = time.monotonic(), self.number
         if job.state in QUEUED:
             _cancel(number)
-        elif not self._asked:
+        elif self._due == inf:
             # to the script alone, which tells the nodes: it knows whether they have been started yet
             _cancel("--batch", "--signal=USR1", number)
-            self._asked = True
+            self._due = time.monotonic() + self._grace  # from now on: slurmctld may have been away
         elif now >= self._due and not self._killed:
             # the step at once; to end the job, Slurm asks once more and waits for KillWait
             _cancel("--signal=KILL", f"{number}.0")

@@ -67,6 +67,7 @@ def waiting(job: SlurmJob) -> str:
 
 
 _ENDS = {
+    "COMPLETED": (Cause.EXIT, 0, "Slurm says COMPLETED"),
     "PREEMPTED": (Cause.PREEMPTED, 75, "preempted by Slurm, and did not leave in time"),
     "TIMEOUT": (Cause.STOPPED, 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time)"),
     "DEADLINE": (Cause.STOPPED, 137, "Slurm ended it at its deadline"),

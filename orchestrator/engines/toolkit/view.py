@@ -58,15 +58,17 @@ class View(Generic[T]):
 class CachedView(View[T]):
     """A value that is read on a thread of its own once it is too old: a backend that hangs delays no caller for long."""
 
-    def __init__(self, value: T, read: Callable[[], T], *, name: str, silence: str) -> None:
+    def __init__(self, value: T, read: Callable[[], T], *, name: str, silence: str, overdue: float = 0.0) -> None:
         """Args:
         value: That until the first answer.
         read: Asks the backend. Raises EngineError.
         name: Of the thread.
         silence: The trouble while an answer is late, in words.
+        overdue: Seconds that an answer may take before it is late.
         """
         super().__init__(value)
-        self._read, self._name, self._silence = read, name, silence
+        self._read, self._name, self._silence, self._overdue = read, name, silence, overdue
+        self._asked = 0.0
         self._idle = threading.Event()
         self._idle.set()
         self._late = False
@@ -74,7 +76,8 @@ class CachedView(View[T]):
 
     @property
     def trouble(self) -> str | None:
-        return super().trouble or (self._silence if self._late else None)
+        is_overdue = self._late and machine.monotonic() - self._asked >= self._overdue
+        return super().trouble or (self._silence if is_overdue else None)
 
     def read(self) -> T:
         """The value as it is now, read on the caller's thread. Raises EngineError."""
@@ -102,6 +105,7 @@ class CachedView(View[T]):
         with self._lock:
             if self._idle.is_set():
                 self._idle.clear()
+                self._asked = machine.monotonic()
                 machine.thread(self._name, self._run)
         if patience and not self._late and not self._idle.wait(patience):
             self._late = True

@@ -323,6 +323,7 @@ def test_slurm_s_reason_for_a_waiting_job_is_put_into_words(state: str, reason: 
         ("TIMEOUT", Cause.STOPPED, 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time)"),
         ("OUT_OF_MEMORY", Cause.OUT_OF_MEMORY, 137, "OutOfMemoryError: Container killed due to memory usage"),
         ("NODE_FAIL", Cause.HOST_LOST, 137, "Slurm lost a node of n1"),
+        ("COMPLETED", Cause.EXIT, 0, "Slurm says COMPLETED"),
         ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why"),
     ],
 )

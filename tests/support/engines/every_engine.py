@@ -72,6 +72,13 @@ class EveryEngine:
         assert site.printed(job) == ["one"] and detail["attempts"][0]["nodes"][0]["exitCode"] == 7
         await_job_end(job)
 
+    def test_where_the_outcome_can_not_be_written_the_exit_code_counts_that_the_engine_saw(self, site: Site) -> None:
+        link = "ln -s /tmp $MUSTER_STORE/runs/$MUSTER_RUN/outcomes"  # which is never followed
+        detail = site.serving.wait(site.submit(link, nodes=1), timeout=60)
+        [node] = detail["attempts"][0]["nodes"]
+        assert (detail["status"], node["exitCode"]) == ("SUCCEEDED", 0), (detail["statusReason"], node)
+        assert node["reason"].startswith("exit 0, outcome not written"), node
+
     def test_one_that_does_not_fit_waits_and_says_why(self, site: Site) -> None:
         job = site.submit("true", nodes=2, cpus="100000")
         found = lambda: (d := site.serving.detail(job)) and "100000 CPUs" in (d["statusReason"] or "") and d  # noqa: E731
