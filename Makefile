@@ -195,7 +195,7 @@ cluster: .cluster/environment
 	@echo "  export MUSTER_URL=http://127.0.0.1:$(PORT) $$(grep MUSTER_TOKEN .cluster/environment)"
 
 cluster-down: .cluster/environment
-	$(COMPOSE) down --timeout 45 $(if $(VOLUMES),--volumes)
+	$(COMPOSE) down $(if $(VOLUMES),--volumes)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache

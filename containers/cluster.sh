@@ -17,11 +17,9 @@ head)
 worker)
   begin worker
   export WARP_CACHE_PATH=/muster/kernels
-  until ray start --block --address="$RAY_HEAD" --node-name="$(hostname)" --num-cpus="$MUSTER_WORKER_CPUS" \
-    --memory="$MUSTER_WORKER_MEMORY" $small; do
-    echo "no Ray head at $RAY_HEAD yet; trying again" >&2
-    sleep 2
-  done
+  # Ray itself gets the signal of `docker stop`, and drains. Without a head it ends, and Docker starts the container again.
+  exec ray start --block --address="$RAY_HEAD" --node-name="$(hostname)" --num-cpus="$MUSTER_WORKER_CPUS" \
+    --memory="$MUSTER_WORKER_MEMORY" $small
   ;;
 controller)
   begin controller
@@ -29,7 +27,14 @@ controller)
   join() { ray start --address="$RAY_HEAD" --node-name=controller --num-cpus=0 $small; }
   until join; do sleep 2; done
   (while sleep 5; do grep -qs '^raylet' /proc/[0-9]*/comm || join || true; done) &
-  exec muster serve --engine ray --host 0.0.0.0 --port 8080 --store /muster/store
+  muster serve --engine ray --host 0.0.0.0 --port 8080 --store /muster/store &
+  serving=$!
+  trap 'kill "$serving" 2>/dev/null || true' TERM INT
+  until wait "$serving" || ! kill -0 "$serving" 2>/dev/null; do :; done   # a signal, too, ends a wait
+  # The drivers end with this container. Each has its gang save and leave first, and nobody starts it again until then.
+  drivers() { grep -ls 'orchestrator.engines.ray.drive[r]' /proc/[0-9]*/cmdline | cut -d/ -f3; }
+  for driver in $(drivers); do kill "$driver" 2>/dev/null || true; done
+  while [ -n "$(drivers)" ]; do sleep 0.2; done
   ;;
 healthy)
   case "$(cat /tmp/role)" in

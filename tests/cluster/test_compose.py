@@ -9,6 +9,7 @@ import secrets
 import shutil
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,12 @@ import pytest
 import yaml
 
 from orchestrator.client import Client
+from orchestrator.domain.attempt import SHORTEST_REQUEUE
 from orchestrator.domain.errors import ApiError, Unreachable
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, wait_for
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 from tests.support.engines.ray_cluster import IMPATIENT
+from tests.support.engines.sites import POLITE
 from tests.support.worker.ranks import free_port
 
 NODES = 3
@@ -66,8 +69,8 @@ class Cluster:
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    def up(self) -> None:
-        self.compose("up", "--detach", "--scale", f"worker={NODES}")
+    def up(self, workers: int = NODES) -> None:
+        self.compose("up", "--detach", "--scale", f"worker={workers}")
 
     def muster(self, *arguments: str) -> str:
         """The command on this machine, as a user has it."""
@@ -142,3 +145,40 @@ def test_a_training_survives_two_workers_and_the_controller(cluster: Cluster, do
     assert done["status"] == "SUCCEEDED", done["statusReason"]
     assert len(done["attempts"]) >= 2 and iteration() == 24
     assert "resumed from checkpoint" in cluster.muster("logs", job)
+
+
+def test_what_is_scaled_down_restarted_or_taken_down_has_its_jobs_save_and_spends_no_attempt(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    wait_for(lambda: len(cluster.hosts()) == NODES, 90, "the workers")
+    job = {"name": "polite", "nodes": NODES, "command": ["sh", "-c", POLITE], "retry": {"attempts": 1}}
+    spec = tmp_path / "polite.yaml"
+    spec.write_text(yaml.safe_dump({**job, "resources": {"cpus": 1, "memory": "64MiB"}}))
+    polite = json.loads(cluster.muster("submit", str(spec), "--json"))["jobId"]
+
+    def attempts() -> list[dict[str, Any]]:
+        found = cluster.ask(f"/api/jobs/{polite}") or {"attempts": [], "status": ""}
+        assert found["status"] != "FAILED", found["statusReason"]
+        attempts: list[dict[str, Any]] = found["attempts"]
+        return attempts
+
+    def ready(number: int) -> bool:
+        lines = cluster.ask(f"/api/jobs/{polite}") and cluster.muster("logs", polite, "--attempt", str(number))
+        return (lines or "").count("ready") == NODES
+
+    def saved(number: int) -> bool:
+        found = attempts()
+        return len(found) >= number and [node["exitCode"] for node in found[number - 1]["nodes"]] == [75] * NODES
+
+    blows = (
+        lambda: cluster.up(NODES - 1),
+        lambda: cluster.compose("restart", "controller"),
+        lambda: cluster.compose("down"),
+    )
+    for number, blow in enumerate(blows, start=1):
+        wait_for(lambda number=number: len(attempts()) == number and ready(number), 120, f"attempt {number}")
+        time.sleep(SHORTEST_REQUEUE / 1000)
+        blow()
+        cluster.up()
+        wait_for(lambda number=number: saved(number), 120, f"the end of attempt {number}")
+    assert [each["spent"] for each in attempts()[: len(blows)]] == [False] * len(blows)

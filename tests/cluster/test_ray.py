@@ -202,6 +202,19 @@ def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBenc
     wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "its successor is one")
 
 
+def test_a_driver_that_is_told_to_end_has_its_gang_save_and_leaves_one_that_waits_to_the_next_driver(
+    bench: RayBench,
+) -> None:
+    handle = bench.ready(bench.gang(POLITE))
+    waiting = bench.launch(bench.gang(POLITE, suffix="-2"))  # for room
+    wait_for(lambda: "waits for room" in bench.engine.observe(waiting)[0].words, 20, "it is placed")
+    for driver in processes_of(bench.home / "home"):
+        os.kill(driver, signal.SIGTERM)
+    wait_for(lambda: bench.log().count("saved") == 3, 30, "all have saved")
+    assert [node.exit_code for node in bench.ended(handle, bench.new_engine())] == [75, 75, 75]
+    bench.ready(bench.gang(POLITE, suffix="-2"))
+
+
 def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> None:
     bench.cluster.add("controller", cpus=0, gpus=0)  # a driver on the head's own node would go with it
     wait_for(lambda: bench.engine._watch.seen["join"] == addresses(bench).get("controller"), 20, "it is seen")

@@ -2,7 +2,8 @@
 
 ``python -m orchestrator.engines.ray.driver FOLDER JOIN FD``. It outlives the controller, takes commands from the folder's pipe
 and tells in state files how the nodes are (:mod:`orchestrator.engines.ray.folder`). When a gang is over it keeps the placement group
-for a while: the job's next attempt finds its place, its GPUs and a driver that knows the cluster. Ray is imported here and nowhere else
+for a while: the job's next attempt finds its place, its GPUs and a driver that knows the cluster. On SIGTERM, which comes where its machine
+shuts down, it has the gang save and leave; a gang that was not started is left to the next driver. Ray is imported here and nowhere else
 but in the watch, so that nothing that it does to a process that loses its cluster is done to the controller.
 """
 
@@ -12,6 +13,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import sys
 import threading
 import time
@@ -29,6 +31,10 @@ from orchestrator.engines.ray.gang import DrivenGang
 
 _LINGER = 15.0
 """Seconds for which the place of a gang that is over is kept for the job's next attempt."""
+_LEAVING = 2.0
+"""Seconds between two requests to leave: a node may not have been started at the first."""
+_UNSTARTED = ("joining", "placing", "starting")
+"""Phases of a gang before any command was started."""
 _JOINING = 90.0
 """Seconds that joining the cluster may take: ``ray.init`` itself would try for ever."""
 
@@ -45,8 +51,8 @@ class Driver:
         self.idle_since = time.monotonic()
         self._partial = b""
         self._draining: set[str] = set()
-        self._told_to_leave = False
-        self._next_look = 0.0
+        self._leaves = False
+        self._next_leave, self._next_look = 0.0, 0.0
 
     def run(self) -> None:
         """Until the job has been over for a while."""
@@ -54,14 +60,18 @@ class Driver:
             self.folder.alive.touch()
             gang = self.gang
             if gang is None or gang.phase == "stopped":
-                if time.monotonic() - self.idle_since > _LINGER:
+                if self._leaves or time.monotonic() - self.idle_since > _LINGER:
                     return
                 self._read(0.2)
                 continue
+            if self._leaves and gang.phase in _UNSTARTED:
+                gang.forget()
+                return
             self._step(gang)
             gang.tell()
             if gang.is_over and gang.phase != "stopping":
-                if time.monotonic() - self.idle_since > 4 * _LINGER:  # nobody asks: the controller is gone for long
+                # or nobody asks: the controller is gone for long
+                if self._leaves or time.monotonic() - self.idle_since > 4 * _LINGER:
                     gang.clear()
                     gang.tell()
             else:
@@ -79,9 +89,9 @@ class Driver:
                 gang.start([addresses[node["ray_node"]] for node in gang.nodes])
         else:
             gang.listen(0.1)
-            leaving = [node["ray_node"] for node in gang.nodes if node["ray_node"] in self._draining]
-            if leaving and gang.phase == "running" and not self._told_to_leave:
-                self._told_to_leave = True
+            leaves = self._leaves or any(node["ray_node"] in self._draining for node in gang.nodes)
+            if leaves and gang.phase == "running" and time.monotonic() > self._next_leave:
+                self._next_leave = time.monotonic() + _LEAVING
                 gang.leave()
             if gang.phase == "stopping" and (not gang.is_stopping or time.monotonic() > gang.deadline):
                 gang.clear()
@@ -103,7 +113,7 @@ class Driver:
                 bundles, strategy=STRATEGY, name=name, bundle_label_selector=selectors
             )
             self.key = key
-        gang.phase, gang.why, self._told_to_leave = "placing", "waits for its placement group", False
+        gang.phase, gang.why = "placing", "waits for its placement group"
 
     def _await_place(self, gang: DrivenGang) -> None:
         if self.group.wait(0.1):
@@ -119,6 +129,14 @@ class Driver:
                     node["pin"] = None
                 self._place(gang)
             gang.why = _why_waiting(gang.plan["nodes"])
+
+    def leave(self, *_: object) -> None:
+        """SIGTERM: see the module."""
+        self._leaves = True
+        if not ray.is_initialized():
+            if self.gang is not None:
+                self.gang.forget()
+            os._exit(0)
 
     def _obey(self) -> bool:
         """Carry out the commands that have come; True where the driver should leave."""
@@ -196,6 +214,7 @@ def main(argv: list[str]) -> int:
     folder, join, commands = Folder(Path(argv[0])), argv[1], int(argv[2])
     os.set_inheritable(commands, False)
     driver = Driver(folder, join, commands)
+    signal.signal(signal.SIGTERM, driver.leave)
     driver._obey()
     gang = driver.gang
     if gang is None:
@@ -223,6 +242,7 @@ def main(argv: list[str]) -> int:
         gang.tell()
         return 1
     patience.cancel()
+    signal.signal(signal.SIGTERM, driver.leave)  # Ray has one of its own
     threading.Thread(target=driver.watch, name="watch", daemon=True).start()
     driver.run()
     # leaving, it must not wait for a head that is away; what it holds goes with it

@@ -149,7 +149,7 @@ class DrivenGang:
                 self.asked[actor.stop.remote(grace)] = ("stop", index)
 
     def leave(self) -> None:
-        """SIGTERM to all: one of the machines will go away."""
+        """SIGTERM to all: one of the machines will go away, or the driver's."""
         for actor in self.actors:
             actor.leave.remote()
 
@@ -220,6 +220,12 @@ class DrivenGang:
             elif now - self.heard[index] > (_STARTING if self.phase == "starting" else LEASE):
                 self.nodes[index]["silent"] = True
                 self.end(index, None, "")
+
+    def forget(self) -> None:
+        """No command was started: who looks for the gang next starts it."""
+        for actor in self.actors:
+            ray.kill(actor)
+        self.folder.state(self.name).unlink(missing_ok=True)
 
     def clear(self) -> None:
         """The gang is over: its actors go."""
