@@ -24,7 +24,7 @@ from orchestrator.api.http.limits import RATE, RateLimit
 from orchestrator.api.native.automatic import AutomaticEvaluations
 from orchestrator.console import add_console
 from orchestrator.control.bus import Bus
-from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.control.compute_environments import ensure_compute_environments, in_order
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
@@ -86,7 +86,7 @@ class Server:
         ``database``: URL, or path of an SQLite file, where it is not that of the home directory. ``min_free``: what must be free on
         the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of jobs is kept;
         None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
-        first.
+        first, or to the one whose jobs in it are not over.
         ``adopt_store``: take what is at the store's path, although the database knows another store.
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
@@ -121,6 +121,7 @@ class Server:
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
                     identity = recognise(session, self.store, adopt_store)
+                    nodes.arrange(in_order(session, nodes.names))
                     ensure_compute_environments(session, nodes.names)
             except (DatabaseError, SecretsError) as error:
                 raise ServerError(str(error)) from None

@@ -1,19 +1,53 @@
 """The built-in queues and compute environments: one of each for every engine.
 
-A job goes to an engine by its queue. The queue ``default`` is that of the first engine, unless it was given others.
+A job goes to an engine by its queue. The queue ``default`` is that of the first engine, unless it was given others, or has jobs of another
+engine that are not over.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
-from orchestrator.persistence.models import ComputeEnvironment, JobQueue
+from orchestrator.persistence.models import ComputeEnvironment, Job, JobQueue
+from shared_store.wording import counted
+
+log = logging.getLogger("muster.controller")
 
 ENGINE_TAG = "muster:engine"
 """Tag that names the engine of a compute environment; without it, the controller's first engine."""
+
+
+def in_order(session: Session, engines: Sequence[str]) -> list[str]:
+    """``engines``, first the one that has the queue ``default``: their order moves no job to another engine, and says so."""
+    first, default = engines[0], session.get(JobQueue, "default")
+    before = (
+        default.compute_environments[0] if default is not None and len(default.compute_environments) == 1 else first
+    )
+    if before == first or before not in ENGINES:
+        return list(engines)
+    # a compute environment that names no engine goes with the queue
+    unnamed = {each.name for each in session.scalars(select(ComputeEnvironment)) if ENGINE_TAG not in each.tags}
+    queues = [each.name for each in session.scalars(select(JobQueue)) if unnamed & set(each.compute_environments)]
+    moved = select(func.count()).where(Job.queue.in_([*queues, "default"]), Job.status.not_in(TERMINAL))
+    if not (count := session.scalar(moved)):
+        return list(engines)
+    jobs = f"{counted(count, 'job')} in it {'is' if count == 1 else 'are'} not over"
+    if before not in engines:
+        log.warning("queue default moves from engine %s, which is not served, to engine %s: %s", before, first, jobs)
+        return list(engines)
+    log.warning(
+        "queue default stays with engine %s until the next start: %s; engine %s has a queue of its name",
+        before,
+        jobs,
+        first,
+    )
+    return [before, *(each for each in engines if each != before)]
 
 
 def ensure_compute_environments(session: Session, engines: Sequence[str]) -> None:

@@ -62,6 +62,10 @@ class EngineSet:
             for runner in self._runners.values():
                 stack.callback(runner.close)
 
+    def arrange(self, names: Sequence[str]) -> None:
+        """Take the engines in this order: all of them, by their names."""
+        self.engines = {name: self.engines[name] for name in names}
+
     @property
     def names(self) -> Sequence[str]:
         return list(self.engines)

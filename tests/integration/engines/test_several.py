@@ -25,6 +25,7 @@ from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files, pl
 from tests.support.engines.sites import POLITE, WAIT
 from tests.support.engines.slurm_cluster import need_slurm
 from tests.support.engines.training import submit
+from tests.support.processes import kill_rank
 
 
 @pytest.fixture(scope="module")
@@ -272,6 +273,34 @@ def test_a_job_goes_to_the_engine_that_it_names_and_else_to_the_first(tmp_path: 
     with Serving(tmp_path, "--engine", "docker") as served:
         assert served.client.get("/api/capacity")["engines"] == {"docker": "default"}
         assert "on the docker engine, queue default" in lines(served, "submit", str(spec), "--dry-run")[0]
+
+
+@pytest.mark.usefixtures("docker_client")
+def test_the_order_of_the_engines_moves_no_job(tmp_path: Path) -> None:
+    served = Serving(tmp_path, "--engine", "local", "--engine", "docker")
+    try:
+        job = served.gang("import time; time.sleep(600)", attempts=2)
+        served.wait(job, "RUNNING")
+        served.client.close()
+        served.kill()
+        served.options = ("--engine", "docker", "--engine", "local")
+        served.start()
+        assert served.client.get("/api/capacity")["engines"] == {"local": "default", "docker": "docker"}
+        kill_rank(job, 0)
+        wait_for(lambda: len(served.detail(job)["attempts"]) == 2, 30, "the second attempt")
+        attempts = served.wait(job, "RUNNING")["attempts"]
+        assert [each["nodes"][0]["host"] for each in attempts] == ["localhost"] * 2
+        served.client.batch("TerminateJob", jobId=job, reason="enough")
+        served.wait(job)
+    finally:
+        served.close()
+    assert served.process.stderr is not None
+    assert (
+        "queue default stays with engine local until the next start: 1 job in it is not over"
+        in served.process.stderr.read()
+    )
+    with Serving(tmp_path, *served.options) as served:
+        assert served.client.get("/api/capacity")["engines"] == {"docker": "default", "local": "local"}
 
 
 # -- engines that can't be had, or can't do what is asked --------------------------------------------------------------
