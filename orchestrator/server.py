@@ -123,6 +123,8 @@ class Server:
                     identity = recognise(session, self.store, adopt_store)
                     nodes.arrange(in_order(session, nodes.names))
                     ensure_compute_environments(session, nodes.names)
+                if any(engine.traits.as_owner for engine in nodes.engines.values()):
+                    self.store.check_owner()
             except (DatabaseError, SecretsError) as error:
                 raise ServerError(str(error)) from None
             self.bus = Bus(home, nodes.addresses, Presence(lost_after))

@@ -174,6 +174,22 @@ class Store:
         if not os.access(present, os.W_OK | os.X_OK):
             raise self._not_writable(os.strerror(errno.EACCES))
 
+    def check_owner(self) -> None:
+        """Raises StoreError where the owner of the store's directory can't write in directories that this user makes there."""
+        probe = self.path / "runs" / f".probe-{os.getpid()}"
+        try:
+            probe.mkdir()
+            made, owner = probe.stat(), self.path.stat()
+            probe.rmdir()
+        except OSError as error:
+            raise self._not_writable(error.strerror or str(error)) from error
+        bit = 0o200 if made.st_uid == owner.st_uid else 0o020 if made.st_gid == owner.st_gid else 0o002
+        if owner.st_uid != 0 and not made.st_mode & bit:
+            raise StoreError(
+                f"store {self.path}: it belongs to user {owner.st_uid}, as whom containers run, and they can't write what this "
+                f"controller makes there as user {made.st_uid}; chown the store, or start muster serve as user {owner.st_uid}"
+            )
+
     def _not_writable(self, why: str) -> StoreError:
         return StoreError(f"store {self.path}: not writable ({why}); choose another with --store")
 

@@ -321,6 +321,8 @@ class Traits:
     """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
     users: bool = False
     """A node can run as the user that the job names. True of every engine with images."""
+    as_owner: bool = False
+    """Nodes run as the owner of the store's directory, whoever the controller is."""
     secrets: SecretValues = SecretValues.NONE
     gpu_ids: bool = False
     """The ids of its hosts' GPUs are those of the devices; else they are numbers until a node's status has its ``gpus``."""

@@ -322,6 +322,17 @@ def test_an_engine_that_is_not_there_is_refused_before_anything_is_made(tmp_path
     assert said.startswith("muster: scontrol is not installed here: the slurm engine uses the cluster's own")
 
 
+@pytest.mark.usefixtures("docker_client")
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives a directory away")
+def test_a_store_that_containers_could_not_write_is_refused(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store").open()
+    os.chown(store.path, 1234, 1234)
+    assert refused(tmp_path, "docker").startswith(
+        f"muster: store {store.path}: it belongs to user 1234, as whom containers run, and they can't write what this controller "
+    )
+    assert os.listdir(store.path / "runs") == []
+
+
 def test_without_slurm_s_controller_nothing_starts(tmp_path: Path) -> None:
     need_slurm()
     configuration = tmp_path / "slurm.conf"
