@@ -112,7 +112,7 @@ class Client:
             yield from lines
 
     def log_batches(self, job: str, **query: Any) -> Iterator[list[dict[str, Any]]]:
-        """:meth:`logs`, as many lines at a time as have come."""
+        """:meth:`logs`, as many lines at a time as have come: none where none have come for some seconds."""
         positions: dict[str, int] = {}
         barren = 0
         while True:
@@ -154,6 +154,8 @@ class Client:
                     whole, _, rest = (rest + chunk).rpartition(b"\n")
                     if lines := [line for line in whole.split(b"\n") if line]:  # an empty one: the stream lives
                         yield json.loads(b"[" + b",".join(lines) + b"]")
+                    elif chunk == b"\n":
+                        yield []
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
         except httpx.InvalidURL:

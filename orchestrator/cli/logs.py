@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.jobs import JobArgument, JsonOption
+from orchestrator.cli.progress import Waits
 from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
 from orchestrator.client import Client
 from orchestrator.domain.errors import SpecError
@@ -49,7 +50,11 @@ def logs(
     came = False
     with Client.connect() as client:
         client.told = lambda line: echo(line, err=True)
+        waits = Waits(client, job)
         for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
+            if not lines:
+                waits.tell()
+                continue
             came = True
             shown = [
                 to_json(line) if as_json else _format(line, colour, raw)

@@ -11,8 +11,8 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
-from orchestrator.client import Client
-from orchestrator.domain.errors import Unreachable
+from orchestrator.client import Client, named
+from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL
 from shared_store.evaluations import in_one_line
 from shared_store.wording import counted
@@ -103,9 +103,38 @@ def best_told(run: str, best: Mapping[str, Any] | None) -> str:
 
 
 def _follow_logs(client: Client, job_id: str) -> int:
+    waits = Waits(client, job_id)
     for lines in client.log_batches(job_id, follow=True):
-        echo_raw("\n".join(map(_format, lines)))
+        if lines:
+            echo_raw("\n".join(map(_format, lines)))
+        else:
+            waits.tell()
     return summary(client, job_id)
+
+
+class Waits:
+    """Lines on standard error about a job that has nothing to show because it waits."""
+
+    def __init__(self, client: Client, job: str) -> None:
+        self._client, self._job, self._told = client, job, ""
+
+    def tell(self) -> None:
+        """Say why the job waits, where that was not said before."""
+        try:
+            text = _why_waiting(self._client, self._job)
+        except (ApiError, Unreachable):  # whoever reads the log hears of it
+            return
+        if text and text != self._told:
+            echo(text, err=True)
+        self._told = text
+
+
+def _why_waiting(client: Client, job: str) -> str:
+    """A job's state and why it waits; empty once it runs or is over. Raises ApiError, Unreachable."""
+    found = client.get(f"/api/jobs/{named(job)}")
+    if found["status"] in ("RUNNING", *TERMINAL):
+        return ""
+    return f"{found['name']} ({found['id'][:8]}) {found['status']}: {one_line(found['statusReason'] or '')}"
 
 
 def _format(line: dict[str, Any]) -> str:
@@ -145,13 +174,12 @@ class Activity:
         shown = ""
         while True:
             try:
-                job = client.batch("DescribeJobs", jobs=[job_id])["jobs"][0]
+                text = _why_waiting(client, job_id)
             except Unreachable:
                 client.await_return()
                 continue
-            if job["status"] in ("RUNNING", *TERMINAL):
+            if not text:
                 return
-            text = f"{job['jobName']} ({job_id[:8]}) {job['status']}: {one_line(job.get('statusReason', ''))}"
             if text != shown:
                 self.show(text)
             shown = text

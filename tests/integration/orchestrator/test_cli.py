@@ -247,6 +247,22 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)
 
 
+def test_who_follows_a_command_that_waits_is_told_why(server: Serving) -> None:
+    server.wait(full := server.gang(FOREVER, cpus="4"), "RUNNING")
+    env = {**os.environ, "MUSTER_HOME": str(server.home)}
+    options: dict[str, Any] = {"env": env, "cwd": REPOSITORY, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    following = [subprocess.Popen([MUSTER, "submit", "job_specs/all-reduce.yaml", "-f"], text=True, **options)]
+    wait_for(lambda: '"all-reduce"' in server.muster("list", "--json").stdout, 30, "its submission")
+    following.append(subprocess.Popen([MUSTER, "logs", "all-reduce", "-f"], text=True, **options))
+    for each in following:
+        assert each.stderr is not None
+        line = each.stderr.readline()
+        assert line.startswith("all-reduce (") and f" free until job test ({full[:8]}) ends" in line, line
+    server.client.batch("TerminateJob", jobId=full, reason="enough")
+    for each in following:
+        assert each.communicate(timeout=60 * PATIENCE)[1].count("RUNNABLE") == 0 and each.returncode == 0
+
+
 @pytest.mark.parametrize(
     ("node", "said"),
     [
