@@ -168,7 +168,7 @@ def test_what_is_scaled_down_restarted_or_taken_down_has_its_jobs_save_and_spend
 
     def saved(number: int) -> bool:
         found = attempts()
-        return len(found) >= number and [node["exitCode"] for node in found[number - 1]["nodes"]] == [75] * NODES
+        return len(found) >= number and [node.get("exitCode") for node in found[number - 1]["nodes"]] == [75] * NODES
 
     blows = (
         lambda: cluster.up(NODES - 1),

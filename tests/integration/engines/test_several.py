@@ -6,6 +6,7 @@ import contextlib
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from shared_store.metrics import read_metrics
 from shared_store.outcomes import read_outcome
 from tests.conftest import Serving, call_muster, wait_for
 from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files, plain
-from tests.support.engines.sites import POLITE, WAIT
+from tests.support.engines.sites import POLITE, WAIT, Site
 from tests.support.engines.slurm_cluster import need_slurm
 from tests.support.engines.training import submit
 from tests.support.processes import kill_rank
@@ -124,6 +125,35 @@ def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monke
     assert served.process.stderr is not None
     said = served.process.stderr.read()
     assert said.count("no Docker Engine answers") <= 2 and "Traceback" not in said and "store" not in said, said
+
+
+@pytest.mark.skipif(not Path("/var/run/docker.sock").exists(), reason="NO /var/run/docker.sock: nothing to cut off")
+@pytest.mark.usefixtures("docker_client")
+def test_a_node_that_ends_while_docker_is_away_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    relay = Relay(tmp_path / "docker.sock")
+    relay.open()
+    monkeypatch.setenv("DOCKER_HOST", f"unix://{relay.path}")
+    with Serving(tmp_path, "--engine", "docker", "--cpus", "4", "--lost-after", "10s") as served:
+        image = {"image": SUPERVISED, **host_files()}
+        site = Site("docker", served, tmp_path / "store", image, {"PATH": PATH})
+        job = site.submit("echo ready; while [ ! -e $MUSTER_STORE/go-$RANK ]; do sleep 0.05; done", nodes=2)
+        site.ready(job, 1, 2)
+
+        def nodes() -> Any:
+            found = served.detail(job)
+            assert (found["status"], len(found["attempts"])) == ("RUNNING", 1), found["statusReason"]
+            return found["attempts"][0]["nodes"]
+
+        wait_for(lambda: nodes()[1].get("met"), 30, "node 1 on the bus")
+        relay.cut()
+        (site.volume / "go-1").touch()
+        wait_for(lambda: nodes()[1].get("exitCode") == 0, 30, "its outcome counts")
+        time.sleep(12.0)
+        assert [node.get("exitCode") for node in nodes()] == [None, 0]
+        (site.volume / "go-0").touch()
+        wait_for(lambda: nodes()[0].get("exitCode") == 0, 30, "its outcome counts, too")
+        relay.open()
+        assert served.wait(job)["status"] == "SUCCEEDED"
 
 
 def test_memory_beyond_the_limit_is_named_under_a_supervisor_too(served: Serving) -> None:
