@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from tests.support.engines.sites import POLITE, Site
 from tests.support.processes import command, kill_rank, kill_supervisor, processes_of_job
 from tests.support.waiting import wait_for
@@ -73,6 +75,8 @@ class EveryEngine:
         await_job_end(job)
 
     def test_where_the_outcome_can_not_be_written_the_exit_code_counts_that_the_engine_saw(self, site: Site) -> None:
+        if site.engine == "aws-batch":
+            pytest.skip("there the engine writes the outcome, from AWS's answer")
         link = "ln -s /tmp $MUSTER_STORE/runs/$MUSTER_RUN/outcomes"  # which is never followed
         detail = site.serving.wait(site.submit(link, nodes=1), timeout=60)
         [node] = detail["attempts"][0]["nodes"]
