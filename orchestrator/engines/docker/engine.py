@@ -400,5 +400,6 @@ def _stop(container: Container, grace: float) -> None:
             return
         else:
             container.stop(timeout=int(max(1.0, grace)))
-    except (NotFound, APIError):
-        pass  # it ended meanwhile, or is being removed
+    except APIError as error:  # it ended meanwhile, or is being removed
+        if error.is_server_error():  # it may run: who asks again gives it its time again
+            raise
