@@ -133,10 +133,6 @@ class Driver:
     def leave(self, *_: object) -> None:
         """SIGTERM: see the module."""
         self._leaves = True
-        if not ray.is_initialized():
-            if self.gang is not None:
-                self.gang.forget()
-            os._exit(0)
 
     def _obey(self) -> bool:
         """Carry out the commands that have come; True where the driver should leave."""
@@ -214,7 +210,6 @@ def main(argv: list[str]) -> int:
     folder, join, commands = Folder(Path(argv[0])), argv[1], int(argv[2])
     os.set_inheritable(commands, False)
     driver = Driver(folder, join, commands)
-    signal.signal(signal.SIGTERM, driver.leave)
     driver._obey()
     gang = driver.gang
     if gang is None:
@@ -237,12 +232,15 @@ def main(argv: list[str]) -> int:
             logging_level="error",
             _node_ip_address=join,
         )
+    except SystemExit:  # SIGTERM: until then Ray's own handler has it
+        gang.forget()
+        return 0
     except Exception as error:
         gang.fail(f"can't join the Ray cluster at {os.environ['RAY_ADDRESS']}: {str(error).strip().splitlines()[0]}")
         gang.tell()
         return 1
     patience.cancel()
-    signal.signal(signal.SIGTERM, driver.leave)  # Ray has one of its own
+    signal.signal(signal.SIGTERM, driver.leave)
     threading.Thread(target=driver.watch, name="watch", daemon=True).start()
     driver.run()
     # leaving, it must not wait for a head that is away; what it holds goes with it
