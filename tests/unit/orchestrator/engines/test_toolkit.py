@@ -288,6 +288,12 @@ def test_a_backend_that_hangs_delays_one_caller_and_is_asked_once(backend: Backe
     wait_for(lambda: view.value == "first" and view.trouble is None, 10, "the answer")
 
 
+def test_a_slow_answer_is_no_trouble_until_it_is_overdue(backend: Backend) -> None:
+    view = CachedView("nothing", backend, name="view", silence="no answer yet", overdue=0.5)
+    assert view.get(0.0, patience=0.01) == "nothing" and view.trouble is None
+    wait_for(lambda: view.trouble == "no answer yet", 10, "the silence")
+
+
 def test_a_bug_in_the_reading_is_trouble_and_not_the_end_of_the_view(
     backend: Backend, view: CachedView[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
