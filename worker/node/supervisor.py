@@ -57,6 +57,8 @@ _COMMIT_INTERVAL = 1.0
 _LAST_WORDS = 2.0
 """Seconds before its end of grace at which a node leaves whose outcome can't be written: its exit code must be its own."""
 _ASKED = "asked to leave"
+_REQUESTS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""Signals that ask the node to leave."""
 _STATES = {
     "R": "it runs",
     "D": "it waits for a device or the store",
@@ -119,6 +121,8 @@ class Supervisor:
         self.write(None, "o", END_LINE.format(node=self.contract.node_index, reason=outcome.reason))
         code = self._commit(outcome)
         self.bus.close()
+        for number in _REQUESTS:  # whose default, which Python restores at its end, is another exit code
+            signal.signal(number, signal.SIG_IGN)
         return code
 
     def abandon(self) -> None:
@@ -241,7 +245,7 @@ class Supervisor:
 
     def _catch_signals(self, write_end: int) -> None:
         signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in _REQUESTS:
             signal.signal(number, lambda _number, _frame: self.stop(_ASKED, self.contract.grace))
         signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
         self.selector.register(self._wakeup, selectors.EVENT_READ, None)

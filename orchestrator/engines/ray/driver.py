@@ -31,8 +31,6 @@ from orchestrator.engines.ray.gang import DrivenGang
 
 _LINGER = 15.0
 """Seconds for which the place of a gang that is over is kept for the job's next attempt."""
-_LEAVING = 2.0
-"""Seconds between two requests to leave: a node may not have been started at the first."""
 _UNSTARTED = ("joining", "placing", "starting")
 """Phases of a gang before any command was started."""
 _JOINING = 90.0
@@ -52,7 +50,7 @@ class Driver:
         self._partial = b""
         self._draining: set[str] = set()
         self._leaves = False
-        self._next_leave, self._next_look = 0.0, 0.0
+        self._next_look = 0.0
 
     def run(self) -> None:
         """Until the job has been over for a while."""
@@ -90,8 +88,7 @@ class Driver:
         else:
             gang.listen(0.1)
             leaves = self._leaves or any(node["ray_node"] in self._draining for node in gang.nodes)
-            if leaves and gang.phase == "running" and time.monotonic() > self._next_leave:
-                self._next_leave = time.monotonic() + _LEAVING
+            if leaves and gang.phase == "running":
                 gang.leave()
             if gang.phase == "stopping" and (not gang.is_stopping or time.monotonic() > gang.deadline):
                 gang.clear()

@@ -54,6 +54,8 @@ class DrivenGang:
         self.asked: dict[Any, tuple[str, int]] = {}
         """Calls of actors that are not answered: a kind and a node's index."""
         self.heard = [time.monotonic()] * len(self.nodes)
+        self.left: set[int] = set()
+        """Indices of nodes that were told to leave."""
         self.broken: dict[int, float] = {}
         """Since when the connection to an actor is broken."""
         self.next_beat = 0.0
@@ -149,9 +151,11 @@ class DrivenGang:
                 self.asked[actor.stop.remote(grace)] = ("stop", index)
 
     def leave(self) -> None:
-        """SIGTERM to all: one of the machines will go away, or the driver's."""
-        for actor in self.actors:
-            actor.leave.remote()
+        """SIGTERM to all that are started, once: one of the machines will go away, or the driver's. Called until all have had it."""
+        for index, node in enumerate(self.nodes):
+            if node["started"] and index not in self.left:
+                self.left.add(index)
+                self.actors[index].leave.remote()
 
     def listen(self, seconds: float) -> None:
         """Take what actors answer within that time, and what became of those that do not."""

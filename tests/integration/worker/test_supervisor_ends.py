@@ -216,6 +216,16 @@ def test_a_request_to_leave_reaches_the_ranks_and_exit_75_is_kept(node: Nodes, n
     assert (outcome.exit_code, outcome.reason, outcome.error) == (75, "checkpointed and left on request", None)
 
 
+def test_who_is_asked_to_leave_again_and_again_leaves_with_its_own_exit_code(node: Nodes) -> None:
+    n = node()
+    n.start("sh", "-c", LEAVES)
+    n.wait_for_output("ready")
+    while n.process.poll() is None:
+        n.process.terminate()
+        time.sleep(0.001)
+    assert n.process.returncode == 75
+
+
 def test_a_node_exits_on_request_if_its_ranks_are_done_or_exited_on_request(node: Nodes) -> None:
     n = node(ranks_per_node=2)
     assert n.shell("[ $RANK = 0 ] && exit 75; exit 0") == 75
