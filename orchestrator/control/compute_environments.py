@@ -41,12 +41,7 @@ def in_order(session: Session, engines: Sequence[str]) -> list[str]:
     if before not in engines:
         log.warning("queue default moves from engine %s, which is not served, to engine %s: %s", before, first, jobs)
         return list(engines)
-    log.warning(
-        "queue default stays with engine %s until the next start: %s; engine %s has a queue of its name",
-        before,
-        jobs,
-        first,
-    )
+    log.warning("queue default stays with engine %s: %s; engine %s has a queue of its name", before, jobs, first)
     return [before, *(each for each in engines if each != before)]
 
 
