@@ -150,7 +150,9 @@ def serve(
 ) -> None:
     """Run the controller as a server. Running jobs outlive it; the next controller finds them."""
     from orchestrator.server import Server  # imports dependencies of the controller only
+    from orchestrator.service_manager import ServiceManager
 
+    manager = ServiceManager()
     for name in engine or ():
         check_engine(name)
     server = Server(
@@ -181,10 +183,13 @@ def serve(
         echo(f"on all interfaces: from other machines http://{socket.gethostname()}:{server.url.rpartition(':')[2]}")
     echo(server.access.admitted())
     echo(f"home {muster_home()}, store {server.store.path}")
+    manager.tell("READY=1")
+    manager.keep_alive(lambda: server.reconciler.heartbeat.problem() is None, ended.wait)
     try:
         while not ended.wait(1.0):  # Python sees a signal that another thread took when this one wakes
             pass
     finally:
+        manager.tell("STOPPING=1")
         server.close()
     echo("stopped; running jobs continue and the next `muster serve` finds them")
 

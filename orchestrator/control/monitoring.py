@@ -49,6 +49,9 @@ class Monitoring:
         self._passes = Histogram(
             "muster_scheduling_pass_seconds", "Length of a scheduling pass.", buckets=_PASSES, registry=registry
         )
+        self._loop = Histogram(
+            "muster_loop_seconds", "Length of a pass of the controller's loop.", buckets=_PASSES, registry=registry
+        )
         self._restarts = Counter(
             "muster_restarts", "Attempts that were begun after a job's first one.", _USED, registry=registry
         )
@@ -83,6 +86,10 @@ class Monitoring:
     def pass_took(self, seconds: float) -> None:
         """A scheduling pass was made."""
         self._passes.observe(seconds)
+
+    def loop_took(self, seconds: float) -> None:
+        """The loop has made a pass."""
+        self._loop.observe(seconds)
 
     def webhook_tried(self, webhook: str, result: str) -> None:
         """A message was ``delivered``, has ``failed`` and is tried again, or was ``given up``."""
@@ -134,6 +141,8 @@ class _Moment(Collector):
     def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily]:
         reconciler = self._reconciler
         yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
+        age = "Seconds since the controller's loop made its last progress; /healthz fails above 5."
+        yield _gauge("muster_loop_age_seconds", age, [], {(): reconciler.heartbeat.age})
         try:
             with reconciler.database.session() as session:
                 found = [*self._jobs(session), *self._attempts(session)]

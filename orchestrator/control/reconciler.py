@@ -20,6 +20,7 @@ from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
+from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
@@ -93,7 +94,7 @@ class Reconciler:
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
         self.clock = clock or Clock()
-        self.monitoring = Monitoring()
+        self.monitoring, self.heartbeat = Monitoring(), Heartbeat()
         self.attempts = Attempts(
             engine,
             runs or RunStore(store, peers, *([identity.check] if identity else [])),
@@ -159,7 +160,12 @@ class Reconciler:
             self._thread.join()
         self.attempts.close()
 
+    def problem(self) -> str | None:
+        """Why the controller can't do its work now, as its loop has left it; waits for nothing."""
+        return self.heartbeat.problem() or self.trouble or self.disk.absent("store")
+
     def _loop(self) -> None:
+        self.database.reserve_connections()
         while not self._ending.is_set():
             self._isolated("reconciling", self.tick)
             if self._wake.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
@@ -171,11 +177,13 @@ class Reconciler:
 
         Raises DatabaseError where the database can't be used; the next pass tries again.
         """
-        self._ticking = threading.get_ident()
+        started, self._ticking = machine.monotonic(), threading.get_ident()
+        self.heartbeat.beat()
         try:
             self._pass()
         finally:
             self._ticking = None
+            self.monitoring.loop_took(machine.monotonic() - started)
 
     def _pass(self) -> None:
         self._keep_database()
@@ -239,6 +247,7 @@ class Reconciler:
         Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
         """
+        self.heartbeat.beat()
         try:
             self._carried_out(ids, body)
         except DatabaseError:

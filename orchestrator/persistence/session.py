@@ -6,6 +6,7 @@ import fcntl
 import json
 import logging
 import os
+import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import IO, Any
 from sqlalchemy import (
     URL,
     Connection,
+    Engine,
     create_engine,
     event,
     inspect,
@@ -21,6 +23,7 @@ from sqlalchemy import (
     text,
 )
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import Unavailable
@@ -32,7 +35,8 @@ _RESERVE = 5 << 20
 _FULL = ("SQLITE_FULL", "SQLITE_IOERR_SHMSIZE")
 _CONTROLLER_LOCK = 0x6D7573746572
 """Key of PostgreSQL's advisory lock: one controller a database."""
-
+_POOL_TIMEOUT = 10.0
+"""Seconds for which a request waits for a free connection."""
 
 log = logging.getLogger("muster.controller")
 
@@ -47,6 +51,9 @@ class DatabaseFull(DatabaseError):
 
 class Database:
     """Sessions on one database; ``committed``, where set, is called with the jobs that a commit has changed."""
+
+    _own: tuple[int, Engine] | None = None
+    """A thread that has connections of its own, and the engine that makes them."""
 
     def __init__(self, url: str) -> None:
         """Open ``url`` (``sqlite:///path``, ``postgresql+psycopg://…``) and bring its tables up to date.
@@ -67,12 +74,7 @@ class Database:
         self._identity: tuple[int, int] | None = None
         """Device and inode of the file, once it is open."""
         try:
-            self.engine = create_engine(
-                url,
-                pool_pre_ping=not url.startswith("sqlite"),
-                connect_args=_connect_args(make_url(url)),
-                json_deserializer=_read_document,
-            )
+            self.engine = self._new_engine(url)
         except (SQLAlchemyError, ModuleNotFoundError) as error:
             raise DatabaseError(_explain(_shown(url), error)) from None
         try:
@@ -86,8 +88,6 @@ class Database:
     def _open(self) -> None:
         """Take the lock, then migrate: nothing of a database that another controller has is touched."""
         if self.engine.dialect.name == "sqlite":
-            event.listen(self.engine, "do_connect", self._check_before_connect)
-            event.listen(self.engine, "connect", _tune_sqlite)
             if (path := self.engine.url.database) not in (None, "", ":memory:"):
                 self._file = Path(str(path))
                 self._file_lock = self._take_file_lock(self._file)
@@ -99,6 +99,26 @@ class Database:
             found = self._file.stat()
             self._identity = found.st_dev, found.st_ino
             self._reserve()
+
+    def _new_engine(self, url: str | URL) -> Engine:
+        parsed = make_url(url)
+        is_sqlite = parsed.get_backend_name() == "sqlite"
+        engine = create_engine(
+            parsed,
+            pool_pre_ping=not is_sqlite,
+            connect_args=_connect_args(parsed),
+            json_deserializer=_read_document,
+            **({} if parsed.database in (None, "", ":memory:") else {"pool_timeout": _POOL_TIMEOUT}),
+        )
+        if is_sqlite:
+            event.listen(engine, "do_connect", self._check_before_connect)
+            event.listen(engine, "connect", _tune_sqlite)
+        return engine
+
+    def reserve_connections(self) -> None:
+        """Give this thread connections of its own, which no other can take. A database in memory has only one."""
+        if self.engine.url.database not in (None, "", ":memory:"):
+            self._own = threading.get_ident(), self._new_engine(self.engine.url)
 
     @classmethod
     def at(cls, home: Path) -> Database:
@@ -117,7 +137,8 @@ class Database:
 
     def open(self) -> Session:
         """A session for :meth:`using`; to be closed by the caller."""
-        return _Session(self.engine, expire_on_commit=False, info={"database": self})
+        engine = self._own[1] if self._own and self._own[0] == threading.get_ident() else self.engine
+        return _Session(engine, expire_on_commit=False, info={"database": self})
 
     @contextmanager
     def using(self, session: Session) -> Iterator[None]:
@@ -126,6 +147,10 @@ class Database:
         try:
             yield
             session.commit()
+        except PoolTimeout as error:
+            raise DatabaseError(
+                f"database {self._shown}: all connections of this controller are busy; try again in a moment"
+            ) from error
         except DBAPIError as error:
             if _is_damaged(error):
                 self._damage = _explain(self._shown, error)
@@ -209,6 +234,8 @@ class Database:
         if self._lock is not None:
             self._lock.close()
         self.engine.dispose()
+        if self._own is not None:
+            self._own[1].dispose()
         if self._file_lock is not None:
             self._file_lock.close()
 

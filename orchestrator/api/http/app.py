@@ -27,7 +27,6 @@ from orchestrator.control import monitoring
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import RequestError, Unavailable
-from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
 
@@ -62,15 +61,10 @@ def create_app(
     app.add_exception_handler(DamagedFile, _damaged_file)
 
     @app.get("/healthz")
-    def healthz() -> JSONResponse:
-        """Alive, and which version; 503 with the reason while the database or the store can't be used."""
-        try:
-            reconciler.database.check()
-            trouble = reconciler.trouble or reconciler.disk.absent("store")
-        except DatabaseError as error:
-            trouble = str(error)
-        if trouble is not None:
-            return JSONResponse({"status": "unavailable", "message": trouble, "version": __version__}, 503)
+    async def healthz() -> JSONResponse:
+        """Alive, and which version; 503 with the reason while the loop is stuck, or the database or the store can't be used."""
+        if (problem := reconciler.problem()) is not None:  # needs no thread: all of them may be busy
+            return JSONResponse({"status": "unavailable", "message": problem, "version": __version__}, 503)
         return JSONResponse({"status": "ok", "version": __version__})
 
     @app.get("/metrics", response_class=PlainTextResponse)
