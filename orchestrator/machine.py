@@ -60,6 +60,8 @@ class ThreadPool:
         future: Future[T] = Future()
 
         def call() -> None:
+            if not future.set_running_or_notify_cancel():
+                return  # whoever waited for it has left
             try:
                 result = body()
             except BaseException as error:

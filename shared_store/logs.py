@@ -26,12 +26,8 @@ LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
 HEAD = re.compile(r"node-([0-9]{1,9})\.log")
 """Name of a log's first file."""
 _ATTEMPT = re.compile(r"[0-9]{1,9}")
-_CHUNK = 1 << 20
-"""Bytes that a poll reads of a log; fewer with many nodes."""
-_LEAST_CHUNK = 256 << 10
-"""More than the longest line."""
-_MOST = 8 << 20
-"""Bytes that a poll reads of all logs of an attempt."""
+_CHUNK = 256 << 10
+"""Bytes that a poll reads of a log: more than the longest line, and little, since many may follow and not read."""
 
 LIMIT_REACHED = "the log reached its limit"
 REPLACED = "the log was truncated or replaced; following continues from its new beginning"
@@ -179,14 +175,13 @@ class LogFollower:
     _sources: dict[str, _Source] = field(default_factory=dict)
 
     def poll(self) -> list[LogLine]:
-        """The whole lines since the last call, or the first few MiB of them, in the order of their times."""
+        """The whole lines since the last call, or the first part of them, in the order of their times."""
         lines: list[LogLine] = []
         self.behind = False
         for attempt in [self.attempt] if self.attempt is not None else attempts_with_logs(self.run, self.job):
             logs = self._logs(attempt)
-            most = min(_CHUNK, max(_LEAST_CHUNK, _MOST // max(1, len(logs))))
             for source, segments in logs:
-                source.fill(segments, most, self.rank)
+                source.fill(segments, _CHUNK, self.rank)
             # unread lines of one log may be older than read lines of another
             until = min((source.newest for source, _ in logs if source.more), default=None)
             taken = []
@@ -208,7 +203,7 @@ class LogFollower:
     def batches(self) -> Iterator[list[LogLine]]:
         """:meth:`drain`, many lines at a time."""
         self.behind = True
-        while self.behind:  # a poll may skip 1 MiB of another rank's lines and return none
+        while self.behind:  # a poll may skip a part with another rank's lines alone and return none
             if lines := self.poll():
                 yield lines
 

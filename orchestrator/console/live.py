@@ -6,19 +6,18 @@ import asyncio
 import json
 import threading
 import time
-from collections import Counter, OrderedDict
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Hashable, Mapping, Sequence
-from contextlib import aclosing
+from collections import OrderedDict
+from collections.abc import AsyncGenerator, Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from fastapi import Request
-from fastapi.responses import StreamingResponse
+from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import format_sse_event
-from starlette.concurrency import run_in_threadpool
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.access import Access
+from orchestrator.api.http.following import Following, looked
 from orchestrator.api.permissions import current_identity
 from orchestrator.console.pages import session
 from orchestrator.persistence.session import DatabaseError
@@ -30,8 +29,6 @@ _HEARTBEAT = 10.0
 """Seconds after which an idle stream sends a comment: that reveals a browser that has left."""
 _LONGEST = 300.0
 """Seconds after which a stream ends; the browser reconnects at once, and is admitted again or refused."""
-_MOST_OPEN = 100
-"""Streams of one key or user at once: each takes a share of the server's time."""
 _MOST_KEPT = 64
 _Value = TypeVar("_Value")
 
@@ -68,29 +65,14 @@ def stream(request: Request, look: Look, interval: float = INTERVAL) -> Streamin
         return access.still_admits(identity, given)
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
-    events = _admitted(identity.name, _events(look, interval, admitted, request.app.state.closing))
-    return StreamingResponse(events, media_type="text/event-stream", headers=headers)
+    events = _events(look, interval, admitted, request.app.state.closing)
+    return _Live(events, media_type="text/event-stream", headers=headers)
 
 
-_open: Counter[str] = Counter()
-"""Number of open streams by the name of their reader; used by the event loop alone."""
-
-
-async def _admitted(name: str, events: AsyncGenerator[bytes, None]) -> AsyncIterator[bytes]:
-    """The events, where ``name`` has not too many streams."""
-    if _open[name] >= _MOST_OPEN:
-        yield format_sse_event(retry=30_000, comment="Muster")
-        yield _written(Event("trouble", f"{_open[name]} pages are open already; close some, and this one becomes live"))
-        return
-    _open[name] += 1
-    try:
-        async with aclosing(events):
-            async for each in events:
-                yield each
-    finally:
-        _open[name] -= 1
-        if not _open[name]:
-            del _open[name]
+class _Live(Following):
+    def refusal(self, message: str) -> Response:
+        trouble = _written(Event("trouble", f"{message}, and this one becomes live"))
+        return Response(format_sse_event(retry=30_000, comment="Muster") + trouble, media_type=self.media_type)
 
 
 async def _events(
@@ -100,7 +82,7 @@ async def _events(
     yield format_sse_event(retry=1000, comment="Muster")
     while not closing.is_set() and time.monotonic() - begun < _LONGEST and admitted():
         try:
-            found = await run_in_threadpool(look)
+            found = await looked(look)
         except (ClientError, DatabaseError, DamagedFile, OSError) as error:
             yield _written(Event("trouble", str(error)))
             await asyncio.sleep(5 * interval)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from contextlib import nullcontext
 from math import inf
 from typing import Any
 
@@ -45,10 +44,13 @@ train:
   worlds: 128
   iterations: 100
 """
+_LARGEST = 64 << 10
+"""Bytes of a form's YAML: that of a job's definition, which has 24 KiB, and room for comments."""
 _sent = Recent(inf, 1000)
 """Id and name of the jobs of the last forms, by sender and the form's random name: a form that is sent again makes no second job."""
 _turns = Turns("other reward functions are being tried")
 """Each is tried in a process of its own."""
+_checks = Turns("other jobs are being checked")
 
 
 @router.get("/submit")
@@ -195,7 +197,7 @@ def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     """
     tries = whole and permissions.current_identity.get().queues is None
     try:
-        with _turns.turn() if tries else nullcontext():
+        with (_turns if tries else _checks).turn():
             return from_text(text, SOURCE, whole=tries), None
     except SpecError as error:
         return None, problem_of(str(error), text)
@@ -209,7 +211,9 @@ def _text(request: Request, form: Form) -> tuple[str, str]:
 
 
 def _lines(text: str) -> str:
-    """The text with its own line ends: a form sends lines that end with CR and LF."""
+    """The text with its own line ends: a form sends lines that end with CR and LF. Raises ClientError where it is too large."""
+    if (size := len(text.encode())) > _LARGEST:
+        raise ClientError(f"{SOURCE}: the text has {size:,} bytes, and may have {_LARGEST:,}; shorten it", 413)
     return text.replace("\r\n", "\n")
 
 

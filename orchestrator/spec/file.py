@@ -9,7 +9,7 @@ from typing import Any
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec import strict_yaml
 from orchestrator.spec.changes import override
-from orchestrator.spec.kept_files import check_texts, refuse_paths, with_files
+from orchestrator.spec.kept_files import check_sizes, check_texts, refuse_paths, with_files
 from orchestrator.spec.model import Spec, validate
 from shared_store.files import DamagedFile, read_json
 
@@ -46,6 +46,7 @@ def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
     document, lines = _parsed(text, source, aliases=False)
     if isinstance(document, dict):
         refuse_paths(document, source, lines)
+        check_sizes(document, source, lines)
     spec = validate(document, source, lines)
     if whole:
         check_texts(document, source, lines)

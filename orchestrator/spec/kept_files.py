@@ -71,6 +71,15 @@ def refuse_paths(document: Mapping[str, Any], source: str, lines: Mapping[tuple[
             )
 
 
+def check_sizes(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
+    """Refuse a file's content that is too large, before anything else is done with it. Arguments as :func:`with_files`. Raises SpecError."""
+    for section, field, value, _ in _fields(document):
+        try:
+            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value)
+        except SpecError as error:
+            raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+
+
 def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     for section, field, value, how in _fields(document):
@@ -79,7 +88,6 @@ def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[s
             continue
         name = str(value.get("file") or field)
         try:
-            _check_size(name, value)
             with TemporaryDirectory() as folder:
                 path = Path(folder) / "text"
                 path.write_text(text, encoding="utf-8")

@@ -1,8 +1,8 @@
 """Connections before authentication: limits on their number, and on the time that each may take to send a request.
 
 uvicorn bounds the time between two requests and nothing else. Here a connection that does not send its request in time is closed,
-and when there are too many, those that have waited longest for their client give way. A client that reads its answer is never cut
-off: a log may be followed for days.
+and so is one that takes nothing of its answer for a minute. When there are too many, those that have waited longest for their
+client give way. A client that reads its answer is never cut off: a log may be followed for days.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HEADER_TIMEOUT = 10.0
 BODY_TIMEOUT = 60.0
 """Seconds from there to the end of its body."""
 _FLUSH_TIMEOUT = 60.0
-"""Seconds without any progress after which a closing connection that still has something to send is cut off."""
+"""Seconds without any progress after which a connection that has something to send is cut off."""
 BACKLOG = 128
 """Connections that are accepted at once, and so how far the most may be exceeded for a moment."""
 _PIECE = 16 << 10
@@ -120,6 +120,8 @@ class Connection(H11Protocol):
         self._connections = connections
         self._phase = ""
         self._deadline: asyncio.TimerHandle | None = None
+        self._unread: asyncio.TimerHandle | None = None
+        """Cuts the connection off while its client takes nothing."""
         self.peer = ""
         self.counted = False
 
@@ -136,6 +138,7 @@ class Connection(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._set_deadline(None)
+        self._read_on()
         self._connections.remove(self)
         super().connection_lost(exc)
 
@@ -151,14 +154,28 @@ class Connection(H11Protocol):
         self._look()
 
     def pause_writing(self) -> None:
-        """The client has stopped reading its answer, such as a pager at rest: it may stay until others need the place."""
+        """The client has stopped reading its answer, such as a pager at rest: it may stay for a minute, or until others need the place."""
         super().pause_writing()
         self._connections.awaits_client(self)
+        self._await_reader(self.transport.get_write_buffer_size() + 1)
 
     def resume_writing(self) -> None:
         super().resume_writing()
+        self._read_on()
         if self._phase == "answer":
             self._connections.has_request(self)
+
+    def _await_reader(self, before: int) -> None:
+        left = self.transport.get_write_buffer_size()
+        if left < before:
+            self._unread = self.loop.call_later(_FLUSH_TIMEOUT, self._await_reader, left)
+        else:
+            self.transport.abort()
+
+    def _read_on(self) -> None:
+        if self._unread is not None:
+            self._unread.cancel()
+        self._unread = None
 
     def give_way(self) -> None:
         """Close, since others need the place."""

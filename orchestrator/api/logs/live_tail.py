@@ -12,8 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from itertools import chain
 from typing import Any
 
-from starlette.concurrency import run_in_threadpool
-
+from orchestrator.api.http.following import looked, pause
 from orchestrator.api.logs import eventstream
 from orchestrator.api.logs.events import Event, LogFile
 from orchestrator.api.logs.filter import Matcher
@@ -117,7 +116,7 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
     while not closing.is_set():
         before = time.monotonic()
         try:
-            events, sampled = await run_in_threadpool(tail.poll)
+            events, sampled = await looked(tail.poll)
         except OSError as error:  # the store is away: it may come back, and nothing is lost
             log.warning("live tail: %s", error)
             events, sampled = [], False
@@ -132,7 +131,7 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
         if events or current >= beat:
             yield _updates(events, group, sampled)
             beat = current + 1.0
-        await asyncio.sleep(max(_POLL, 4 * (current - before)))
+        await asyncio.sleep(max(pause(_POLL), 4 * (current - before)))
 
 
 def _updates(events: list[Event], group: str, sampled: bool) -> bytes:

@@ -18,13 +18,14 @@ from typing import Any
 from botocore.validate import ParamValidator
 from sqlalchemy import func, select
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, Response
 
 from orchestrator.api.arns import ACCOUNT, REGION
 from orchestrator.api.batch.members import LOG_GROUP
 from orchestrator.api.batch.service_model import service_model
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.auth import error_response
+from orchestrator.api.http.following import Following
 from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
 from orchestrator.api.logs.events import Event, event_id, first_and_last
@@ -284,7 +285,12 @@ def start_live_tail(reconciler: Reconciler, closing: threading.Event, request: d
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
     tail = LiveTail(reconciler, asked_for, matches)
     stream = messages(tail, start, f"{ACCOUNT}:{LOG_GROUP}", closing)
-    return StreamingResponse(stream, media_type="application/vnd.amazon.eventstream")
+    return _Session(stream, media_type="application/vnd.amazon.eventstream")
+
+
+class _Session(Following):
+    def refusal(self, message: str) -> Response:
+        return LogsError("LimitExceededException", message).response()
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------

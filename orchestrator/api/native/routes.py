@@ -6,7 +6,7 @@ import asyncio
 import json
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -15,7 +15,6 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from sqlalchemy import select
 from sqlalchemy.orm import Session
-from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.api import permissions
 from orchestrator.api.batch import rules
@@ -25,6 +24,7 @@ from orchestrator.api.context import permitted_run, queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
+from orchestrator.api.http.following import Following, looked, looked_patiently, pause
 from orchestrator.api.native import (
     job_list,
     key_routes,
@@ -70,7 +70,9 @@ router.include_router(key_routes.router)
 _LARGEST_PLAN = 4 << 20
 """Characters of all nodes' variables together."""
 _POLL = 0.05
-"""Seconds between two looks at a log that is followed."""
+"""Seconds between two looks at a log that is followed, while few are."""
+_PATIENCE = 30.0
+"""Seconds for which a log that is not followed may keep its reader waiting."""
 _HEARTBEAT = 5.0
 """Seconds after which an idle stream sends an empty line, which is how a client that left is noticed."""
 
@@ -284,9 +286,8 @@ def job_logs(
             )
         follower = LogFollower(reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions))
         job_id = job.id
-    lines: AsyncIterator[str] | Iterator[str]
     lines = _follow(reconciler, job_id, follower, request.app.state.closing) if follow else _stored(follower)
-    return StreamingResponse(lines, media_type="application/x-ndjson")
+    return Following(lines, media_type="application/x-ndjson")
 
 
 def positions_of(text: str) -> dict[str, int]:
@@ -366,10 +367,14 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
     }
 
 
-def _stored(follower: LogFollower) -> Iterator[str]:
+async def _stored(follower: LogFollower) -> AsyncIterator[str]:
     """All that is there, many lines at a time: each piece costs a hand-over between threads."""
+    batches = follower.batches()
     try:
-        yield from map(_json_lines, follower.batches())
+        while (lines := await asyncio.wait_for(looked(lambda: next(batches, None)), _PATIENCE)) is not None:
+            yield _json_lines(lines)
+    except TimeoutError:
+        yield _trouble(OSError(f"the store has not answered for {_PATIENCE:.0f} s"))
     except (OSError, ValueError) as error:
         yield _trouble(error)
 
@@ -387,18 +392,23 @@ def _json_lines(lines: Sequence[LogLine]) -> str:
 async def _follow(
     reconciler: Reconciler, job_id: str, follower: LogFollower, closing: threading.Event
 ) -> AsyncIterator[str]:
-    """Lines as they come; a thread is taken only for each look, since any number of people may follow."""
+    """Lines as they come; a thread is taken only for each look, since many people may follow."""
 
     def look() -> tuple[str, bool]:
         with reconciler.database.session() as session:
-            job = session.get(Job, job_id)
-            over = job is None or Status(job.status).is_terminal  # asked before the poll: nothing is written afterwards
+            status = session.scalar(select(Job.status).where(Job.id == job_id))
+        over = status is None or Status(status).is_terminal  # asked before the poll: nothing is written afterwards
         return _json_lines(follower.poll()), over
 
     spoken = time.monotonic()
     while not closing.is_set():
+        lines, over = "", False
         try:
-            lines, over = await run_in_threadpool(look)
+            async for found in looked_patiently(look, _HEARTBEAT):
+                if found is None:
+                    yield "\n"
+                else:
+                    lines, over = found
         except (OSError, ValueError, DatabaseError) as error:
             yield _trouble(error)
             return
@@ -406,11 +416,11 @@ async def _follow(
             yield lines
             spoken = time.monotonic()
         if over:
-            async for lines in iterate_in_threadpool(_stored(follower)):
+            async for lines in _stored(follower):
                 yield lines
             return
         if time.monotonic() - spoken > _HEARTBEAT:
             yield "\n"
             spoken = time.monotonic()
         if not follower.behind:
-            await asyncio.sleep(_POLL)
+            await asyncio.sleep(pause(_POLL))

@@ -1,0 +1,72 @@
+"""Answers that go on while their client listens: counted by key, and given what is new by threads of their own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from functools import partial
+from typing import TypeVar
+
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from orchestrator import machine
+from orchestrator.api.http.auth import error_response
+from orchestrator.api.permissions import current_identity
+
+T = TypeVar("T")
+
+MOST = 100
+"""Answers of this kind that one key or user has at once."""
+_THREADS = 4
+_SHARE = 0.01
+"""Seconds between two looks, for each open answer: all of them together look 100 times a second."""
+
+_open: Counter[str] = Counter()
+"""Number of open answers by the name of their reader; used by the event loop alone."""
+_looks = machine.pool("followers", _THREADS)
+"""Each open answer has one call here at most."""
+
+
+class Following(StreamingResponse):
+    """A stream that takes one of its reader's places while it is open; :meth:`refusal` is sent where none is free."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        name = current_identity.get().name
+        if _open[name] >= MOST:
+            await self.refusal(f"{name} follows {MOST} logs and pages already; close some")(scope, receive, send)
+            return
+        _open[name] += 1
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            _open[name] -= 1
+            if not _open[name]:
+                del _open[name]
+
+    def refusal(self, message: str) -> Response:
+        """The answer in place of the stream."""
+        return error_response(message, 429, "TooManyRequestsException")
+
+
+def pause(least: float) -> float:
+    """Seconds until an answer looks again: longer where many are open, so that their number does not slow the server down."""
+    return max(least, _SHARE * _open.total())
+
+
+async def looked(look: Callable[[], T]) -> T:
+    """The result of ``look``, from a thread that serves these answers alone. Raises what it raises."""
+    return await asyncio.wrap_future(_looks.submit(partial(contextvars.copy_context().run, look)))
+
+
+async def looked_patiently(look: Callable[[], T], seconds: float) -> AsyncIterator[T | None]:
+    """:func:`looked`, and before it None whenever so many seconds have passed: the store may hang."""
+    task = asyncio.ensure_future(looked(look))
+    try:
+        while not (await asyncio.wait({task}, timeout=seconds))[0]:
+            yield None
+        yield task.result()
+    finally:
+        task.cancel()
