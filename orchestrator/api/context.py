@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
+from typing import Any, TypeVar
 
 from fastapi import Request
 from sqlalchemy import select
@@ -14,11 +17,13 @@ from orchestrator.api.damaged import DamagedRow
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
-from shared_store.layout import Run, Store, StoreError
+from shared_store.layout import Run, StoreError
 from shared_store.parent import NewRun, TeacherCopy
 from shared_store.wording import nearest
 
@@ -27,6 +32,46 @@ IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
 
 _COMPARED = 1000
 """Names of runs among which the nearest to an unknown one is looked for."""
+
+
+T = TypeVar("T")
+Known = dict[Hashable, Callable[[], Any]]
+"""What was read of the store, by key: each returns it, or raises what the read raised."""
+
+
+class StoreNeeded(RequestError):
+    """A call needs to know something of the store: :func:`with_store` reads that and makes the call again."""
+
+    def __init__(self, key: Hashable, body: Callable[[], Any]) -> None:
+        super().__init__("the store was not read yet")
+        self.key, self.body = key, body
+
+
+def with_store(reconciler: Reconciler, call: Callable[[Known], T]) -> T:
+    """Carry out a call that may need to know something of the store. That is read while neither the database nor a lock is held.
+
+    Raises what the call raises, StoreSilent.
+    """
+    known: Known = {}
+    while True:
+        try:
+            return call(known)
+        except StoreNeeded as needed:
+            known[needed.key] = reconciler.calls.call(partial(_outcome, needed.body))
+
+
+def _outcome(body: Callable[[], T]) -> Callable[[], T]:
+    """What returns the result of ``body``, or raises its error."""
+    try:
+        result = body()
+    except Exception as raised:
+        error = raised
+
+        def fail() -> T:
+            raise error
+
+        return fail
+    return lambda: result
 
 
 @dataclass(frozen=True)
@@ -40,6 +85,20 @@ class Context:
     """The run that a submission makes, of a clone."""
     teacher: TeacherCopy | None = None
     """The weights that the submitted job's policy will imitate, copied already (:func:`orchestrator.api.sources.with_teacher`)."""
+    known: Known = field(default_factory=dict)
+    """What was read of the store for the call."""
+
+    def read(self, key: Hashable, body: Callable[[], T]) -> T:
+        """What ``body`` reads of the store; ``key`` tells it apart. Raises StoreNeeded where it was not read yet, else what it raised."""
+        if key not in self.known:
+            raise StoreNeeded(key, body)
+        found: T = self.known[key]()
+        return found
+
+    def found(self, name: str) -> RunFacts:
+        """The run of that name, as it is in the store. Raises ClientError where no run can have it, StoreNeeded."""
+        run = self.run(name)
+        return self.read(("run", name), lambda: facts_of(run))
 
     def queue(self, reference: str, *, deleting: bool = False) -> JobQueue:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
@@ -111,7 +170,7 @@ def find_run(reconciler: Reconciler, name: str) -> Run:
             named = find_job(session, name, visible_queues())
             if named is not None and is_visible(named):
                 raise ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
-            runs = [each.name for each in visible_runs(session, reconciler.store, most=_COMPARED)]
+        runs = [each.name for each in visible_runs(reconciler, most=_COMPARED)]
         others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
         hint = nearest(name, runs, others, cutoff=0.3)
         raise ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
@@ -120,22 +179,30 @@ def find_run(reconciler: Reconciler, name: str) -> Run:
 
 def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:
     """The run called ``name``, where the caller may do this to it; nothing of another's is read. Raises ClientError."""
-    with reconciler.database.session() as session:
-        owner = owner_of(session, Context(session, reconciler).run(name))
+    try:
+        owner = owner_of_run(reconciler, reconciler.store.run(name))
+    except StoreError as error:
+        raise ClientError(str(error)) from None
     if owner is not None:
         check(operation, owner)
     return find_run(reconciler, name)
 
 
-def visible_runs(
-    session: Session, store: Store, after: str = "", most: int | None = None, search: str = ""
-) -> list[Run]:
+def owner_of_run(reconciler: Reconciler, run: Run) -> RunRecord | None:
+    """:func:`owner_of`, for a run that is not read yet. Raises OSError."""
+    found = facts_of(run)
+    with reconciler.database.session() as session:
+        return owner_of(session, found)
+
+
+def visible_runs(reconciler: Reconciler, after: str = "", most: int | None = None, search: str = "") -> list[Run]:
     """The runs of the store that the caller may see, by name: those behind ``after``, at most so many, with ``search`` in their names."""
     if visible_queues() is None and not search:
-        return store.runs(after, most)
-    found = (run for run in store.runs(after) if search.lower() in run.name.lower())
+        return reconciler.store.runs(after, most)
+    found = (run for run in reconciler.store.runs(after) if search.lower() in run.name.lower())
     if visible_queues() is None:
         return list(islice(found, most))
-    recorded = {record.name: record for record in session.scalars(select(RunRecord))}
-    owned = ((run, recorded.get(run.name) or owner_of(session, run)) for run in found)
+    with reconciler.database.session() as session:
+        recorded = {record.name: record for record in session.scalars(select(RunRecord))}
+    owned = ((run, recorded.get(run.name) or owner_of_run(reconciler, run)) for run in found)
     return list(islice((run for run, owner in owned if owner is not None and is_visible(owner)), most))

@@ -13,13 +13,21 @@ from shared_store.leagues import LeagueError, digest_of_track
 
 def check_tracks(store: Store, spec: Mapping[str, Any] | None) -> None:
     """Raise ClientError where a training of an installed racer's task names a track that does not exist or is damaged."""
+    check_names(store, _tracks(spec), "train.config.track")
+
+
+def names_tracks(spec: Mapping[str, Any] | None) -> bool:
+    """Whether :func:`check_tracks` reads the store."""
+    return _tracks(spec) is not None
+
+
+def _tracks(spec: Mapping[str, Any] | None) -> Any:
     train = (spec or {}).get("train")
     task = train.get("task") if isinstance(train, Mapping) else None
     if not isinstance(train, Mapping) or not isinstance(task, str):
-        return
+        return None
     kind, config = task_config(task), train.get("config")
-    if kind is not None and kind.races and isinstance(config, Mapping):
-        check_names(store, config.get("track"), "train.config.track")
+    return config.get("track") if kind is not None and kind.races and isinstance(config, Mapping) else None
 
 
 def check_names(store: Store, named: Any, key: str) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from orchestrator.api import permissions
@@ -13,13 +14,13 @@ from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
-from orchestrator.api.racing_tracks import check_tracks
+from orchestrator.api.racing_tracks import check_tracks, names_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.ownership import owner_of
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.layout import NAME
+from shared_store.layout import NAME, Run
 from shared_store.parent import TeacherCopy, named_parent
 from shared_store.wording import shown
 
@@ -61,25 +62,30 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     Returns:
         The teacher's weights, where the job's run has to hold a copy of them.
     """
-    check_tracks(context.reconciler.store, gang.spec)
+    store, spec = context.reconciler.store, gang.spec
+    if names_tracks(spec):
+        context.read("tracks", lambda: check_tracks(store, spec))
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
     for source in sources_of(gang):
         is_teacher = source.key == _TEACHER
-        if is_teacher and _is_held(context, gang, source):
+        if is_teacher and context.read(("held", source), partial(_is_held, context, gang, source)):
             continue
         if not is_waiting:
             try:
-                find_run(context.reconciler, source.run)
+                context.read(("find", source.run), partial(find_run, context.reconciler, source.run))
             except ClientError as error:
                 raise ClientError(f"{source.key}: {error}" if is_teacher else str(error), error.status) from None
         if permissions.visible_queues() is not None:
             nobodys = RunRecord(name=source.run, queue="")
-            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
+            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.found(source.run)) or nobodys)
         if source.key in ("evaluate", "race") and not is_waiting:
-            check_evaluation(context.reconciler.store, context.run(source.run), gang.spec or {}, source.key)
+            evaluated = partial(check_evaluation, store, context.run(source.run), spec or {}, source.key)
+            context.read((source.key, source.run), evaluated)
         if is_teacher and not is_waiting:
-            needed = TeacherNeeded(source.run, _checkpoint(context, source))
+            needed = TeacherNeeded(
+                source.run, context.read(("weights", source), partial(_checkpoint, context.run(source.run), source))
+            )
             teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take
     return teacher
 
@@ -148,9 +154,9 @@ def _is_meant(checkpoint: Checkpoint, source: Source) -> bool:
     return source.checkpoint in ("", str(checkpoint.iteration), checkpoint.name)
 
 
-def _checkpoint(context: Context, source: Source) -> Checkpoint:
+def _checkpoint(run: Run, source: Source) -> Checkpoint:
     """The newest checkpoint that a teacher's reference means. Raises ClientError."""
-    checkpoints = list_checkpoints(context.run(source.run))
+    checkpoints = list_checkpoints(run)
     if not checkpoints:
         raise ClientError(f"{source.key}: run {source.run} has no checkpoint yet; train it first")
     meant = [checkpoint for checkpoint in checkpoints if _is_meant(checkpoint, source)]

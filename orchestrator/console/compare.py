@@ -22,7 +22,7 @@ from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped,
 from shared_store.metrics import sampled
 from shared_store.wording import nearest
 
-router = page_router("run")
+router = page_router("run", stored=True)
 
 MOST = 40
 """Runs that are compared at once."""
@@ -105,8 +105,7 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
             chosen[pattern] = None
             continue
         if known is None:
-            with reconciler.database.session() as session:
-                known = [run.name for run in visible_runs(session, reconciler.store)]
+            known = [run.name for run in visible_runs(reconciler)]
         fitting = [name for name in known if fnmatchcase(name, pattern)]
         if not fitting:
             raise ClientError(f"no run is called like {pattern[:128]}; the page of runs has their names", 404)

@@ -33,7 +33,7 @@ from orchestrator.console.routing import page_router
 from shared_store.layout import Run
 from shared_store.metrics import finite, history_of, sampled
 
-router = page_router("name")
+router = page_router("name", stored=True)
 
 POINTS = 300
 """Points of a curve by default; a chart is seldom wider than that many points two pixels apart."""

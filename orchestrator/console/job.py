@@ -32,7 +32,7 @@ from shared_store.files import DamagedFile
 from shared_store.layout import Run
 from shared_store.metrics import history_of, sampled
 
-router = page_router()
+router = page_router(stored=True)
 
 _recent = Recent()
 _RECORDS = 200

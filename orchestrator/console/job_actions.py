@@ -20,6 +20,7 @@ from orchestrator.api.permissions import Operation
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import SpecError
 from orchestrator.persistence.queries import short_id
 from orchestrator.spec.evaluations import evaluation_document
@@ -27,7 +28,7 @@ from orchestrator.spec.model import validate
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Run
 
-router = page_router()
+router, _stored = page_router(), page_router(stored=True)
 _Wanted = int | Literal["best", "latest"] | None
 
 
@@ -52,7 +53,7 @@ def save(request: Request, reference: str) -> Response:
     return done(request, f"/jobs/{job}", answer)
 
 
-@router.post("/jobs/{reference}/resume")
+@_stored.post("/jobs/{reference}/resume")
 def resume(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that continues the run."""
     run, directory = _run(request, reference, Operation.RESUME_RUN)
@@ -70,7 +71,7 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
     return done(request, f"/jobs/{told['jobId']}", f"resumed {run.name} from iteration {told['iteration']}")
 
 
-@router.post("/jobs/{reference}/clone")
+@_stored.post("/jobs/{reference}/clone")
 def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that begins a new run with the weights of a checkpoint."""
     run, directory = _run(request, reference, Operation.CLONE_RUN)
@@ -80,7 +81,7 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
     return done(request, f"/jobs/{told['jobId']}", f"cloned {parent['run']}@{parent['iteration']} as run {told['run']}")
 
 
-@router.post("/jobs/{reference}/evaluate")
+@_stored.post("/jobs/{reference}/evaluate")
 def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that evaluates a checkpoint."""
     run, directory = _run(request, reference, Operation.READ_RUN)
@@ -88,19 +89,19 @@ def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) 
     return _submitted(request, document, directory, f"evaluation of {run.name}")
 
 
-@router.post("/jobs/{reference}/export")
+@_stored.post("/jobs/{reference}/export")
 def export(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that exports a checkpoint's policy."""
     return _beside(request, reference, form, "export")
 
 
-@router.post("/jobs/{reference}/record")
+@_stored.post("/jobs/{reference}/record")
 def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that records a checkpoint's policy at work."""
     return _beside(request, reference, form, "record")
 
 
-@router.post("/jobs/{reference}/register")
+@_stored.post("/jobs/{reference}/register")
 def register(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Keep an exported checkpoint as the next version of a model."""
     run, _ = _run(request, reference, Operation.REGISTER_MODEL)
@@ -149,8 +150,9 @@ def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, s
 
 def _trained(request: Request, run: Run) -> Mapping[str, Any]:
     reconciler: Reconciler = reconciler_of(request)
+    found = facts_of(run)
     with reconciler.database.session() as session:
-        spec = runs.spec_of(session, run) or {}
+        spec = runs.spec_of(session, found) or {}
     if not spec.get("train"):
         raise ClientError(f"run {run.name} is no training, so it has no policy")
     return spec
@@ -186,3 +188,6 @@ def _named(form: Form, what: str) -> str:
     if not 0 < len(name) <= 128:
         raise ClientError(f"give {what} a name, of at most 128 characters")
     return name
+
+
+router.include_router(_stored)

@@ -16,6 +16,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native import runs
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import facts_of
 from orchestrator.persistence.models import Job
 from shared_store.files import DamagedFile
 
@@ -92,13 +93,14 @@ def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, s
                 spec = earlier.gang.spec
             if spec:
                 return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", permissions.shown(spec)
-        parent = (detail["results"] or {}).get("parent") or {}
-        name = parent.get("run")
-        if not isinstance(name, str):
-            return None
-        try:
-            run = permitted_run(reconciler, name, Operation.READ_RUN)
+    parent = (detail["results"] or {}).get("parent") or {}
+    name = parent.get("run")
+    if not isinstance(name, str):
+        return None
+    try:
+        run = facts_of(permitted_run(reconciler, name, Operation.READ_RUN))
+        with reconciler.database.session() as session:
             spec = runs.spec_of(session, run)
-        except (ClientError, DamagedFile, OSError):
-            return None  # deleted, or another's
+    except (ClientError, DamagedFile, OSError):
+        return None  # deleted, or another's
     return (f"its parent {name}", f"/runs/{name}", permissions.shown(spec)) if spec else None

@@ -17,7 +17,7 @@ from orchestrator.console.routing import page_router
 from shared_store.log_windows import LINES_A_WINDOW, Chosen, Window, first_error, lines_after, lines_before, search
 from shared_store.logs import LogFollower, LogLine
 
-router = page_router()
+router = page_router(stored=True)
 
 _MOST_LAG = 1 << 20
 """Bytes that a page gets of the lines that it has missed; where it has missed more, it gets the last lines alone."""

@@ -29,7 +29,7 @@ from shared_store.races import clock
 from shared_store.standings import RANKINGS
 from shared_store.wording import counted
 
-router = page_router()
+router = page_router(stored=True)
 
 _RACES = 20
 """Number of races under way, or over and not entered, on a league's page."""

@@ -20,7 +20,7 @@ from orchestrator.api.http.access import Access
 from orchestrator.api.http.following import Following, looked
 from orchestrator.api.permissions import current_identity
 from orchestrator.console.pages import session
-from orchestrator.persistence.session import DatabaseError
+from orchestrator.domain.errors import Unavailable
 from shared_store.files import DamagedFile
 
 INTERVAL = 0.5
@@ -83,7 +83,7 @@ async def _events(
     while not closing.is_set() and time.monotonic() - begun < _LONGEST and admitted():
         try:
             found = await looked(look)
-        except (ClientError, DatabaseError, DamagedFile, OSError) as error:
+        except (ClientError, Unavailable, DamagedFile, OSError) as error:
             yield _written(Event("trouble", str(error)))
             await asyncio.sleep(5 * interval)
             continue

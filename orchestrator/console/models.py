@@ -16,7 +16,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import written
 from shared_store.files import DamagedFile
 
-router = page_router()
+router = page_router(stored=True)
 
 _MOST_VERSIONS = 30
 """Number of a model's newest versions in its graph, beside the one on the page."""

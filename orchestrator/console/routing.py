@@ -14,9 +14,10 @@ from starlette.routing import Match
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.auth import kind_of
+from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.console.forms import Unconfirmed, check_form
 from orchestrator.console.pages import NAVIGATION, failure, wants_page
-from orchestrator.persistence.session import DatabaseError
+from orchestrator.domain.errors import Unavailable
 from shared_store.files import DamagedFile
 from shared_store.wording import explain
 
@@ -38,7 +39,7 @@ class PageRoute(APIRoute):
                 first = error.errors()[0]
                 name = ".".join(map(str, first["loc"][1:])) or str(first["loc"][0])
                 return failure(request, f"{name}: {explain(first)}", 400)
-            except DatabaseError as error:
+            except Unavailable as error:
                 return failure(request, str(error), 503, "ServerException")
             except DamagedFile as error:
                 return failure(request, f"the store holds a damaged file: {error}", 409)
@@ -46,8 +47,17 @@ class PageRoute(APIRoute):
         return answer
 
 
-def page_router(*repeatable: str) -> APIRouter:
-    """A router for pages of the console. ``repeatable``: query parameters that an address may have several times."""
+class StoredPageRoute(PageRoute, StoreRoute):
+    """A route of a page that is made of what is in the store."""
+
+
+def page_router(*repeatable: str, stored: bool = False) -> APIRouter:
+    """A router for pages of the console.
+
+    Args:
+        repeatable: Query parameters that an address may have several times.
+        stored: Whether its functions use the store.
+    """
 
     def check_query(request: Request) -> None:
         given = Counter(name for name, _ in request.query_params.multi_items() if name not in repeatable)
@@ -56,7 +66,7 @@ def page_router(*repeatable: str) -> APIRouter:
                 raise ClientError(f"the address has {name[:50]} {times} times; give it once")
 
     checks = [Depends(check_form), Depends(check_query)]
-    return APIRouter(route_class=PageRoute, include_in_schema=False, dependencies=checks)
+    return APIRouter(route_class=StoredPageRoute if stored else PageRoute, include_in_schema=False, dependencies=checks)
 
 
 def finish(app: FastAPI) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import mimetypes
 import os
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from urllib.parse import quote
@@ -20,7 +21,7 @@ from orchestrator.console.routing import page_router
 from shared_store.files import DamagedFile, open_inside
 from shared_store.layout import NAME, Run
 
-router = page_router()
+router = page_router(stored=True)
 
 PLACES = ("metrics", "recordings", "evaluations", "exports")
 """Directories of a run whose files are shown."""
@@ -84,7 +85,8 @@ def _walk(directory: Path, depth: int) -> Iterator[Path]:
 @router.get("/runs/{name}/files/{path:path}")
 def file(request: Request, name: str, path: str) -> Response:
     """A file of a run: pictures are shown, other files are downloaded."""
-    run = permitted_run(reconciler_of(request), name, Operation.READ_RUN)
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.READ_RUN)
     parts = path.split("/")
     if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):
         raise ClientError(f"run {run.name} shows no file {path[:100]!r}", 404)
@@ -96,10 +98,10 @@ def file(request: Request, name: str, path: str) -> Response:
         raise ClientError(f"{path[:100]} of run {run.name} can't be read: {error}", 409) from None
     size = os.fstat(opened.fileno()).st_size
 
-    def blocks() -> Iterator[bytes]:
+    async def blocks() -> AsyncIterator[bytes]:
         left = size  # a file that grows meanwhile has no more than was announced
         with opened:
-            while left and (block := opened.read(min(left, _BLOCK))):
+            while left and (block := await reconciler.calls.answer(partial(opened.read, min(left, _BLOCK)))):
                 left -= len(block)
                 yield block
 

@@ -22,7 +22,7 @@ from orchestrator.persistence.queries import short_id
 from shared_store.evaluations import told_changes
 from shared_store.metrics import finite
 
-router = page_router()
+router = page_router(stored=True)
 
 ROWS = 50
 """Runs of a page."""
@@ -114,9 +114,7 @@ def _window(reconciler: Reconciler, search: str, after: str) -> dict[str, dict[s
     """Rows of a page of the list, by the run's name; open pages with the same choice share them."""
 
     def look() -> dict[str, dict[str, Any]]:
-        with reconciler.database.session() as session:
-            found = list_runs(reconciler, session, after, ROWS, search)
-        return {each["run"]: _row(each) for each in found}
+        return {each["run"]: _row(each) for each in list_runs(reconciler, after, ROWS, search)}
 
     return _listed.get((id(reconciler), current_identity.get(), search, after), look)
 

@@ -14,9 +14,9 @@ from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.errors import ClientError
-from orchestrator.api.native import routes
+from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.fitting import UnknownQueue
-from orchestrator.api.native.routes import PlanRequest
+from orchestrator.api.native.plan_routes import PlanRequest
 from orchestrator.api.permissions import Operation
 from orchestrator.api.turns import Turns
 from orchestrator.console.forms import TOKEN, Form, done, sent_form
@@ -32,7 +32,7 @@ from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
 from shared_store.wording import nearest
 
-router = page_router()
+router, _stored = page_router(), page_router(stored=True)
 
 BEGINNING = """\
 name: my-job
@@ -62,13 +62,13 @@ def choose(request: Request) -> Response:
     return render(request, "submit.html", racers=racers, tasks=others)
 
 
-@router.get("/submit/task/{task}")
+@_stored.get("/submit/task/{task}")
 def wizard(request: Request, task: str) -> Response:
     """The wizard for a task."""
     return _wizard(request, task, _groups(request, task), None)
 
 
-@router.post("/submit/task/{task}")
+@_stored.post("/submit/task/{task}")
 def wizard_again(request: Request, task: str, form: Form = Depends(sent_form)) -> Response:
     """The wizard with the fields as they were filled in before."""
     return _wizard(request, task, filled(form, _groups(request, task)), None)
@@ -109,7 +109,7 @@ def check(request: Request, form: Form = Depends(sent_form)) -> Response:
     )
 
 
-@router.post("/submit/review")
+@_stored.post("/submit/review")
 def review(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML with the hosts on which its nodes would start; or the form again, with its problem."""
     permissions.check(Operation.SUBMIT_JOB)
@@ -121,7 +121,7 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
         body = PlanRequest(definition=compile_definition(spec, ""), queue=spec.queue)
         problem = _unfit(request, spec, body)
         try:
-            plan = {} if problem else routes.plan(request, body)
+            plan = {} if problem else plan_routes.plan(request, body)
         except ClientError as error:
             unplanned = str(error)
     if spec is None or problem is not None:
@@ -142,7 +142,7 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
     )
 
 
-@router.post("/submit")
+@_stored.post("/submit")
 def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Submit the job of a YAML, as ``muster submit`` does; a form that is sent again leads to the job that it made."""
     permissions.check(Operation.SUBMIT_JOB)
@@ -177,7 +177,7 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
 def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
     """Why the job could never start."""
     try:
-        problem = routes.fits(request, body)["problem"]
+        problem = plan_routes.fits(request, body)["problem"]
     except permissions.Refusal:
         raise
     except UnknownQueue as error:
@@ -255,3 +255,6 @@ def _nearest_field(key: str, names: Sequence[str]) -> str:
 def _editor(request: Request, text: str, problem: Problem | None, status: int = 200) -> Response:
     permissions.check(Operation.SUBMIT_JOB)
     return render(request, "submit_yaml.html", status, text=text, problem=problem, help=help_at(text, 1))
+
+
+router.include_router(_stored)

@@ -21,7 +21,7 @@ from orchestrator.console.routing import page_router
 from shared_store import tracks as stored
 from shared_store.wording import nearest
 
-router = page_router()
+router = page_router(stored=True)
 
 _SIZE = (240.0, 160.0)
 """Width and height of an outline."""

@@ -102,6 +102,10 @@ class Disk:
         of = (volume for volume in self._volumes if purpose in (None, volume.name))
         return next((said for volume in of if (said := self._silence(volume) or volume.absent or volume.short)), None)
 
+    def is_silent(self, purpose: str) -> bool:
+        """Whether the volume of this purpose has not answered for a while."""
+        return any(volume.name == purpose and self._silence(volume) for volume in self._volumes)
+
     def absent(self, purpose: str) -> str | None:
         """Why the volume of this purpose is not there; None where it is, as far as was seen."""
         return next((volume.absent for volume in self._volumes if volume.name == purpose), None)

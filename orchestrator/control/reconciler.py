@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
@@ -26,8 +25,9 @@ from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import RunStore
 from orchestrator.control.snapshot import holding_of, open_attempts, take_snapshot
+from orchestrator.control.store_calls import StoreCalls
 from orchestrator.control.store_identity import StoreAbsent, StoreIdentity
-from orchestrator.control.usage import forget_before, held_by
+from orchestrator.control.usage import forget_before
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL, Status
@@ -90,6 +90,8 @@ class Reconciler:
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
+        self.calls = StoreCalls(store.path, partial(self.disk.is_silent, "store"))
+        """The store, for requests."""
         self._short, self._is_cut_off = False, False
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
@@ -159,6 +161,7 @@ class Reconciler:
         if self._thread is not None:
             self._thread.join()
         self.attempts.close()
+        self.calls.close()
 
     def problem(self) -> str | None:
         """Why the controller can't do its work now, as its loop has left it; waits for nothing."""
@@ -416,20 +419,6 @@ class Reconciler:
         if leading is not None and leading.job in times:
             times[leading.job] = leading.since + self.clock.drift
         return order, times
-
-    def utilization(
-        self, session: Session, queue: str
-    ) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
-        """Amounts that the gangs of a queue hold now, by unit (``VCPU``, ``GPU``): in all, and by share."""
-        total: dict[str, float] = defaultdict(float)
-        shares: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-        for job, attempt in open_attempts(session, self.work_queue.active()):
-            if job.queue == queue:
-                held = held_by(attempt)
-                for unit, amount in (("VCPU", held.cpus), ("GPU", held.gpus)):
-                    total[unit] += amount
-                    shares[job.share or ""][unit] += amount
-        return total, shares
 
     def drain(self, session: Session, queue: JobQueue) -> None:
         """Ask all jobs of a queue to end."""

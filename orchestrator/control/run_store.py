@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ from orchestrator.machine import Pool
 from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
 from shared_store.files import DamagedFile
-from shared_store.layout import Store, StoreError
+from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import Outcome, read_outcome
 
 log = logging.getLogger("muster.controller")
@@ -56,10 +56,19 @@ class RunFacts:
         return self.missing
 
     def description(self) -> Mapping[str, Any] | None:
-        """Raises ValueError where it is damaged."""
+        """Raises DamagedFile."""
         if self.damage:
-            raise ValueError(self.damage)
+            raise DamagedFile(self.damage)
         return self.content
+
+
+def facts_of(run: Run) -> RunFacts:
+    """A run as the store has it now. Raises OSError."""
+    try:
+        content, damage = run.description(), ""
+    except (ValueError, RecursionError) as error:
+        content, damage = None, str(error)
+    return RunFacts(run.name, run.is_missing(), content, damage)
 
 
 @dataclass(frozen=True)
@@ -83,11 +92,7 @@ class RunStore:
         """A run before an attempt begins. Raises RunRefused."""
         with self._using(f"read run {name}"):
             run = self.store.run(name)
-            try:
-                content, damage = run.description(), ""
-            except (ValueError, RecursionError) as error:
-                content, damage = None, str(error)
-            return RunFacts(name, run.is_missing(), content, damage, read_epoch(run), self.peers.writer(run))
+            return replace(facts_of(run), epoch=read_epoch(run), writer=self.peers.writer(run))
         raise AssertionError
 
     def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 
 from sqlalchemy import delete, or_, select
 from sqlalchemy.orm import Session, aliased
@@ -25,6 +26,21 @@ from orchestrator.scheduling.order import decayed
 def held_by(attempt: Attempt) -> Resources:
     """Total resources of the nodes of an attempt."""
     return sum((each.resources for each in placements_of(attempt)), Resources())
+
+
+def utilization(
+    attempts: Iterable[tuple[Job, Attempt]], queue: str
+) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
+    """Amounts that those of these attempts hold that are of a queue, by unit (``VCPU``, ``GPU``): in all, and by share."""
+    total: dict[str, float] = defaultdict(float)
+    shares: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    for job, attempt in attempts:
+        if job.queue == queue:
+            held = held_by(attempt)
+            for unit, amount in (("VCPU", held.cpus), ("GPU", held.gpus)):
+                total[unit] += amount
+                shares[job.share or ""][unit] += amount
+    return total, shares
 
 
 def placements_of(attempt: Attempt) -> tuple[Placement, ...]:

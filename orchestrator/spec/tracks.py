@@ -11,6 +11,9 @@ from typing import Any
 
 from orchestrator.domain.errors import ServerError, UsageError
 
+_PATIENCE = 120.0
+"""Seconds that an order may take."""
+
 
 def ask(order: Mapping[str, Any]) -> Any:
     """Give an order to :mod:`worker.racer`, and return its answer.
@@ -24,9 +27,11 @@ def ask(order: Mapping[str, Any]) -> Any:
     """
     if find_spec("numpy") is None:
         raise ServerError("tracks need numpy, which this environment lacks: pip install 'muster[worker]'")
-    asked = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.racer", json.dumps(order)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-P", "-m", "worker.racer", json.dumps(order)]
+    try:
+        asked = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_PATIENCE)
+    except subprocess.TimeoutExpired:
+        raise ServerError(f"worker.racer has not answered within {_PATIENCE:.0f} s; does the store answer?") from None
     said = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
     if asked.returncode == 2:
         raise UsageError(said[-1])

@@ -32,11 +32,12 @@ LAYERS = {
     "control": {"domain", "machine", "spec", "scheduling", "persistence", "engines"},
     "api": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "keys"},
     "console": {"domain", "spec", "scheduling", "persistence", "control", "api", "keys"},
+    "service_manager": {"machine"},
     "home": {"domain"},
     "keys": {"domain"},
     "client": {"domain", "home"},
     "server": {"domain", "engines", "persistence", "control", "api", "console", "home", "keys"},
-    "cli": {"domain", "spec", "engines", "control", "client", "home", "keys", "server"},
+    "cli": {"domain", "spec", "engines", "control", "client", "home", "keys", "server", "service_manager"},
 }
 """What each room of the orchestrator may import beside itself."""
 ADAPTERS = {

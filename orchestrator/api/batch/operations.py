@@ -7,7 +7,7 @@ model can't say.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from botocore.validate import ParamValidator
@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from orchestrator.api import permissions
 from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
 from orchestrator.api.batch.service_model import service_model
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
 from orchestrator.api.permissions import Operation
@@ -103,15 +103,22 @@ def call(reconciler: Reconciler, operation: str, request: object, idempotency_ke
             answer: dict[str, Any] = permissions.shown(handler(Context(session, reconciler), checked))
             return answer
 
-    def carry_out(session: Session, teacher: TeacherCopy | None = None) -> dict[str, Any]:
-        return handler(Context(session, reconciler, idempotency_key, teacher=teacher), checked)
+    def carry_out(session: Session) -> dict[str, Any]:
+        return handler(Context(session, reconciler, idempotency_key), checked)
+
+    def submit(teacher: TeacherCopy | None) -> dict[str, Any]:
+        def call(known: Known) -> dict[str, Any]:
+            context = partial(
+                Context, reconciler=reconciler, idempotency_key=idempotency_key, teacher=teacher, known=known
+            )
+            return reconciler.submissions.call(lambda session: handler(context(session), checked))
+
+        return with_store(reconciler, call)
 
     reconciler.check_writable(adds=operation.startswith(_ADDING))
     try:
         if operation == "SubmitJob":
-            response = with_teacher(
-                reconciler, lambda teacher: reconciler.submissions.call(lambda session: carry_out(session, teacher))
-            )
+            response = with_teacher(reconciler, submit)
         else:
             with reconciler.writing, reconciler.database.session() as session:
                 response = carry_out(session)

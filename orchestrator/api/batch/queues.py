@@ -97,7 +97,7 @@ def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[st
 
 
 def _utilization(context: Context, queue: JobQueue) -> dict[str, Any]:
-    used, by_share = context.reconciler.utilization(context.session, queue.name)
+    used, by_share = utilization(open_attempts(context.session, context.reconciler.work_queue.active()), queue.name)
     detail: dict[str, Any] = {
         "totalCapacityUsage": [{"capacityUnit": unit, "quantity": amount} for unit, amount in used.items()],
         "lastUpdatedAt": now(),

@@ -196,7 +196,7 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     if not NAME.fullmatch(run):
         raise ClientError(f"MUSTER_RUN {run[:100]!r}: a run is named with letters, digits, '.', '_' and '-'")
     restricted = named and permissions.visible_queues() is not None
-    if restricted and (owner := owner_of(context.session, context.run(run))):
+    if restricted and (owner := owner_of(context.session, context.found(run))):
         permissions.check(Operation.SUBMIT_JOB, owner)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
     if holder:
@@ -204,7 +204,8 @@ def _check_run(context: Context, run: str, named: bool) -> None:
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
         )
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
-        if named and (writer := context.reconciler.peers.writer(context.reconciler.store.run(run))):
+        there = context.run(run)
+        if named and (writer := context.read(("writer", run), lambda: context.reconciler.peers.writer(there))):
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
 
 

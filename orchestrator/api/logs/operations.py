@@ -12,12 +12,12 @@ import re
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
+from functools import partial
 from itertools import chain, islice
 from typing import Any
 
 from botocore.validate import ParamValidator
 from sqlalchemy import func, select
-from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
 from orchestrator.api.arns import ACCOUNT, REGION
@@ -33,8 +33,8 @@ from orchestrator.api.logs.live_tail import LiveTail, messages
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
 from orchestrator.api.permissions import Operation, Refusal, check
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.models import Job, now
-from orchestrator.persistence.session import DatabaseError
 
 GROUP_ARN = f"arn:aws:logs:{REGION}:{ACCOUNT}:log-group:{LOG_GROUP}"
 SETTLE = 500
@@ -92,8 +92,8 @@ async def answer(
         check(Operation(operation))
         request = validate(operation, await body())
         if operation == "StartLiveTail":
-            return await run_in_threadpool(start_live_tail, reconciler, closing, request)
-        return await run_in_threadpool(
+            return await reconciler.calls.answer(partial(start_live_tail, reconciler, closing, request))
+        return await reconciler.calls.answer(
             lambda: JSONResponse(OPERATIONS[operation](reconciler, request), media_type=_JSON)
         )
     except LogsError as error:
@@ -102,7 +102,7 @@ async def answer(
         return LogsError(error.kind, str(error), error.status).response()
     except ClientError as error:
         return LogsError("InvalidParameterException", str(error), error.status).response()
-    except DatabaseError as error:
+    except Unavailable as error:
         return LogsError("ServiceUnavailableException", str(error), 503).response()
     except OSError as error:
         return LogsError("ServiceUnavailableException", f"the store can't be read: {error}", 503).response()

@@ -18,7 +18,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import submit
 from orchestrator.control.reconciler import Reconciler
@@ -203,12 +203,17 @@ class AutomaticEvaluations:
         token = permissions.current_identity.set(permissions.Identity(training.owner))
         try:
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
-            with reconciler.writing, reconciler.database.session() as session:
-                context = Context(session, reconciler)
-                tags = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}
-                answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
-                row = _row(session, training, counted)
-                row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
+            tags = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}
+
+            def call(known: Known) -> dict[str, Any]:
+                with reconciler.writing, reconciler.database.session() as session:
+                    context = Context(session, reconciler, known=known)
+                    answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
+                    row = _row(session, training, counted)
+                    row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
+                    return answer
+
+            answer = with_store(reconciler, call)
         except (ClientError, SpecError) as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from sqlalchemy import select
@@ -15,16 +16,17 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import Changes, answered, check, submit
 from orchestrator.api.native.runs import spec_of
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import SpecError
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
-from orchestrator.persistence.ownership import first_description, forget_gone_run
+from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
@@ -59,8 +61,7 @@ def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes
 
     Raises ClientError as :func:`clone`.
     """
-    with reconciler.database.session() as session:
-        spec, chosen = _checked(Context(session, reconciler), source, name, changes)
+    spec, chosen = _checked(reconciler, source, name, changes)
     definition = _check_submission(reconciler, spec, changes, name)
     return {
         "definition": definition,
@@ -77,45 +78,57 @@ def _clone(
     idempotency_key: str | None,
     teacher: TeacherCopy | None,
 ) -> dict[str, Any]:
-    with reconciler.database.session() as session:
-        context = Context(session, reconciler, idempotency_key)
-        if earlier := _answered(context, name):
-            return earlier
-        spec, chosen = _checked(context, source, name, changes)
-        new = context.run(name)
+    def answered_before(known: Known) -> dict[str, Any] | None:
+        with reconciler.database.session() as session:
+            return _answered(Context(session, reconciler, idempotency_key, known=known), name)
+
+    if earlier := with_store(reconciler, answered_before):
+        return earlier
+    spec, chosen = _checked(reconciler, source, name, changes)
+    new = reconciler.store.run(name)
     _check_submission(reconciler, spec, changes, name)  # before the copy: not for who may not submit it
     reconciler.check_writable(adds=True)
     if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
     making = NewRun(reconciler.store, reconciler.peers.id, source.name, chosen)
     environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
+
+    def begin(known: Known) -> dict[str, Any]:
+        with reconciler.writing, reconciler.database.session() as session:
+            context = Context(session, reconciler, idempotency_key, making, teacher, known)
+            if earlier := _answered(context, name):
+                return earlier
+            _check_free(session, new, context.read("taken", partial(_is_taken, new)))
+            forget_gone_run(session, new)
+            answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
+            # before the commit: a job without its weights must not start
+            making.publish(new.name, first_description(new, job, job.owner, job.queue))
+            return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
+
     try:
         with making:
             try:
                 making.copy()
             except DamagedCheckpoint as error:
                 raise refusal(source, chosen, error) from None
-            with reconciler.writing, reconciler.database.session() as session:
-                context = Context(session, reconciler, idempotency_key, making, teacher)
-                if earlier := _answered(context, name):
-                    return earlier
-                _check_free(session, new)
-                forget_gone_run(session, new)
-                answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
-                # before the commit: a job without its weights must not start
-                making.publish(new.name, first_description(new, job, job.owner, job.queue))
+            answer = with_store(reconciler, begin)
     except RunExists:
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
     reconciler.wake()
-    return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
+    return answer
 
 
-def _checked(context: Context, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
+def _checked(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
     """The spec of the new run, and the checkpoint with its weights. Raises ClientError."""
-    spec = _changed(context.session, source, name, changes)
-    _check_free(context.session, context.run(name))
+    found = facts_of(source)
+    with reconciler.database.session() as session:
+        spec = _changed(session, found, name, changes)
+        new = Context(session, reconciler).run(name)
+    is_taken = _is_taken(new)
+    with reconciler.database.session() as session:
+        _check_free(session, new, is_taken)
     chosen = _choose(source, changes)
     _check_weights(source, chosen, spec)
     return spec, chosen
@@ -124,8 +137,12 @@ def _checked(context: Context, source: Run, name: str, changes: Changes) -> tupl
 def _check_submission(reconciler: Reconciler, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
     """The definition of the job, which may be submitted. Raises ClientError."""
     reconciler.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
-    with reconciler.database.session() as session:
-        return check(Context(session, reconciler), spec, changes.directory, f"clone {name}")
+
+    def call(known: Known) -> dict[str, Any]:
+        with reconciler.database.session() as session:
+            return check(Context(session, reconciler, known=known), spec, changes.directory, f"clone {name}")
+
+    return with_store(reconciler, call)
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:
@@ -133,11 +150,11 @@ def _answered(context: Context, name: str) -> dict[str, Any] | None:
     job = answered(context, name)
     if job is None:
         return None
-    parent = (context.run(job.run).description() or {}).get("parent")
+    parent = (context.found(job.run).description() or {}).get("parent")
     return {**submission.answer(job), "run": job.run, "parent": parent, "kind": "train"}
 
 
-def _changed(session: Session, source: Run, name: str, changes: Changes) -> Spec:
+def _changed(session: Session, source: FoundRun, name: str, changes: Changes) -> Spec:
     """The spec of the new run. Raises ClientError."""
     document = spec_of(session, source)
     if document is None:
@@ -216,9 +233,13 @@ def _of_other_size(manifest: Mapping[str, Any], train: Train) -> tuple[str, str,
 _EXISTS = "run {} exists already: give the clone another --name"
 
 
-def _check_free(session: Session, new: Run) -> None:
+def _is_taken(new: Run) -> bool:
+    return new.path.is_symlink() or new.path.exists()
+
+
+def _check_free(session: Session, new: Run, is_taken: bool) -> None:
     """Raises ClientError where the name is taken."""
-    if not (new.path.is_symlink() or new.path.exists()):
+    if not is_taken:
         return
     hint = ""
     if session.scalars(select(Job.id).where(Job.run == new.name).limit(1)).first() is None:

@@ -10,11 +10,11 @@ from orchestrator.api import permissions
 from orchestrator.api.batch import definitions, submission
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
 from orchestrator.api.native.fitting import fit_of
-from orchestrator.api.racing_tracks import check_tracks
+from orchestrator.api.racing_tracks import check_tracks, names_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import GangSpec, gang_needs
@@ -69,7 +69,9 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
     permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(context.queue(spec.queue).name))
-    check_tracks(context.reconciler.store, spec.model_dump(mode="json", exclude_none=True))
+    document = spec.model_dump(mode="json", exclude_none=True)
+    if names_tracks(document):
+        context.read("tracks", lambda: check_tracks(context.reconciler.store, document))
     limits.check_document("RegisterJobDefinition", definition)
     return definition
 
@@ -112,7 +114,11 @@ def submit_alone(reconciler: Reconciler, spec: Spec, directory: str, what: str) 
     """:func:`submit` of a job that neither continues nor begins a run, and its commit. Raises ClientError."""
     reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     reconciler.check_writable(adds=True)
-    with reconciler.writing, reconciler.database.session() as session:
-        answer, _ = submit(Context(session, reconciler), spec, directory, what, {})
+
+    def call(known: Known) -> dict[str, Any]:
+        with reconciler.writing, reconciler.database.session() as session:
+            return submit(Context(session, reconciler, known=known), spec, directory, what, {})[0]
+
+    answer = with_store(reconciler, call)
     reconciler.wake()
     return answer

@@ -7,6 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Query, Request
@@ -17,12 +18,14 @@ from orchestrator.api import permissions
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.damaged import DAMAGED, DamagedRow, reading
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.model import KINDS
 from shared_store.files import DamagedFile
-from shared_store.layout import Run
+from shared_store.layout import Run, Store
 from shared_store.metrics import finite, sampled
 
 router = APIRouter()
@@ -84,8 +87,9 @@ def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: 
         query = select(Job).where(*conditions, *wanted.in_states).order_by(Job.created_at.desc(), Job.id.desc())
         query = query.options(selectinload(Job.attempts)).offset(offset).limit(most)
         jobs = session.scalars(query).all()
-        hidden = _runs_of_others(session, reconciler, jobs)
-        found = [_row(reconciler, job, job.run not in hidden) for job in jobs]
+        rows = [_row(reconciler, job) for job in jobs]
+    progress = _progress(reconciler, [training for _, training in rows if training is not None])
+    found = [{**row, "progress": progress.get(row["id"])} for row, _ in rows]
     states = wanted.statuses or tuple(Status)
     return {"jobs": found, "total": sum(counts.get(each, 0) for each in states), "counts": counts}
 
@@ -102,17 +106,16 @@ def kind_of(spec: Mapping[str, Any] | None) -> str:
     return next((kind for kind in KINDS if (spec or {}).get(kind)), "command")
 
 
-def _runs_of_others(session: Session, reconciler: Reconciler, jobs: Sequence[Job]) -> set[str]:
-    """Runs of these jobs that belong to queues that the caller may not see: a job may continue a run of another queue."""
-    if permissions.visible_queues() is None:
-        return set()
-    names = {job.run for job in jobs}
-    _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(names))).all()  # one query instead of many
-    owners = {name: owner_of(session, reconciler.store.run(name)) for name in names}
-    return {name for name, owner in owners.items() if owner is None or not permissions.is_visible(owner)}
+@dataclass(frozen=True)
+class _Training:
+    """A job that has begun to train."""
+
+    job: Job
+    main: int
+    iterations: int
 
 
-def _row(reconciler: Reconciler, job: Job, is_visible: bool) -> dict[str, Any]:
+def _row(reconciler: Reconciler, job: Job) -> tuple[dict[str, Any], _Training | None]:
     row = {
         "id": job.id,
         "name": job.name,
@@ -133,27 +136,58 @@ def _row(reconciler: Reconciler, job: Job, is_visible: bool) -> dict[str, Any]:
             gang = job.gang
             spec = gang.spec or {}
     except DamagedRow:
-        return {**row, "kind": "command", "nodes": 0, "statusReason": DAMAGED, "progress": None}
+        return {**row, "kind": "command", "nodes": 0, "statusReason": DAMAGED}, None
     training = spec.get("train")
     iterations = training.get("iterations") if isinstance(training, Mapping) else None
-    told = _told(reconciler, job, gang.main) if is_visible and iterations else None
-    progress = {**told, "iterations": iterations} if told else None
-    return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes), "progress": progress}
+    found = _Training(job, gang.main, iterations) if iterations and job.attempts else None
+    return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes)}, found
 
 
-def _told(reconciler: Reconciler, job: Job, main: int) -> dict[str, Any] | None:
+def _progress(reconciler: Reconciler, trainings: Sequence[_Training]) -> Mapping[str, dict[str, Any]]:
+    """By job the progress of those trainings whose runs the caller may see; empty where the store does not answer."""
+    if not trainings:
+        return {}
+    try:
+        read, runs = reconciler.calls.call(partial(_read, reconciler.store, trainings))
+    except (StoreSilent, OSError):
+        return {}
+    hidden = set[str]()
+    if permissions.visible_queues() is not None:  # a job may continue a run of another queue
+        with reconciler.database.session() as session:
+            # one query instead of many
+            _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(list(runs)))).all()
+            owners = {name: owner_of(session, run) for name, run in runs.items()}
+        hidden = {name for name, owner in owners.items() if owner is None or not permissions.is_visible(owner)}
+    told = {each.job.id: _told(reconciler, each, read[each.job.id]) for each in trainings if each.job.run not in hidden}
+    return {job: progress for job, progress in told.items() if progress is not None}
+
+
+def _read(
+    store: Store, trainings: Sequence[_Training]
+) -> tuple[Mapping[str, Sequence[Mapping[str, Any]]], Mapping[str, RunFacts]]:
+    """By job its curve, and by name the runs whose owners must be known."""
+    read = {each.job.id: curves.of(store.run(each.job.run), each.job) for each in trainings}
+    names = {each.job.run for each in trainings} if permissions.visible_queues() is not None else set()
+    return read, {name: facts_of(store.run(name)) for name in names}
+
+
+def _told(reconciler: Reconciler, training: _Training, curve: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Progress of a training: the last report of its main node, and its curve; None before its first iteration."""
-    if not job.attempts:
-        return None
-    curve = curves.of(reconciler.store.run(job.run), job)
-    live = reconciler.bus.progress(job.id, job.attempts[-1].number, main) or {}
+    job = training.job
+    live = reconciler.bus.progress(job.id, job.attempts[-1].number, training.main) or {}
     last = curve[-1] if curve else {}
     iteration = int(max(finite(live.get("iteration")) or 0, finite(last.get("iteration")) or 0))
     if not iteration:
         return None
     rate = finite(live.get("steps_per_second")) or finite(last.get("steps_per_second"))
     rewards = [reward for each in curve if (reward := finite(each.get("reward"))) is not None]
-    return {"iteration": iteration, "stepsPerSecond": rate, "reward": finite(last.get("reward")), "rewards": rewards}
+    return {
+        "iteration": iteration,
+        "stepsPerSecond": rate,
+        "reward": finite(last.get("reward")),
+        "rewards": rewards,
+        "iterations": training.iterations,
+    }
 
 
 class Curves:

@@ -15,9 +15,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from orchestrator.api import permissions
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, reconciler_of
+from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, Known, reconciler_of, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.callers import user_name
+from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native.continuing import submit
 from orchestrator.api.native.model_routes import find_model, owner_of_model
 from orchestrator.api.permissions import LeagueOf, Operation
@@ -38,7 +39,7 @@ from shared_store.models import Model
 from shared_store.standings import BadRace, Ranking, read_race, table
 from shared_store.wording import shown
 
-router = APIRouter()
+router = APIRouter(route_class=StoreRoute)
 
 LEAGUE_TAG, MODEL_TAG = "muster:league", "muster:model"
 """Tags of a race's job: the league, and the model as ``NAME@VERSION``."""
@@ -330,19 +331,23 @@ def _submit(
     facts = model.facts()
     reconciler.check_writable(adds=True)
     reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    with reconciler.writing, reconciler.database.session() as session:
-        context = Context(session, reconciler, idempotency_key)
-        earlier = submission.answered(context)
-        if earlier is not None:
-            answer = submission.answer(earlier)
-        else:
+
+    def call(known: Known) -> dict[str, Any]:
+        with reconciler.writing, reconciler.database.session() as session:
+            context = Context(session, reconciler, idempotency_key, known=known)
+            earlier = submission.answered(context)
+            if earlier is not None:
+                return submission.answer(earlier)
             queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
             try:
                 spec = race_job(league, model.reference, facts, queue, _suffix())
             except SpecError as error:
                 raise ClientError(str(error)) from None
             tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
-            answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {}, tags)
+            what = f"league {league.name}, race of {model.reference}"
+            return submit(context, spec, directory, what, {}, tags)[0]
+
+    answer = with_store(reconciler, call)
     reconciler.wake()
     return {**answer, "model": model.name, "version": model.version, "run": facts["run"]}
 

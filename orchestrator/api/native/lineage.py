@@ -5,8 +5,6 @@ from __future__ import annotations
 import threading
 import time
 
-from sqlalchemy.orm import Session
-
 from orchestrator.api.context import visible_runs
 from orchestrator.control.reconciler import Reconciler
 from shared_store.files import DamagedFile
@@ -16,10 +14,9 @@ _KEPT = 600.0
 """Seconds for which the parent of a run is not read again: it changes only where the run is replaced by another of its name."""
 
 
-def clones_of(reconciler: Reconciler, session: Session, run: Run) -> list[str]:
+def clones_of(reconciler: Reconciler, run: Run) -> list[str]:
     """The runs that began with weights of ``run`` and that the caller may see, by name."""
-    there = visible_runs(session, reconciler.store)
-    return [each.name for each in there if _parents.of(each) == run.name]
+    return [each.name for each in visible_runs(reconciler) if _parents.of(each) == run.name]
 
 
 class _Parents:

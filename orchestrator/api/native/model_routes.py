@@ -9,18 +9,18 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import permitted_run, reconciler_of
+from orchestrator.api.context import owner_of_run, permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
+from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import RunRecord
-from orchestrator.persistence.ownership import owner_of
 from shared_store import bundles, models
 from shared_store.bundles import DamagedBundle
 from shared_store.files import DamagedFile
 from shared_store.models import AlreadyRegistered, Model, ModelError, UnknownModel
 
-router = APIRouter()
+router = APIRouter(route_class=StoreRoute)
 
 
 class RegisterRequest(BaseModel):
@@ -72,9 +72,8 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     checkpoint = choose(run, body.checkpoint)
     if checkpoint is None:
         raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
-    with reconciler.database.session() as session:
-        record = owner_of(session, run)
-        queue, owner = (record.queue, record.owner) if record else ("", None)
+    record = owner_of_run(reconciler, run)
+    queue, owner = (record.queue, record.owner) if record else ("", None)
     try:
         there = models.versions(reconciler.store, body.name)
         if there:

@@ -7,54 +7,49 @@ import json
 import threading
 import time
 from collections.abc import AsyncIterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, Field
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions
-from orchestrator.api.batch import rules
-from orchestrator.api.batch.operations import validate
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import permitted_run, queue_names, reconciler_of
+from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
-from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.http.following import Following, looked, looked_patiently, pause
 from orchestrator.api.native import (
     job_list,
     key_routes,
     league_routes,
     model_routes,
+    plan_routes,
     queue_overview,
     run_routes,
     runs,
     track_routes,
     webhook_routes,
 )
-from orchestrator.api.native.fitting import fit_of, named_queue
-from orchestrator.api.permissions import JobsOf, Operation
-from orchestrator.api.racing_tracks import check_tracks
-from orchestrator.api.sources import sources_of
+from orchestrator.api.permissions import Operation
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.control.snapshot import new_nodes
+from orchestrator.control.run_store import facts_of
+from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.hosts import Limit, Queued, engine_of
+from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import Status
-from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, short_id
 from orchestrator.persistence.session import DatabaseError
-from orchestrator.scheduling.placement import needs
+from shared_store.files import DamagedFile
+from shared_store.layout import Run
 from shared_store.logs import LogFollower, LogLine, timestamp
 
 router = APIRouter(prefix="/api")
@@ -66,22 +61,14 @@ router.include_router(league_routes.router)
 router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)
+router.include_router(plan_routes.router)
 
-_LARGEST_PLAN = 4 << 20
-"""Characters of all nodes' variables together."""
 _POLL = 0.05
 """Seconds between two looks at a log that is followed, while few are."""
 _PATIENCE = 30.0
 """Seconds for which a log that is not followed may keep its reader waiting."""
 _HEARTBEAT = 5.0
 """Seconds after which an idle stream sends an empty line, which is how a client that left is noticed."""
-
-
-class PlanRequest(BaseModel):
-    """A job that is not submitted."""
-
-    definition: dict[str, Any] = Field(description="a RegisterJobDefinition request of type multinode")
-    queue: str = "default"
 
 
 def permitted_job(session: Session, reference: str, operation: Operation) -> Job:
@@ -135,105 +122,30 @@ def _limit(capacity: Queued) -> dict[str, Any] | None:
     return {"queue": limits.queue, **asdict(limits.resources)} if isinstance(limits, Limit) else None
 
 
-@router.post("/plan")
-def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
-    """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
-    reconciler = reconciler_of(request)
-    wanted, definition = _gang_of(body), body.definition
-    check_tracks(reconciler.store, wanted.spec)
-    for source in sources_of(wanted):
-        run = permitted_run(reconciler, source.run, Operation.READ_RUN)
-        if source.key in ("evaluate", "race"):
-            check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
-    with reconciler.database.session() as session:
-        queue = named_queue(session, body.queue)
-        permissions.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_of(session, reconciler, queue, wanted, FRESH)
-        if found.allocation is None:
-            raise ClientError(
-                found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
-            )
-        compute_environment, placements = found.allocation
-        job = Job(
-            id="job",
-            name=definition["jobDefinitionName"],
-            queue=queue.name,
-            kind="multinode",
-            run=wanted.options.run or "run",
-            timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
-            priority=definition.get("schedulingPriority", 0),
-        )
-        attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
-        gang = reconciler.attempts.gang(session, job, attempt, wanted)  # neither of them is stored
-    planned = _planned(reconciler, replace(gang, bus_token="…") if gang.bus_token else gang)
-    nodes = [
-        {
-            "index": node.contract.node_index,
-            "rank": node.contract.node_rank,
-            "image": wanted.nodes[node.contract.node_index].container.get("image"),
-            **asdict(node.placement),
-            "address": node.contract.address,
-            "command": list(node.command),
-            "environment": {**node.environment, **node.contract.to_env()},
-        }
-        for node in planned.nodes
-    ]
-    size = sum(len(name) + len(value) for node in nodes for name, value in node["environment"].items())
-    if size > _LARGEST_PLAN:
-        raise ClientError(
-            f"the plan's {len(nodes)} nodes have {size >> 20} MiB of variables, more than {_LARGEST_PLAN >> 20}; "
-            "plan the job with fewer nodes"
-        )
-    name = engine_of(placements[0].host)
-    images = reconciler.engine.engines[name].traits.images
-    return {
-        "engine": name,
-        "computeEnvironment": compute_environment,
-        "images": images,
-        "nodes": nodes,
-        "document": planned.document,
-    }
-
-
-@router.post("/fit")
-def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
-    """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
-    reconciler = reconciler_of(request)
-    wanted = _gang_of(body)
-    check_tracks(reconciler.store, wanted.spec)
-    with reconciler.database.session() as session:
-        queue = named_queue(session, body.queue)
-        permissions.check(Operation.FIT, JobsOf(queue.name))
-        return {"problem": fit_of(session, reconciler, queue, wanted, FRESH).problem}
-
-
-def _gang_of(body: PlanRequest) -> GangSpec:
-    """The gang of a plan's job. Raises ClientError."""
-    definition = validate("RegisterJobDefinition", body.definition)
-    if definition["type"] != "multinode" or "nodeProperties" not in definition:
-        raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
-    return rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
-
-
-def _planned(reconciler: Reconciler, gang: Gang) -> Plan[Any]:
-    try:
-        return reconciler.engine.plan(gang)
-    except EngineError as error:
-        raise ClientError(str(error)) from None
-
-
 @router.get("/jobs/{reference}")
 def job_detail(request: Request, reference: str) -> Any:
-    """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
+    """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results.
+
+    ``storeProblem``: why there are no results, where the store does not answer.
+    """
     reconciler = reconciler_of(request)
     with reconciler.database.session() as session:
         job = permitted_job(session, reference, Operation.READ_JOB)
         run = reconciler.store.run(job.run)
-        owner = owner_of(session, run)
-        is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
-        is_replaced = is_of_earlier_run(job, run)
-        is_visible = is_visible and not is_replaced
-        described = runs.results_of(reconciler, session, run) if is_visible else None
+    problem, is_replaced, results, progress = None, False, None, None
+    try:
+        found = reconciler.calls.call(partial(facts_of, run))
+        with reconciler.database.session() as session:
+            owner = owner_of(session, found)
+        is_replaced = is_of_earlier_run(job, found)
+        # a job may continue a run of another queue
+        if owner is not None and permissions.is_visible(owner) and not is_replaced:
+            results, progress = reconciler.calls.call(partial(_results, run))
+    except (StoreSilent, OSError) as error:
+        problem = str(error)
+    with reconciler.database.session() as session:
+        job = permitted_job(session, job.id, Operation.READ_JOB)
+        described = runs.described(session, results) if results else None
         with reading(job):
             attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
             gang = job.gang
@@ -256,9 +168,19 @@ def job_detail(request: Request, reference: str) -> Any:
                 "attemptsAllowed": job.attempts_allowed,
                 "spec": gang.spec,
                 "results": described,
-                "progress": runs.last_metrics(run) if is_visible else None,
+                "progress": progress,
+                "storeProblem": problem,
             }
     return permissions.shown(detail)
+
+
+def _results(run: Run) -> tuple[runs.StoredRun | None, dict[str, Any] | None]:
+    """What the store has of a run, and its newest metrics; a damaged run must not take the job away."""
+    try:
+        stored = runs.stored_run(run)
+    except (DamagedFile, OSError):
+        return None, runs.last_metrics(run)
+    return stored if stored.found.content else None, runs.last_metrics(run)
 
 
 @router.get("/jobs/{reference}/logs")

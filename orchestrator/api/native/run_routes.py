@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
 from orchestrator.api.context import IDEMPOTENCY_HEADER, permitted_run, reconciler_of
+from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native import clones, lineage, runs
 from orchestrator.api.native.continuing import Changes
 from orchestrator.api.permissions import Operation
@@ -17,7 +18,7 @@ from shared_store.checkpoints import best_checkpoint, list_checkpoints
 from shared_store.evaluations import by_checkpoint, list_evaluations
 from shared_store.metrics import history_of
 
-router = APIRouter()
+router = APIRouter(route_class=StoreRoute)
 
 RUNS_A_PAGE = 100
 METRICS_A_PAGE = 10_000
@@ -61,8 +62,7 @@ def list_runs(
 ) -> Any:
     """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
     reconciler = reconciler_of(request)
-    with reconciler.database.session() as session:
-        found = runs.list_runs(reconciler, session, after, most, search)
+    found = runs.list_runs(reconciler, after, most, search)
     if len(found) == most:
         query = urlencode({"max": most, "after": found[-1]["run"], **({"search": search} if search else {})})
         response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
@@ -74,9 +74,8 @@ def run_detail(request: Request, name: str) -> Any:
     """One run; ``parent`` is where its weights come from, ``clones`` are the runs that began with its own."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.READ_RUN)
-    with reconciler.database.session() as session:
-        described = runs.describe_run(reconciler, session, run)
-        return permissions.shown({**described, "clones": lineage.clones_of(reconciler, session, run)})
+    described = runs.describe_run(reconciler, run)
+    return permissions.shown({**described, "clones": lineage.clones_of(reconciler, run)})
 
 
 @router.get("/runs/{name}/checkpoints")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, select
@@ -11,19 +13,20 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context, visible_runs
+from orchestrator.api.context import Context, Known, visible_runs, with_store
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import Changes, answered, submit
 from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import AutomaticEvaluation, Job, RunRecord
-from orchestrator.persistence.ownership import is_of_earlier_run, jobs_of, owner_of
+from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
@@ -36,51 +39,53 @@ from shared_store.settings import first_difference, fixed_settings, innermost, s
 from shared_store.wording import counted, shown
 
 
-def list_runs(
-    reconciler: Reconciler, session: Session, after: str, most: int, search: str = ""
-) -> list[dict[str, Any]]:
+def list_runs(reconciler: Reconciler, after: str, most: int, search: str = "") -> list[dict[str, Any]]:
     """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see.
 
     One that can't be read has a ``problem`` instead of its facts.
     """
-    found = []
-    page = visible_runs(session, reconciler.store, after, most, search.strip())
-    recorded = select(RunRecord).where(RunRecord.name.in_([run.name for run in page]))
-    _known = session.scalars(recorded).all()  # one query instead of one a run: the session looks here first
-    for run in page:
+    stored: list[StoredRun | dict[str, Any]] = []
+    for run in visible_runs(reconciler, after, most, search.strip()):
         try:
-            found.append(describe_run(reconciler, session, run))
+            stored.append(stored_run(run))
         except (DamagedFile, OSError) as error:
             problem = excerpt(" ".join(str(error).split()), LONGEST_REASON)
-            found.append({"run": run.name, "path": str(run.path), "problem": problem})
-    return found
+            stored.append({"run": run.name, "path": str(run.path), "problem": problem})
+    names = [each.found.name for each in stored if isinstance(each, StoredRun)]
+    with reconciler.database.session() as session:
+        # one query instead of one a run: the session looks here first
+        _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(names))).all()
+        return [described(session, each) if isinstance(each, StoredRun) else each for each in stored]
 
 
-def results_of(reconciler: Reconciler, session: Session, run: Run) -> dict[str, Any] | None:
-    """:func:`describe_run` for the page of a job, which a damaged run must not take away; None where nothing can be read."""
-    try:
-        return describe_run(reconciler, session, run) if run.description() else None
-    except (DamagedFile, OSError):
-        return None
-
-
-def describe_run(reconciler: Reconciler, session: Session, run: Run) -> dict[str, Any]:
+def describe_run(reconciler: Reconciler, run: Run) -> dict[str, Any]:
     """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
-    description = run.description() or {}
-    owner = owner_of(session, run)
-    jobs = session.execute(select(Job.id, Job.name, Job.status).where(*_of_run(run)).order_by(Job.created_at)).all()
+    stored = stored_run(run)
+    with reconciler.database.session() as session:
+        return described(session, stored)
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """What the store has of a run."""
+
+    found: RunFacts
+    results: Mapping[str, Any]
+
+
+def stored_run(run: Run) -> StoredRun:
+    """The part of :func:`describe_run` that the store has. Raises DamagedFile, OSError."""
+    found = facts_of(run)
+    description = found.description() or {}
     checkpoints = list_checkpoints(run)
     evaluated = _evaluated(run)
     newest = next((each.name for each in reversed(checkpoints) if each.name in evaluated), "")
     plot, picture = run.metrics / "reward.png", run.metrics / "policy.png"
-    return {
+    results = {
         "run": run.name,
         "path": str(run.path),
         "created": description.get("created"),
-        "owner": owner.owner if owner else None,
-        "queue": owner.queue if owner else None,
-        "spec": _shown_spec(session, run, description.get("spec")) if jobs else description.get("spec"),
-        "jobs": [{"id": job.id, "name": job.name, "status": job.status} for job in jobs],
+        "spec": description.get("spec"),
         "checkpoints": len(checkpoints),
         "iteration": checkpoints[-1].iteration if checkpoints else 0,
         "checkpoint": str(checkpoints[-1].path) if checkpoints else None,
@@ -88,8 +93,23 @@ def describe_run(reconciler: Reconciler, session: Session, run: Run) -> dict[str
         "picture": str(picture) if picture.exists() else None,
         "evaluation": evaluated.get(newest),
         "best": _best(checkpoints, evaluated),
-        "automatic": _automatic(session, run),
         "parent": description.get("parent"),
+    }
+    return StoredRun(found, results)
+
+
+def described(session: Session, stored: StoredRun) -> dict[str, Any]:
+    """:func:`describe_run` of what the store has, and the database."""
+    run, results = stored.found, stored.results
+    owner = owner_of(session, run)
+    jobs = session.execute(select(Job.id, Job.name, Job.status).where(*_of_run(run)).order_by(Job.created_at)).all()
+    return {
+        **results,
+        "owner": owner.owner if owner else None,
+        "queue": owner.queue if owner else None,
+        "spec": _shown_spec(session, run, results["spec"]) if jobs else results["spec"],
+        "jobs": [{"id": job.id, "name": job.name, "status": job.status} for job in jobs],
+        "automatic": _automatic(session, run),
     }
 
 
@@ -116,7 +136,7 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
     return facts
 
 
-def spec_of(session: Session, run: Run) -> Mapping[str, Any] | None:
+def spec_of(session: Session, run: FoundRun) -> Mapping[str, Any] | None:
     """The spec with which a run continues: that of its newest job, else the one that it was created with. Raises DamagedRow."""
     newest = newest_job(session, run)
     if newest:
@@ -125,7 +145,7 @@ def spec_of(session: Session, run: Run) -> Mapping[str, Any] | None:
     return (run.description() or {}).get("spec")
 
 
-def _shown_spec(session: Session, run: Run, created: Any) -> Any:
+def _shown_spec(session: Session, run: FoundRun, created: Any) -> Any:
     """:func:`spec_of`; that with which the run was ``created`` where the row of its newest job is damaged."""
     try:
         return spec_of(session, run)
@@ -151,53 +171,61 @@ def resume(reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: 
 def _resume(
     reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: str | None, teacher: TeacherCopy | None
 ) -> dict[str, Any]:
+    found, checkpoints = facts_of(run), list_checkpoints(run)
     with reconciler.database.session() as session:
-        if earlier := _answered(Context(session, reconciler, idempotency_key), run):
+        if earlier := _answered(Context(session, reconciler, idempotency_key), found, checkpoints):
             return earlier
     chosen = choose(run, changes.checkpoint)
+    if chosen is not None:
+        with suppress(DamagedCheckpoint):
+            _ = chosen.manifest  # read, and kept: before others have to wait for it
     if chosen and changes.checkpoint is not None:
         try:
-            chosen.verify()  # reads all of it: before others have to wait for it
+            chosen.verify()  # reads all of it
         except DamagedCheckpoint as error:
             raise refusal(run, chosen, error) from None
     reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     reconciler.check_writable(adds=True)
-    with reconciler.writing, reconciler.database.session() as session:
-        context = Context(session, reconciler, idempotency_key, teacher=teacher)
-        if earlier := _answered(context, run):
-            return earlier
-        document = spec_of(session, run)
-        if document is None:
-            raise ClientError(
-                f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
-            )
-        try:
-            before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
-            changed = override(document, changes.all())
-            _check_algorithm(run, before, changed)
-            spec = validate(changed, f"run {run.name}")
-        except SpecError as error:
-            raise ClientError(str(error)) from None
-        _check_changes(run, before, spec)
-        environment = {"MUSTER_RUN": run.name}
-        if spec.train:
-            if chosen:
-                _check_rate(run, chosen, spec, changes.assignments)
-                _check_progress(session, run, spec, chosen)
-            environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
-        if chosen and changes.checkpoint is not None:
-            environment["MUSTER_CHECKPOINT"] = chosen.name
-        submitted, _ = submit(context, spec, changes.directory, f"run {run.name}", environment)
+
+    def begin(known: Known) -> dict[str, Any]:
+        with reconciler.writing, reconciler.database.session() as session:
+            context = Context(session, reconciler, idempotency_key, teacher=teacher, known=known)
+            if earlier := _answered(context, found, checkpoints):
+                return earlier
+            document = spec_of(session, found)
+            if document is None:
+                raise ClientError(
+                    f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
+                )
+            try:
+                before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
+                changed = override(document, changes.all())
+                _check_algorithm(run, before, changed)
+                spec = validate(changed, f"run {run.name}")
+            except SpecError as error:
+                raise ClientError(str(error)) from None
+            _check_changes(run, before, spec)
+            environment = {"MUSTER_RUN": run.name}
+            if spec.train:
+                if chosen:
+                    _check_rate(run, chosen, spec, changes.assignments)
+                    _check_progress(session, found, spec, chosen)
+                environment["MUSTER_WORLDS"] = str(_worlds(session, found, before, spec, chosen))
+            if chosen and changes.checkpoint is not None:
+                environment["MUSTER_CHECKPOINT"] = chosen.name
+            submitted, _ = submit(context, spec, changes.directory, f"run {run.name}", environment)
+            return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
+
+    answer = with_store(reconciler, begin)
     reconciler.wake()
-    return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
+    return answer
 
 
-def _answered(context: Context, run: Run) -> dict[str, Any] | None:
+def _answered(context: Context, run: FoundRun, saved: Sequence[Checkpoint]) -> dict[str, Any] | None:
     """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another run."""
     job = answered(context, run.name)
     if job is None:
         return None
-    saved = list_checkpoints(run)
     kind = "train" if (spec_of(context.session, run) or {}).get("train") else "command"
     return {
         **submission.answer(job),
@@ -284,7 +312,7 @@ _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": (
 """Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
 
 
-def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint) -> None:
+def _check_progress(session: Session, run: FoundRun, after: Spec, chosen: Checkpoint) -> None:
     """Refuse a run that is complete, and one that a newer Muster wrote.
 
     A job that was struck down after its last save still owes its evaluation: such a run may be resumed.
@@ -306,7 +334,7 @@ def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint)
         )
 
 
-def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
+def _worlds(session: Session, run: FoundRun, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
     """Number of worlds with which the run continues: those that it has, whatever the number of ranks. Raises ClientError where they don't fit."""
     assert before.train is not None and after.train is not None
     ranks = after.nodes.max * after.ranks_per_node
@@ -329,7 +357,7 @@ def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Check
     return worlds
 
 
-def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | None) -> int:
+def _worlds_of(session: Session, run: FoundRun, before: Spec, chosen: Checkpoint | None) -> int:
     """Number of worlds of the run, by its checkpoint, else by its newest job's variables or spec."""
     assert before.train is not None
     try:
@@ -342,11 +370,11 @@ def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | No
     return before.train.worlds * before.ranks_per_node * before.nodes.max
 
 
-def newest_job(session: Session, run: Run) -> Job | None:
+def newest_job(session: Session, run: FoundRun) -> Job | None:
     return session.scalars(select(Job).where(*_of_run(run)).order_by(Job.created_at.desc()).limit(1)).first()
 
 
-def _of_run(run: Run) -> list[ColumnElement[bool]]:
+def _of_run(run: FoundRun) -> list[ColumnElement[bool]]:
     """Those of the run's jobs that the caller may see: a key with all queues may have continued it in another queue."""
     queues = visible_queues()
     return [*jobs_of(run), *([] if queues is None else [Job.queue.in_(queues)])]
@@ -369,7 +397,7 @@ def _best(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str
     return {"checkpoint": best.name, "iteration": best.iteration, "mean": mean, "of": len(evaluated)}
 
 
-def _automatic(session: Session, run: Run) -> dict[str, Any] | None:
+def _automatic(session: Session, run: FoundRun) -> dict[str, Any] | None:
     """The newest automatic evaluation of a training, how it is, and how many checkpoints that were due were passed over."""
     row = session.get(AutomaticEvaluation, run.name)
     training = session.get(Job, row.training) if row else None

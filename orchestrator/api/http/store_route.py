@@ -1,0 +1,42 @@
+"""Routes whose functions use the store: they are carried out on the store's threads, and refused where it does not answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from contextvars import ContextVar
+from functools import partial, wraps
+from inspect import iscoroutinefunction
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.routing import APIRoute
+
+from orchestrator.control.store_calls import StoreCalls
+
+_calls: ContextVar[StoreCalls] = ContextVar("_calls")
+
+
+class StoreRoute(APIRoute):
+    """A route of a function that uses the store: what only reads must end sooner than what changes or verifies something."""
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **given: Any) -> None:
+        reads = set(given.get("methods") or ["GET"]) <= {"GET", "HEAD"}
+        super().__init__(path, endpoint if iscoroutinefunction(endpoint) else _on_store(endpoint, reads), **given)
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler = super().get_route_handler()
+
+        async def answer(request: Request) -> Response:
+            _calls.set(request.app.state.reconciler.calls)
+            return await handler(request)
+
+        return answer
+
+
+def _on_store(endpoint: Callable[..., Any], reads: bool) -> Callable[..., Coroutine[Any, Any, Any]]:
+    @wraps(endpoint)
+    async def answer(**given: Any) -> Any:
+        works = not reads or bool(given.get("verify"))
+        return await _calls.get().answer(partial(endpoint, **given), works=works)
+
+    return answer

@@ -1,0 +1,128 @@
+"""The native API of plans: the processes that a job would start, and whether it could ever start."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+from fastapi import APIRouter, Request
+from pydantic import BaseModel, Field
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import rules
+from orchestrator.api.batch.operations import validate
+from orchestrator.api.context import permitted_run, reconciler_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.evaluated import check_evaluation
+from orchestrator.api.http.store_route import StoreRoute
+from orchestrator.api.native.fitting import fit_of, named_queue
+from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.racing_tracks import check_tracks
+from orchestrator.api.sources import sources_of
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.snapshot import new_nodes
+from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.hosts import engine_of
+from orchestrator.engines.api import EngineError, Gang, Plan
+from orchestrator.engines.registry import FRESH
+from orchestrator.persistence.models import Attempt, Job
+from orchestrator.scheduling.placement import needs
+
+router = APIRouter(route_class=StoreRoute)
+
+_LARGEST_PLAN = 4 << 20
+"""Characters of all nodes' variables together."""
+
+
+class PlanRequest(BaseModel):
+    """A job that is not submitted."""
+
+    definition: dict[str, Any] = Field(description="a RegisterJobDefinition request of type multinode")
+    queue: str = "default"
+
+
+@router.post("/plan")
+def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
+    """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
+    reconciler = reconciler_of(request)
+    wanted, definition = _gang_of(body), body.definition
+    check_tracks(reconciler.store, wanted.spec)
+    for source in sources_of(wanted):
+        run = permitted_run(reconciler, source.run, Operation.READ_RUN)
+        if source.key in ("evaluate", "race"):
+            check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
+    with reconciler.database.session() as session:
+        queue = named_queue(session, body.queue)
+        permissions.check(Operation.PLAN, JobsOf(queue.name))
+        found = fit_of(session, reconciler, queue, wanted, FRESH)
+        if found.allocation is None:
+            raise ClientError(
+                found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
+            )
+        compute_environment, placements = found.allocation
+        job = Job(
+            id="job",
+            name=definition["jobDefinitionName"],
+            queue=queue.name,
+            kind="multinode",
+            run=wanted.options.run or "run",
+            timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
+            priority=definition.get("schedulingPriority", 0),
+        )
+        attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
+        gang = reconciler.attempts.gang(session, job, attempt, wanted)  # neither of them is stored
+    planned = _planned(reconciler, replace(gang, bus_token="…") if gang.bus_token else gang)
+    nodes = [
+        {
+            "index": node.contract.node_index,
+            "rank": node.contract.node_rank,
+            "image": wanted.nodes[node.contract.node_index].container.get("image"),
+            **asdict(node.placement),
+            "address": node.contract.address,
+            "command": list(node.command),
+            "environment": {**node.environment, **node.contract.to_env()},
+        }
+        for node in planned.nodes
+    ]
+    size = sum(len(name) + len(value) for node in nodes for name, value in node["environment"].items())
+    if size > _LARGEST_PLAN:
+        raise ClientError(
+            f"the plan's {len(nodes)} nodes have {size >> 20} MiB of variables, more than {_LARGEST_PLAN >> 20}; "
+            "plan the job with fewer nodes"
+        )
+    name = engine_of(placements[0].host)
+    images = reconciler.engine.engines[name].traits.images
+    return {
+        "engine": name,
+        "computeEnvironment": compute_environment,
+        "images": images,
+        "nodes": nodes,
+        "document": planned.document,
+    }
+
+
+@router.post("/fit")
+def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
+    """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
+    reconciler = reconciler_of(request)
+    wanted = _gang_of(body)
+    check_tracks(reconciler.store, wanted.spec)
+    with reconciler.database.session() as session:
+        queue = named_queue(session, body.queue)
+        permissions.check(Operation.FIT, JobsOf(queue.name))
+        return {"problem": fit_of(session, reconciler, queue, wanted, FRESH).problem}
+
+
+def _gang_of(body: PlanRequest) -> GangSpec:
+    """The gang of a plan's job. Raises ClientError."""
+    definition = validate("RegisterJobDefinition", body.definition)
+    if definition["type"] != "multinode" or "nodeProperties" not in definition:
+        raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
+    return rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
+
+
+def _planned(reconciler: Reconciler, gang: Gang) -> Plan[Any]:
+    try:
+        return reconciler.engine.plan(gang)
+    except EngineError as error:
+        raise ClientError(str(error)) from None
