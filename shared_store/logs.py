@@ -26,8 +26,8 @@ LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
 HEAD = re.compile(r"node-([0-9]{1,9})\.log")
 """Name of a log's first file."""
 _ATTEMPT = re.compile(r"[0-9]{1,9}")
-_CHUNK = 256 << 10
-"""Bytes that a poll reads of a log: more than the longest line, and little, since many may follow and not read."""
+_CHUNK = 1 << 20
+"""Bytes that a poll reads of a log: more than the longest line."""
 
 LIMIT_REACHED = "the log reached its limit"
 REPLACED = "the log was truncated or replaced; following continues from its new beginning"
@@ -118,6 +118,9 @@ class _Source:
             return
         try:
             chunk = read_log(segments, self.position, most, self.identity, self.inside)
+            if len(chunk.data) == most < _CHUNK and b"\n" not in chunk.data:
+                most = _CHUNK
+                chunk = read_log(segments, self.position, most, self.identity, self.inside)
         except OSError:  # deleted meanwhile, ESTALE, or not yet visible on NFS: the next poll opens it again
             self.more = False
             return
@@ -170,6 +173,8 @@ class LogFollower:
     rank: int | None = None
     attempt: int | None = None
     offsets: dict[str, int] = field(default_factory=dict)
+    chunk: int = _CHUNK
+    """Bytes that a poll reads of a log; more where no line ends in them."""
     behind: bool = False
     """Whether there was more than the last poll returned."""
     _sources: dict[str, _Source] = field(default_factory=dict)
@@ -181,7 +186,7 @@ class LogFollower:
         for attempt in [self.attempt] if self.attempt is not None else attempts_with_logs(self.run, self.job):
             logs = self._logs(attempt)
             for source, segments in logs:
-                source.fill(segments, _CHUNK, self.rank)
+                source.fill(segments, self.chunk, self.rank)
             # unread lines of one log may be older than read lines of another
             until = min((source.newest for source, _ in logs if source.more), default=None)
             taken = []

@@ -10,6 +10,7 @@ from fastapi import Depends, Query, Request
 
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
+from orchestrator.api.http.following import PIECE
 from orchestrator.api.native.routes import permitted_job, positions_of
 from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Event
@@ -126,4 +127,4 @@ class LiveLog:
 
     def _follow(self, places: Mapping[str, int]) -> LogFollower:
         chosen = self.chosen
-        return LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(places))
+        return LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(places), PIECE)

@@ -15,6 +15,8 @@ from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, Shared
+from orchestrator.control.snapshot import open_attempts
+from orchestrator.control.usage import utilization
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
 
 _MOST_COMPUTE_ENVIRONMENTS, _MOST_QUEUES = 3, 50

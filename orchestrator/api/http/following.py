@@ -20,6 +20,8 @@ T = TypeVar("T")
 
 MOST = 100
 """Answers of this kind that one key or user has at once."""
+PIECE = 64 << 10
+"""Bytes of a log that are read for one of them at once: one whose client does not read keeps them, and as much again."""
 _THREADS = 4
 _SHARE = 0.01
 """Seconds between two looks, for each open answer: all of them together look 100 times a second."""

@@ -21,7 +21,7 @@ from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
-from orchestrator.api.http.following import Following, looked, looked_patiently, pause
+from orchestrator.api.http.following import PIECE, Following, looked, looked_patiently, pause
 from orchestrator.api.native import (
     job_list,
     key_routes,
@@ -206,7 +206,9 @@ def job_logs(
             raise ClientError(
                 f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
-        follower = LogFollower(reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions))
+        follower = LogFollower(
+            reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions), PIECE
+        )
         job_id = job.id
     lines = _follow(reconciler, job_id, follower, request.app.state.closing) if follow else _stored(follower)
     return Following(lines, media_type="application/x-ndjson")

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import threading
-from collections.abc import AsyncIterator
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
+import httpx
 import pyarrow
 import pyarrow.parquet
 import pytest
-from fastapi import Request
 
 from orchestrator.api.errors import ClientError
-from orchestrator.api.http.access import Access
 from orchestrator.api.turns import Turns
-from orchestrator.console.live import Event, stream
 from shared_store.files import DamagedFile, open_inside, write_json
 from shared_store.layout import Run, Store
 from shared_store.metrics import MetricsWriter
-from tests.conftest import call_muster
+from tests.conftest import call_muster, wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page, Visitor
 from tests.support.orchestrator.jobs import await_status
@@ -213,29 +210,24 @@ def test_a_form_searches_for_no_longer_text_than_the_page(console: Console) -> N
     assert answer.status_code == 400 and "more than 200 characters" in answer.json()["message"]
 
 
-def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends() -> None:
-    state = SimpleNamespace(closing=threading.Event(), access=Access())
-    request = cast(Request, SimpleNamespace(app=SimpleNamespace(state=state), headers={"authorization": ""}))
+def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends(console: Console) -> None:
+    given = console.visitor("reader").http
+    limits, address = httpx.Limits(max_connections=None), "/jobs/stream"
+    with ExitStack() as stack, ExitStack() as one:
+        http = stack.enter_context(httpx.Client(base_url=console.url, cookies=given.cookies, timeout=60, limits=limits))
 
-    def opened() -> AsyncIterator[bytes]:
-        return cast(AsyncIterator[bytes], aiter(stream(request, lambda: [Event("rows", {})]).body_iterator))
+        def begun() -> str:
+            """The first event of another stream."""
+            with http.stream("GET", address) as answer:
+                return "".join(islice(answer.iter_lines(), 3))
 
-    async def story() -> tuple[bytes, bytes]:
-        there = [opened() for _ in range(100)]
-        for each in there:
-            await anext(each)
-        another = opened()
-        refused = [await anext(another), await anext(another)]
-        await cast(Any, there[0]).aclose()
-        there[0] = opened()
-        again = await anext(there[0])
-        for each in there:
-            await cast(Any, each).aclose()
-        return b"".join(refused), again
-
-    refused, again = asyncio.run(story())
-    assert b"event: trouble" in refused and b"100 pages are open" in refused
-    assert b"retry: 1000" in again
+        one.enter_context(http.stream("GET", address))
+        for _ in range(99):
+            stack.enter_context(http.stream("GET", address))
+        refused = begun()
+        assert "event: trouble" in refused and "follows 100 logs and pages already" in refused
+        one.close()
+        wait_for(lambda: "event: rows" in begun(), 30, "the place of the one that ended")
 
 
 def test_those_who_wait_for_a_turn_are_few_and_the_others_are_refused_at_once() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import httpx
 import pytest
 
 from orchestrator.spec import strict_yaml
@@ -236,3 +238,23 @@ def test_a_read_only_key_and_a_key_of_another_queue_submit_nothing(console: Cons
     token = lab.page("/").form_token
     stolen = lab.http.post("/submit", data={"form_token": token[:-1] + "x", "yaml": COMMAND})
     assert stolen.status_code == 403 and "load the page again" in stolen.text
+
+
+def test_a_reward_function_that_is_too_large_is_refused_before_anything_reads_it(console: Console) -> None:
+    visitor = console.visitor("lab")
+    code = "def reward_function(params):\n    return 1.0\nx = 1" + "<1" * 60_000
+    text = f"name: a\nqueue: lab\ntrain:\n  task: Racer\n  config:\n    reward_function: {json.dumps({'file': 'r.py', 'text': code})}\n"
+    token = visitor.page("/").form_token
+    sent = {"form_token": token, "yaml": text, "whole": "yes"}
+
+    def check(_: int) -> httpx.Response:
+        return visitor.http.post("/submit/check", data=sent, headers={"Accept": "application/json"})
+
+    with ThreadPoolExecutor(12) as threads:
+        answers = threads.map(check, range(12))
+        for _ in range(20):
+            assert visitor.http.get("/healthz").status_code == 200
+        assert {answer.status_code for answer in answers} <= {413, 429}
+    shorter = text.replace("<1" * 60_000, "<1" * 12_000)
+    found = checked(visitor, {"yaml": shorter}, whole="yes")
+    assert "may take 20,480; shorten it" in found["problem"]["message"]
