@@ -11,12 +11,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 from sqlalchemy import event, func, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.snapshot import open_attempts
+from orchestrator.control.store_calls import THREADS
 from orchestrator.control.usage import held_by
 from orchestrator.domain.hosts import engine_of
 from orchestrator.domain.job import Status
@@ -138,7 +139,7 @@ class _Moment(Collector):
     def describe(self) -> Iterable[GaugeMetricFamily]:
         return ()
 
-    def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily]:
+    def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily | CounterMetricFamily]:
         reconciler = self._reconciler
         yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
         age = "Seconds since the controller's loop made its last progress; /healthz fails above 5."
@@ -152,6 +153,7 @@ class _Moment(Collector):
         yield _gauge("muster_database_usable", "1 while the database can be used, else 0.", [], {(): float(usable)})
         yield from found
         yield self._volumes()
+        yield from self._store()
         yield from self._hosts()
 
     def _jobs(self, session: Session) -> Iterator[GaugeMetricFamily]:
@@ -202,6 +204,13 @@ class _Moment(Collector):
         short = {(name,): float(disk.shortage(name) is not None) for name in disk.names}
         said = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
         return _gauge("muster_volume_short", said, ["volume"], short)
+
+    def _store(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+        calls = self._reconciler.calls
+        states = {("busy",): float(min(calls.open, THREADS)), ("waiting",): float(max(0, calls.open - THREADS))}
+        yield _gauge("muster_store_calls", "Requests that use the store, by state.", ["state"], states)
+        refused = "Requests that were refused since the store did not answer."
+        yield CounterMetricFamily("muster_store_calls_refused", refused, calls.refused)
 
     def _hosts(self) -> Iterator[GaugeMetricFamily]:
         hosts, gpus, cpus = _Sums(float), _Sums(float), _Sums(float)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from orchestrator import machine
 from orchestrator.domain.errors import Unavailable
@@ -43,7 +43,9 @@ class StoreCalls:
         """``is_silent``: whether the volume is known not to answer; then no call is tried."""
         self._path, self._is_silent, self.patience = path, is_silent, PATIENCE
         self._pool = machine.pool("store of requests", THREADS, WAITING)
-        self._callers = threading.Semaphore(_CALLERS)
+        self._callers, self._lock = threading.Semaphore(_CALLERS), threading.Lock()
+        self.open = self.refused = 0
+        """Calls that have not returned, and those that were refused or late since the beginning."""
 
     def call(self, body: Callable[[], T]) -> T:
         """The result of ``body``, for a thread that waits. Raises StoreSilent, and what it raises."""
@@ -79,11 +81,20 @@ class StoreCalls:
         context = contextvars.copy_context()
         context.run(_inside.set, True)
         try:
-            return self._pool.submit(partial(context.run, body))
+            future = self._pool.submit(partial(context.run, body))
         except machine.PoolFull:
             raise self._silence(f"{THREADS + WAITING} requests wait for it") from None
+        with self._lock:
+            self.open += 1
+        future.add_done_callback(self._returned)
+        return future
+
+    def _returned(self, _: Future[Any]) -> None:
+        with self._lock:
+            self.open -= 1
 
     def _silence(self, why: str) -> StoreSilent:
+        self.refused += 1
         return StoreSilent(
             f"the store at {self._path} does not answer ({why}); see whether its server can be reached, and try again"
         )

@@ -65,6 +65,7 @@ def test_hanging_reads_keep_neither_the_loop_nor_a_stop_nor_a_submission_waiting
             wait_for(lambda: connections_of(server) == 0, 10, "that no request holds a connection")
             for _ in range(10):
                 assert asked(server, "/healthz").status_code == 200
+            assert "muster_store_calls{" in asked(server, "/metrics").text
             assert server.reconciler.heartbeat.age < 5 and not any(read.done() for read in reads)
             client.batch("TerminateJob", jobId=job, reason="enough")
             other = submit_gang(client, "pass")
