@@ -209,6 +209,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "took": took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
         "run": detail["run"] + (" (gone; another run has its name now)" if detail["runIsReplaced"] else ""),
+        "store": one_line(detail.get("storeProblem") or ""),
         _OF_RUN.get(detail["kind"], ""): _source(detail),
         "started from": started_from((detail["results"] or {}).get("parent")),
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],

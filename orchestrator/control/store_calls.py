@@ -27,6 +27,8 @@ WORK = 600.0
 """Seconds for which a request waits that copies or verifies a checkpoint."""
 _CALLERS = 16
 """Threads of requests that wait at once: the others serve what needs no store."""
+_TURN = 1.0
+"""Seconds for which another one waits for its turn."""
 
 _inside = contextvars.ContextVar("_inside", default=False)
 """Whether this thread is one of the pool's."""
@@ -51,8 +53,8 @@ class StoreCalls:
         """The result of ``body``, for a thread that waits. Raises StoreSilent, and what it raises."""
         if _inside.get():
             return body()
-        if not self._callers.acquire(blocking=False):
-            raise self._silence(f"{_CALLERS} requests wait for it")
+        if self._is_silent() or not self._callers.acquire(timeout=_TURN):
+            raise self._silence("its volume is silent" if self._is_silent() else f"{_CALLERS} requests wait for it")
         try:
             future = self._submit(body)
             try:

@@ -108,7 +108,7 @@ class Database:
             pool_pre_ping=not is_sqlite,
             connect_args=_connect_args(parsed),
             json_deserializer=_read_document,
-            **({} if parsed.database in (None, "", ":memory:") else {"pool_timeout": _POOL_TIMEOUT}),
+            **({} if _is_in_memory(parsed) else {"pool_timeout": _POOL_TIMEOUT}),
         )
         if is_sqlite:
             event.listen(engine, "do_connect", self._check_before_connect)
@@ -117,7 +117,7 @@ class Database:
 
     def reserve_connections(self) -> None:
         """Give this thread connections of its own, which no other can take. A database in memory has only one."""
-        if self.engine.url.database not in (None, "", ":memory:"):
+        if not _is_in_memory(self.engine.url):
             self._own = threading.get_ident(), self._new_engine(self.engine.url)
 
     @classmethod
@@ -301,6 +301,10 @@ def _make_private(path: Path) -> None:
 
 def _private(path: str, flags: int) -> int:
     return os.open(path, flags, 0o600)
+
+
+def _is_in_memory(url: URL) -> bool:
+    return url.get_backend_name() == "sqlite" and url.database in (None, "", ":memory:")
 
 
 def _shown(url: str) -> str:

@@ -22,6 +22,7 @@ from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import submit
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain.errors import SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
@@ -191,8 +192,9 @@ class AutomaticEvaluations:
         return chosen.path.is_dir() and bool(chosen.manifest)
 
     def _note(self, training: _Training, counted: Counted, problem: str | None = None) -> None:
+        found = facts_of(training.run)
         with self._reconciler.writing, self._reconciler.database.session() as session:
-            row = _row(session, training, counted)
+            row = _row(session, training, counted, found)
             row.problem = problem or row.problem  # it stands until an evaluation is submitted
 
     def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
@@ -203,13 +205,13 @@ class AutomaticEvaluations:
         token = permissions.current_identity.set(permissions.Identity(training.owner))
         try:
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
-            tags = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}
+            tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
             def call(known: Known) -> dict[str, Any]:
                 with reconciler.writing, reconciler.database.session() as session:
                     context = Context(session, reconciler, known=known)
                     answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
-                    row = _row(session, training, counted)
+                    row = _row(session, training, counted, found)
                     row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
                     return answer
 
@@ -241,12 +243,12 @@ def _counted(row: AutomaticEvaluation | None, training: _Training, checkpoints: 
     return Counted(row.seen, row.waiting, row.passed)
 
 
-def _row(session: Session, training: _Training, counted: Counted) -> AutomaticEvaluation:
+def _row(session: Session, training: _Training, counted: Counted, found: RunFacts) -> AutomaticEvaluation:
     row = session.get(AutomaticEvaluation, training.run.name)
     if row is None:
         row = AutomaticEvaluation(run=training.run.name)
         session.add(row)
-    elif (before := session.get(Job, row.training)) is not None and is_of_earlier_run(before, training.run):
+    elif (before := session.get(Job, row.training)) is not None and is_of_earlier_run(before, found):
         row.checkpoint, row.job, row.open, row.problem = None, None, False, None
     row.training, row.seen, row.waiting, row.passed = training.job, counted.seen, counted.waiting, counted.passed
     return row
