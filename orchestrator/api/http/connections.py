@@ -11,6 +11,7 @@ import asyncio
 import json
 import logging
 import resource
+import socket
 import time
 from typing import Any
 
@@ -24,6 +25,8 @@ BODY_TIMEOUT = 60.0
 """Seconds from there to the end of its body."""
 _FLUSH_TIMEOUT = 60.0
 """Seconds without any progress after which a connection that has something to send is cut off."""
+_UNSENT = 128 << 10
+"""Bytes of answers that the kernel keeps for a client that does not read; by itself it would keep MBs."""
 BACKLOG = 128
 """Connections that are accepted at once, and so how far the most may be exceeded for a moment."""
 _PIECE = 16 << 10
@@ -134,6 +137,8 @@ class Connection(H11Protocol):
         if not self._connections.admit(self):
             self._refuse()
             return
+        if (connection := transport.get_extra_info("socket")) is not None and connection.family != socket.AF_UNIX:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
         self._look()
 
     def connection_lost(self, exc: Exception | None) -> None:

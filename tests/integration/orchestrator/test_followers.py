@@ -51,7 +51,7 @@ def test_a_hundred_followers_that_never_read_cost_little_memory_and_no_one_waits
             took.append(time.monotonic() - begun)
             time.sleep(0.1)
         assert sorted(took)[len(took) // 2] < 1.0, took
-        assert memory_of(server.process.pid) - before < 3 * SILENT
+        assert memory_of(server.process.pid) - before < SILENT * 3 // 2
         refused = [answer for reader in readers if b" 429 " in (answer := reader.recv(600).split(b"\r\n")[0])]
         assert len(refused) == SILENT - following.MOST
         answer = httpx.get(f"{server.url}/api/jobs/{job}/logs", params={"follow": True}, timeout=30)
