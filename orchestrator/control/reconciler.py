@@ -90,7 +90,7 @@ class Reconciler:
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
-        self.calls = StoreCalls(store.path, partial(self.disk.is_silent, "store"))
+        self.calls = StoreCalls(store.path, lambda: self.disk.is_silent("store"))
         """The store, for requests."""
         self._short, self._is_cut_off = False, False
         self.work_queue = WorkQueue()

@@ -8,8 +8,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable
-from itertools import chain
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 from orchestrator.api.http.following import looked, pause
@@ -129,15 +128,16 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
             yield eventstream.exception("SessionTimeoutException", "the session was open for three hours")
             return
         if events or current >= beat:
-            yield _updates(events, group, sampled)
+            for update in _updates(events, group, sampled):
+                yield update
             beat = current + 1.0
         await asyncio.sleep(max(pause(_POLL), 4 * (current - before)))
 
 
-def _updates(events: list[Event], group: str, sampled: bool) -> bytes:
+def _updates(events: list[Event], group: str, sampled: bool) -> Iterator[bytes]:
     """One sessionUpdate for every MOST_EVENTS events; an empty one where there are none."""
     batches = [events[first : first + MOST_EVENTS] for first in range(0, len(events), MOST_EVENTS)] or [[]]
-    return b"".join(chain(_update(batch, group, sampled) for batch in batches))
+    return (_update(batch, group, sampled) for batch in batches)
 
 
 def _update(events: list[Event], group: str, sampled: bool) -> bytes:
