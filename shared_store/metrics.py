@@ -13,6 +13,7 @@ import re
 import threading
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice, takewhile
@@ -32,6 +33,8 @@ _SECTIONS = {
     "iteration_seconds": "speed/iteration_seconds",
 }
 _NAME = re.compile(r"metrics-e([0-9]{1,18})\.jsonl")
+_KEPT = 32 << 20
+"""Bytes of records that wait for room on the volume; later ones are lost."""
 _BLOCK = 16 << 10
 """Bytes between two marks."""
 _LONGEST = 64 << 10
@@ -49,15 +52,29 @@ class MetricsWriter:
         """Open the file of ``epoch``; ``resumed_from`` is the number of finished iterations (0 for a new run)."""
         run.metrics.mkdir(parents=True, exist_ok=True)
         self.path = run.metrics / f"metrics-e{epoch}.jsonl"
-        self._file = open(self.path, "a", buffering=1)  # noqa: SIM115 - closed by close()
-        self.write({"resumed_from": resumed_from})
+        self._file = open(self.path, "ab", buffering=0)  # noqa: SIM115 - closed by close()
+        self._left = bytearray()
+        """What the volume has not taken yet."""
+        with suppress(OSError):  # it goes with the first iteration's record
+            self.write({"resumed_from": resumed_from})
 
     def write(self, record: Mapping[str, Any]) -> None:
-        """Append one record; ``iteration`` counts from 1. Non-finite values must be given as None."""
-        self._file.write(json.dumps(record, allow_nan=False) + "\n")
+        """Append one record; ``iteration`` counts from 1. Non-finite values must be given as None.
+
+        Raises OSError where the volume does not take it now: the record is kept, up to a limit, and goes with the next one.
+        """
+        if len(self._left) < _KEPT:
+            self._left += json.dumps(record, allow_nan=False).encode() + b"\n"
+        self._flush()
+
+    def _flush(self) -> None:
+        while self._left:
+            del self._left[: self._file.write(self._left)]
 
     def close(self) -> None:
-        self._file.close()
+        """Raises OSError where records are left that the volume does not take."""
+        with self._file:
+            self._flush()
 
     def __enter__(self) -> MetricsWriter:
         return self

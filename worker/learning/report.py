@@ -70,7 +70,7 @@ WARMED = 2
 
 
 class Report:
-    """Writes the records of one attempt. Main rank only. A volume that refuses a record costs the record, not the run.
+    """Writes the records of one attempt. Main rank only. A volume that refuses a record gets it later; it does not end the run.
 
     Args:
         training: The training.
@@ -108,14 +108,20 @@ class Report:
             key: value if not isinstance(value, float) or math.isfinite(value) else None
             for key, value in record.items()
         }
-        try:
-            self._metrics.write({**finite, "time": time.time()})
-            for name, value in scalars(finite).items():
-                self._events.add_scalar(name, value, record["iteration"])
-        except OSError as error:
-            if not self._warned:
-                print(f"warning: metrics can't be written ({error}); training goes on without them", flush=True)
-            self._warned = True
+        for write in (self._write_record, self._write_events):
+            try:
+                write(finite)
+            except OSError as error:
+                if not self._warned:
+                    print(f"warning: metrics can't be written ({error}); training goes on, and tries again", flush=True)
+                self._warned = True
+
+    def _write_record(self, record: Mapping[str, Any]) -> None:
+        self._metrics.write({**record, "time": time.time()})
+
+    def _write_events(self, record: Mapping[str, Any]) -> None:
+        for name, value in scalars(record).items():
+            self._events.add_scalar(name, value, record["iteration"])
 
     def _long(self, record: dict[str, float | int | None]) -> str:
         """A warning about a training that takes very long without a GPU; empty for others."""

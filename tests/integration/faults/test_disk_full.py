@@ -16,6 +16,8 @@ from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.domain.errors import ApiError
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database, DatabaseFull
+from shared_store.layout import Store
+from shared_store.metrics import MetricsWriter, read_metrics
 from tests.conftest import PATIENCE, Serving, wait_for
 from tests.support.conformance.streams import client_of
 from tests.support.faults.full_disk import fill, small_volume
@@ -129,3 +131,22 @@ def test_a_minimum_is_a_size_a_share_or_nothing() -> None:
 def test_only_the_volume_that_is_short_is_named(tmp_path: Path) -> None:
     disk = Disk({"store": tmp_path, "database": tmp_path / "gone"}, MinFree(share=1.0))
     assert "the volume of the store" in str(disk.shortage()) and disk.shortage("database") is None
+
+
+def test_metrics_wait_for_room_and_none_is_lost(tmp_path: Path) -> None:
+    with small_volume(tmp_path / "volume", 1 << 20) as volume:
+        run = Store(volume / "store").open().run("r")
+        writer = MetricsWriter(run, 1, 0)
+        writer.write({"iteration": 1})
+        filler = fill(volume)
+        refused = 0
+        for iteration in range(2, 400):
+            try:
+                writer.write({"iteration": iteration, "fill": "x" * 100})
+            except OSError:
+                refused += 1
+        assert refused > 300, "what was left of its last block took a few"
+        filler.unlink()
+        writer.write({"iteration": 400})
+        assert [each["iteration"] for each in read_metrics(run)] == list(range(1, 401))
+        writer.close()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import shutil
 import subprocess
 import time
 from collections import Counter
@@ -163,6 +164,8 @@ def _run(
     verdict = Verdict()
     judge(verdict, home, run, reference, controller_kills=0)
     done["runs"] += 1
+    if verdict.violations:  # the volume goes: its logs are kept for whoever looks
+        shutil.copytree(run.path / "logs", home.path / f"logs-of-{run.name}")
     return verdict
 
 
