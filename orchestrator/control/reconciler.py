@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-from sqlalchemy import select, update
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
@@ -20,6 +20,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.heartbeat import Heartbeat
+from orchestrator.control.isolation import Isolation
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
@@ -29,11 +30,8 @@ from orchestrator.control.store_calls import StoreCalls
 from orchestrator.control.store_identity import StoreAbsent, StoreIdentity
 from orchestrator.control.usage import forget_before
 from orchestrator.control.work_queue import WorkQueue
-from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.registry import EngineSet
-from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.persistence.columns import storable
 from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.models import Job, JobQueue, now
 from orchestrator.persistence.queries import ask_to_end
@@ -120,18 +118,19 @@ class Reconciler:
         self._wake, self._ending = threading.Event(), threading.Event()
         self._ticking: int | None = None
         """The thread that makes a pass now."""
-        self.trouble: str | None = None
-        """Why the database can't be used at present: nothing is launched, and no request is accepted."""
-        self._is_full = False
-        """Whether its volume is full; jobs are ended all the same."""
-        self._backoff = Backoff(log)
-        """Failures, by the part of the pass, or by the action on a job and the job's id."""
+        self._isolation = Isolation(database, self._loaded, self.heartbeat)
+        self._backoff = self._isolation.backoff
         self._thread: threading.Thread | None = None
         with database.session() as session:
             self.clock.restore(session)
             self.work_queue.load(session)
             for job, attempt in open_attempts(session, self.work_queue.active()):
                 bus.expect(job.id, attempt.number, len(attempt.nodes))  # before the router is there for their nodes
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the database can't be used at present: nothing is launched, and no request is accepted."""
+        return self._isolation.trouble
 
     def start(self) -> None:
         self.disk.start()
@@ -170,7 +169,7 @@ class Reconciler:
     def _loop(self) -> None:
         self.database.reserve_connections()
         while not self._ending.is_set():
-            self._isolated("reconciling", self.tick)
+            self._isolation.part("reconciling", self.tick)
             if self._wake.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
                 self._ending.wait(_GATHERING)
             self._wake.clear()
@@ -200,18 +199,20 @@ class Reconciler:
         if due and len(taken) == _SETTLED_A_TICK:
             self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), _SETTLED_AT_ONCE):
-            self.work_queue.look_again(self._guarded("settle", due[start : start + _SETTLED_AT_ONCE], self._settle))
+            self.work_queue.look_again(
+                self._isolation.jobs("settle", due[start : start + _SETTLED_AT_ONCE], self._settle)
+            )
         self._loaded.keep(self.work_queue.active())
         self.engine.look()
         for job_id in self.work_queue.take_active(machine.monotonic()):
             try:
                 if not self._backoff.waits(("advance", job_id)):
-                    self._guarded("advance", [job_id], self._advance)
+                    self._isolation.jobs("advance", [job_id], self._advance)
             finally:
                 self.work_queue.later(job_id, machine.monotonic() + _SOON)
         self._note_silence()
-        self._isolated("scheduling", self._admit)
-        self._isolated("clearing away", self._sweep)
+        self._isolation.part("scheduling", self._admit)
+        self._isolation.part("clearing away", self._sweep)
 
     def _note_silence(self) -> None:
         why = self.bus.presence.cut_off
@@ -229,55 +230,8 @@ class Reconciler:
             with self.database.session() as session:
                 self.clock.rewrite(session)  # to be read is not enough: its volume may be full
                 self.work_queue.load(session)
-            self.trouble = None
+            self._isolation.trouble = None
             log.warning("the database can be used again")
-
-    def _isolated(self, what: str, body: Callable[[], None]) -> None:
-        """Carry out one part of a pass: its failure must not stop the other parts."""
-        try:
-            body()
-            self._backoff.worked(what)
-        except DatabaseError as error:
-            if self.trouble is None:
-                log.error("%s; until it can be used again no job is started or accepted", error)
-            self.trouble, self._is_full = str(error), isinstance(error, DatabaseFull)
-        except Exception as error:
-            self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
-
-    def _guarded(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
-        """Do something to these jobs in one commit; where that fails, to each by itself. Returns the jobs for which it failed.
-
-        Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
-        Raises DatabaseError.
-        """
-        self.heartbeat.beat()
-        try:
-            self._carried_out(ids, body)
-        except DatabaseError:
-            raise
-        except Exception as error:
-            if len(ids) > 1:
-                return [failed for job_id in ids for failed in self._guarded(what, [job_id], body)]
-            self._failed(what, ids[0], error)
-            return ids
-        for job_id in ids:
-            self._backoff.worked((what, job_id), lasting=True)
-        return []
-
-    def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
-        with self._loaded.session() as session:
-            for job in self._loaded.jobs(session, ids).values():
-                body(session, job)
-
-    def _failed(self, what: str, job_id: str, error: Exception) -> None:
-        """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
-        reason = f"the controller failed on this job ({_words(error)}); trying again"
-        reason = excerpt(storable(reason), LONGEST_REASON)
-        if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", error):
-            with self.database.session() as session:  # by its id alone: its row may be what is damaged
-                told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
-                session.execute(told)
-            self._loaded.changed([job_id])
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:
@@ -356,7 +310,7 @@ class Reconciler:
         ]
         for what, job_id, body in bodies:
             if not self._backoff.waits((what, job_id)):
-                self._guarded(what, [job_id], body)
+                self._isolation.jobs(what, [job_id], body)
 
     @staticmethod
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
@@ -383,7 +337,7 @@ class Reconciler:
         Raises StoreAbsent for an addition while the store is not there, DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
         little room for an addition.
         """
-        if (trouble := self.trouble) is not None and (adds or not self._is_full):
+        if (trouble := self.trouble) is not None and (adds or not self._isolation.is_full):
             raise DatabaseError(trouble)
         if adds and (absent := self.disk.absent("store")):
             raise StoreAbsent(absent)
@@ -446,8 +400,3 @@ class Reconciler:
             if self.retention is not None:
                 # by the clock that is behind: nothing is forgotten too early
                 forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
-
-
-def _words(error: Exception) -> str:
-    """An unexpected error in one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

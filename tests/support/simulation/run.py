@@ -134,7 +134,7 @@ class Simulation:
             return
         reconciler._wake.clear()
         try:
-            reconciler._isolated("reconciling", reconciler.tick)
+            reconciler._isolation.part("reconciling", reconciler.tick)
         except Crash:
             self.die()
             return

@@ -1,0 +1,82 @@
+"""Keeps failures apart: a part of a pass that fails stops no other part, and a job that fails no other job."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+from sqlalchemy import update
+from sqlalchemy.orm import Session
+
+from orchestrator.control.heartbeat import Heartbeat
+from orchestrator.control.loaded import LoadedJobs
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.domain.job import TERMINAL
+from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.columns import storable
+from orchestrator.persistence.models import Job
+from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
+
+log = logging.getLogger("muster.controller")
+
+
+class Isolation:
+    """Carries out the work of the controller's loop, and remembers what fails. On the controller's thread alone."""
+
+    def __init__(self, database: Database, loaded: LoadedJobs, heartbeat: Heartbeat) -> None:
+        self._database, self._loaded, self._heartbeat = database, loaded, heartbeat
+        self.trouble: str | None = None
+        """Why the database can't be used at present: nothing is launched, and no request is accepted."""
+        self.is_full = False
+        """Whether its volume is full; jobs are ended all the same."""
+        self.backoff = Backoff(log)
+        """Failures, by the part of the pass, or by the action on a job and the job's id."""
+
+    def part(self, what: str, body: Callable[[], None]) -> None:
+        """Carry out one part of a pass."""
+        try:
+            body()
+            self.backoff.worked(what)
+        except DatabaseError as error:
+            if self.trouble is None:
+                log.error("%s; until it can be used again no job is started or accepted", error)
+            self.trouble, self.is_full = str(error), isinstance(error, DatabaseFull)
+        except Exception as error:
+            self.backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
+
+    def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
+        """Do something to these jobs in one commit; where that fails, to each by itself. Returns the jobs for which it failed.
+
+        Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
+        Raises DatabaseError.
+        """
+        self._heartbeat.beat()
+        try:
+            with self._loaded.session() as session:
+                for job in self._loaded.jobs(session, ids).values():
+                    body(session, job)
+        except DatabaseError:
+            raise
+        except Exception as error:
+            if len(ids) > 1:
+                return [failed for job_id in ids for failed in self.jobs(what, [job_id], body)]
+            self._failed(what, ids[0], error)
+            return ids
+        for job_id in ids:
+            self.backoff.worked((what, job_id), lasting=True)
+        return []
+
+    def _failed(self, what: str, job_id: str, error: Exception) -> None:
+        """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
+        reason = f"the controller failed on this job ({_words(error)}); trying again"
+        reason = excerpt(storable(reason), LONGEST_REASON)
+        if self.backoff.failed((what, job_id), f"job {job_id}: {reason}", error):
+            with self._database.session() as session:  # by its id alone: its row may be what is damaged
+                told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
+                session.execute(told)
+            self._loaded.changed([job_id])
+
+
+def _words(error: Exception) -> str:
+    """An unexpected error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
