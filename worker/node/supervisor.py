@@ -193,6 +193,8 @@ class Supervisor:
         since, limit = (rank.heard, timeout) if rank.heard is not None else (rank.spoke, max(timeout, _PATIENCE))
         if (silence := time.monotonic() - since) < limit:
             return False
+        if any(key.data == (rank, "beacon") for key, _ in self.selector.select(0)):
+            return False  # it was not silent: this process was held up, such as by its log on a volume that hangs
         timeout = limit
         state = state_of(rank.pid)
         if state not in _STATES and silence < timeout + _WAITING_EXTRA:

@@ -17,6 +17,7 @@ from shared_store.epoch import raise_epoch
 from shared_store.outcomes import LONGEST_TEXT
 from tests.conftest import PATIENCE, wait_for
 from tests.support.faults.full_disk import full_volume
+from tests.support.faults.outages import loop_volume
 from tests.support.processes import alive, await_end
 from tests.support.worker.node import Node, Nodes
 
@@ -386,3 +387,29 @@ def test_while_the_store_is_away_the_node_waits_and_its_outcome_is_in_the_store_
     finally:
         n.process.kill()
         n.process.wait()
+
+
+FROZEN = """
+import os, subprocess, time
+fd = int(os.environ["MUSTER_PROGRESS_FD"])
+def work(seconds):  # at work, and so no rank that waits for another one
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        pass
+for iteration in range(60):
+    if iteration == 10:
+        subprocess.run(["fsfreeze", "-f", os.environ["MUSTER_STORE"]], check=True)
+        thaws = subprocess.Popen(["sh", "-c", 'sleep 4; exec fsfreeze -u "$MUSTER_STORE"'])
+    print(iteration, flush=True)
+    work(0.05)
+    os.write(fd, b'{"iteration": %d}\\n' % iteration)
+    work(0.05)
+"""
+
+
+def test_a_store_that_freezes_does_not_make_a_training_stall(tmp_path: Path) -> None:
+    with loop_volume(tmp_path / "store") as volume:
+        n = Node(volume, stall_timeout=1.0)
+        n.stderr = tmp_path / "stderr"
+        assert n.python(FROZEN) == 0
+        assert n.output() == [str(iteration) for iteration in range(60)], n.lines()

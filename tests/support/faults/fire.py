@@ -44,9 +44,9 @@ class Result:
     seconds: float = 0.0
 
 
-def write_spec(path: Path, nodes: int, attempts: int, iterations: int, keep: int) -> Path:
+def write_spec(path: Path, nodes: int, attempts: int, iterations: int, keep: int, steps: int = 16) -> Path:
     """The job: cheap iterations, many checkpoints. ``keep`` and ``attempts`` change nothing in what is computed."""
-    ppo = {"steps": 16, "epochs": 1, "minibatches": 2, "hidden_sizes": [16]}
+    ppo = {"steps": steps, "epochs": 1, "minibatches": 2, "hidden_sizes": [16]}
     spec = {
         "name": "torture",
         "nodes": nodes,
@@ -60,9 +60,9 @@ def write_spec(path: Path, nodes: int, attempts: int, iterations: int, keep: int
     return path
 
 
-def run_straight(home: Home, nodes: int, iterations: int) -> Reference:
+def run_straight(home: Home, nodes: int, iterations: int, steps: int = 16) -> Reference:
     """The reference: the same job, undisturbed; every checkpoint is kept."""
-    spec = write_spec(home.path / f"straight-{nodes}.yaml", nodes, 1, iterations, 10_000)
+    spec = write_spec(home.path / f"straight-{nodes}.yaml", nodes, 1, iterations, 10_000, steps)
     submitted, said = home.command("submit", str(spec))
     if submitted is None:
         raise Broken(f"submit: {said}")

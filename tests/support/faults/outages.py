@@ -32,7 +32,8 @@ LOST_AFTER = 10.0
 """``serve --lost-after``: the shortest, so that an outage outlasts it [s]."""
 LONGEST = 2 * LOST_AFTER
 """Seconds of the longest outage."""
-ITERATIONS = 1500
+ITERATIONS, STEPS = 300, 128
+"""Long iterations, so that no outage lasts until the end, whose checkpoint must be saved."""
 BLOWS = 3
 """In one run."""
 
@@ -132,7 +133,7 @@ def outage_round(
         try:
             home.serve()
             for nodes in sizes:
-                reference = run_straight(home, nodes, ITERATIONS)
+                reference = run_straight(home, nodes, ITERATIONS, STEPS)
                 verdict = _run(home, nodes, reference, blows or rng.choices(list(OUTAGES), k=BLOWS), rng, done)
                 wrong += verdict.violations
                 wrong += [f"{nodes} nodes: {verdict.attempts} attempts"] * (verdict.attempts != 1)
@@ -146,7 +147,7 @@ def _run(
     home: Home, nodes: int, reference: Reference, blows: Sequence[str], rng: random.Random, done: Counter[str]
 ) -> Verdict:
     """A run with one attempt under these blows, to its end."""
-    spec = write_spec(home.path / "spec.yaml", nodes, 1, ITERATIONS, keep=3)
+    spec = write_spec(home.path / "spec.yaml", nodes, 1, ITERATIONS, 3, STEPS)
     submitted, said = home.command("submit", str(spec))
     if submitted is None:
         raise Broken(f"submit: {said}")
