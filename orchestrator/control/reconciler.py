@@ -167,7 +167,6 @@ class Reconciler:
         return self.heartbeat.problem() or self.trouble or self.disk.absent("store")
 
     def _loop(self) -> None:
-        self.database.reserve_connections()
         while not self._ending.is_set():
             self._isolation.part("reconciling", self.tick)
             if self._wake.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
@@ -188,6 +187,7 @@ class Reconciler:
             self.monitoring.loop_took(machine.monotonic() - started)
 
     def _pass(self) -> None:
+        self.database.reserve_connections()
         self._keep_database()
         with self.database.session() as session:
             if self.clock.stepped:

@@ -117,7 +117,7 @@ class Database:
 
     def reserve_connections(self) -> None:
         """Give this thread connections of its own, which no other can take. A database in memory has only one."""
-        if not _is_in_memory(self.engine.url):
+        if (self._own is None or self._own[0] != threading.get_ident()) and not _is_in_memory(self.engine.url):
             self._own = threading.get_ident(), self._new_engine(self.engine.url)
 
     @classmethod

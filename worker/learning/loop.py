@@ -371,6 +371,7 @@ class Loop:
 
     def _finish(self) -> None:
         """Wait for the last save, evaluate the policy, plot the curve, print the paths."""
+        self.beacon.tell(done=True)  # no iteration comes any more: a slow volume is no stall
         if self.state.ordered_at != self.state.progress.iteration:
             self.state.save(self.reporter if self.gang.is_main else None)
         self._tell_saved(self.state.finish())
@@ -379,7 +380,6 @@ class Loop:
             raise TrainingError(
                 "training is done, but its last checkpoint could not be saved; free space in the store and start again"
             )
-        self.beacon.tell(done=True)
         self._failures.tell(again=True)
         self.say(f"evaluating checkpoint {name}")
         worlds = self.held_out_worlds()

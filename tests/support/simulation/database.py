@@ -7,13 +7,18 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import StaticPool, create_engine
+from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.persistence.models import JobQueue
-from orchestrator.persistence.session import Database, _read_document
+from orchestrator.persistence.session import Database, DatabaseError, _read_document
+from tests.support.simulation.machine import LoopWaits
+
+if TYPE_CHECKING:
+    from tests.support.simulation.run import Simulation
 
 
 class Memory(sqlite3.Connection):
@@ -68,13 +73,24 @@ def new_memory() -> Memory:
 class SimulatedDatabase(Database):
     """The sessions of one process of the controller."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: Memory, world: Simulation) -> None:
+        self._world, self._reserved = world, False
         self.committed = self.changed = self.ended = None
         self._lock = self._file_lock = self._damage = self._file = self._identity = None
         memory.rollback()  # what a process that was killed has not committed
         self.engine = create_engine(
             "sqlite://", creator=lambda: memory, poolclass=StaticPool, json_deserializer=_read_document
         )
+
+    def reserve_connections(self) -> None:
+        self._reserved = True
+
+    def open(self) -> Session:
+        if self._world.crowded and not (self._reserved and self._world.in_loop):
+            if self._world.in_loop:
+                raise LoopWaits
+            raise DatabaseError("all connections are busy")
+        return super().open()
 
     def close(self) -> None:
         """The data stay."""

@@ -78,6 +78,10 @@ def database_outage(world: Simulation, rng: Random) -> None:
     _during(world, rng.uniform(1, 60), "database_down")
 
 
+def crowd_database(world: Simulation, rng: Random) -> None:
+    _during(world, _seconds(rng), "crowded")
+
+
 def stall_volume(world: Simulation, rng: Random) -> None:
     _during(world, _seconds(rng), "stalled", world.volume)
 
@@ -150,6 +154,7 @@ def _some_node(world: Simulation, rng: Random) -> SimulatedNode | None:
 
 
 KINDS: tuple[Fault, ...] = (
-    *(crash_at_a_write, crash_at_a_write, move, partition, engine_outage, bus_outage, database_outage, step_clock),
+    *(crash_at_a_write, crash_at_a_write, move, partition, engine_outage, bus_outage, step_clock),
+    *(database_outage, crowd_database),
     *(stall_volume, fill_volume, unmount_volume, break_volume, freeze_node, isolate_node, lose_host, kill_node),
 )

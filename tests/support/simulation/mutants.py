@@ -17,6 +17,7 @@ from orchestrator.domain.attempt_instructions import Explain, Instructions, Laun
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
 from shared_store.bus import Node
+from tests.support.simulation.database import SimulatedDatabase
 
 Mutant = AbstractContextManager[Any]
 
@@ -44,6 +45,11 @@ def those_whom_another_router_met_are_silent() -> Mutant:
             self.left((job, attempt, index))
 
     return mock.patch.object(Presence, "expect", expected)
+
+
+def the_loop_shares_its_connections() -> Mutant:
+    """B3: requests that wait hold the connections that the loop needs."""
+    return mock.patch.object(SimulatedDatabase, "reserve_connections", lambda self: None)
 
 
 def the_loop_reads_the_store() -> Mutant:
@@ -94,6 +100,7 @@ def without_an_outcome_is_killed() -> Mutant:
 MUTANTS: Mapping[str, Callable[[], Mutant]] = {
     "B1": silence_alone_counts,
     "B2": those_whom_another_router_met_are_silent,
+    "B3": the_loop_shares_its_connections,
     "B4": the_loop_reads_the_store,
     "B9": what_is_to_end_is_launched,
     "T1": any_volume_is_the_store,

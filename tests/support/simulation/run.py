@@ -51,6 +51,10 @@ class Simulation:
         self.cluster = Cluster(self)
         self.invariants = Invariants(self)
         self.engine_down = self.bus_down = self.database_down = False
+        self.crowded = False
+        """Requests hold every connection to the database that they can get."""
+        self.in_loop = False
+        """The controller's loop is at work."""
         self.router = 1
         """The address at which the controller's bus is."""
         self.writes_left: int | None = None
@@ -103,11 +107,12 @@ class Simulation:
 
     def _start(self) -> None:
         self.machine.process += 1
+        self.crowded = False
         try:
             runs = SimulatedRunStore(self)
             self._bus = SimulatedBus(self)
             self._reconciler = Reconciler(
-                SimulatedDatabase(self.memory),
+                SimulatedDatabase(self.memory, self),
                 EngineSet([SimulatedEngine(self)]),
                 runs.store,
                 self._bus,  # type: ignore[arg-type]
@@ -133,6 +138,7 @@ class Simulation:
         if process != self.machine.process or due != self._next_tick or reconciler is None:
             return
         reconciler._wake.clear()
+        self.in_loop = True
         try:
             reconciler._isolation.part("reconciling", reconciler.tick)
         except Crash:
@@ -140,6 +146,8 @@ class Simulation:
             return
         except LoopWaits:
             raise Violation("the loop waits for a call") from None
+        finally:
+            self.in_loop = False
         self._tick_at(self.machine.time + _TICK)
         if self._committed:
             self._committed = False
