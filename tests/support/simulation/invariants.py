@@ -35,7 +35,9 @@ class Invariants:
         """Since when that is so [s]; None once it was checked."""
 
     def check_launch(self, gang: Gang, same_process: bool) -> None:
-        """Never two writers; and nothing starts that is to end (another process of the controller can't take back its request)."""
+        """Never two writers, nothing without its run, and nothing that is to end (but another process can't take back its request)."""
+        if gang.run not in self._world.volume.runs:
+            raise Violation(f"{gang.name} is launched, and the store does not have its run")
         for other in self._world.cluster.gangs.values():
             if other.run == gang.run and any(self._world.cluster.can_write(node) for node in other.running):
                 raise Violation(f"{gang.name} is launched while {other.name} runs")
