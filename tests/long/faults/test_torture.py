@@ -31,6 +31,6 @@ def test_a_run_under_fire_ends_with_the_bits_of_a_straight_one(tmp_path: Path) -
 
 
 def test_outages_of_network_and_store_and_a_moved_controller_end_nothing_and_change_no_bit(tmp_path: Path) -> None:
-    done, violations = outage_round(tmp_path, 7, sizes=(2,), blows=tuple(OUTAGES))
+    done, violations = outage_round(tmp_path, 7, sizes=(2,), blows=tuple(OUTAGES), longest=12.0)
     assert not violations
     assert done == {**dict.fromkeys(OUTAGES, 1), "runs": 1}

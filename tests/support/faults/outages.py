@@ -32,7 +32,7 @@ LOST_AFTER = 10.0
 """``serve --lost-after``: the shortest, so that an outage outlasts it [s]."""
 LONGEST = 2 * LOST_AFTER
 """Seconds of the longest outage."""
-ITERATIONS, STEPS = 300, 128
+ITERATIONS, STEPS = 800, 128
 """Long iterations, so that no outage lasts until the end, whose checkpoint must be saved."""
 BLOWS = 3
 """In one run."""
@@ -123,7 +123,7 @@ OUTAGES: Mapping[str, Callable[[Home], AbstractContextManager[None]]] = {
 
 
 def outage_round(
-    directory: Path, seed: int, sizes: Sequence[int] = (1, 3), blows: Sequence[str] = ()
+    directory: Path, seed: int, sizes: Sequence[int] = (1, 3), blows: Sequence[str] = (), longest: float = LONGEST
 ) -> tuple[Counter[str], list[str]]:
     """One run of each size of gang under these blows, drawn ones by default: its only attempt must end as that of the straight run."""
     rng = random.Random(seed)
@@ -134,7 +134,7 @@ def outage_round(
             home.serve()
             for nodes in sizes:
                 reference = run_straight(home, nodes, ITERATIONS, STEPS)
-                verdict = _run(home, nodes, reference, blows or rng.choices(list(OUTAGES), k=BLOWS), rng, done)
+                verdict = _run(home, nodes, reference, blows or rng.choices(list(OUTAGES), k=BLOWS), rng, done, longest)
                 wrong += verdict.violations
                 wrong += [f"{nodes} nodes: {verdict.attempts} attempts"] * (verdict.attempts != 1)
         finally:
@@ -144,7 +144,13 @@ def outage_round(
 
 
 def _run(
-    home: Home, nodes: int, reference: Reference, blows: Sequence[str], rng: random.Random, done: Counter[str]
+    home: Home,
+    nodes: int,
+    reference: Reference,
+    blows: Sequence[str],
+    rng: random.Random,
+    done: Counter[str],
+    longest: float,
 ) -> Verdict:
     """A run with one attempt under these blows, to its end."""
     spec = write_spec(home.path / "spec.yaml", nodes, 1, ITERATIONS, 3, STEPS)
@@ -158,7 +164,7 @@ def _run(
         if _is_over(home, run):
             break
         with OUTAGES[name](home):
-            time.sleep(rng.uniform(0.5, LONGEST))
+            time.sleep(rng.uniform(0.5, longest))
         done[name] += 1
         print(f"{nodes} nodes: {name} at iteration {before} of {ITERATIONS}", flush=True)
     wait_for(lambda: _is_over(home, run), 240, "the end")
