@@ -15,6 +15,7 @@ from urllib.parse import parse_qs
 from fastapi import Request, Response
 from fastapi.responses import JSONResponse, RedirectResponse
 from pydantic import BaseModel, ValidationError
+from starlette.concurrency import run_in_threadpool
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Refusal
@@ -23,6 +24,10 @@ from shared_store.wording import explain, path_of
 
 TOKEN = "form_token"
 """The field of a form that other web pages can't know."""
+_LARGE = 16 << 10
+"""Bytes of a body that would keep the event loop busy for some milliseconds."""
+_LARGEST_JOB = 200 << 10
+"""Bytes of a form with a job: 64 KiB of YAML, of which each may take three, and the other fields."""
 _MOST_FIELDS = 5000
 _Body = TypeVar("_Body", bound=BaseModel)
 _OPEN = "/login"
@@ -75,10 +80,20 @@ class Unconfirmed(Exception):
 
 
 async def sent_form(request: Request) -> Form:
-    """The fields of an ``application/x-www-form-urlencoded`` body. Raises ClientError."""
+    """The fields of an ``application/x-www-form-urlencoded`` body, parsed once, a large one in a thread. Raises ClientError."""
+    if (form := getattr(request.state, "form", None)) is None:
+        body = await request.body()
+        if request.url.path.startswith("/submit") and len(body) > _LARGEST_JOB:
+            raise ClientError(f"the form has {len(body):,} bytes, and may have {_LARGEST_JOB:,}; shorten the job", 413)
+        form = _parsed(body) if len(body) < _LARGE else await run_in_threadpool(_parsed, body)
+        request.state.form = form
+    parsed: Form = form
+    return parsed
+
+
+def _parsed(body: bytes) -> Form:
     try:
-        text = (await request.body()).decode()
-        return Form(parse_qs(text, keep_blank_values=True, max_num_fields=_MOST_FIELDS, errors="strict"))
+        return Form(parse_qs(body.decode(), keep_blank_values=True, max_num_fields=_MOST_FIELDS, errors="strict"))
     except ValueError:
         raise ClientError(f"the form can't be read: it has more than {_MOST_FIELDS} fields, or is not UTF-8") from None
 
