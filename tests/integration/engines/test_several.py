@@ -128,22 +128,24 @@ def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monke
 
 
 @pytest.mark.skipif(not Path("/var/run/docker.sock").exists(), reason="NO /var/run/docker.sock: nothing to cut off")
-@pytest.mark.usefixtures("docker_client")
-def test_a_node_that_ends_while_docker_is_away_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_that_ends_while_docker_is_away_is_not_silent(
+    docker_client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     relay = Relay(tmp_path / "docker.sock")
     relay.open()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{relay.path}")
-    with Serving(tmp_path, "--engine", "docker", "--cpus", "4", "--lost-after", "10s") as served:
-        image = {"image": SUPERVISED, **host_files()}
-        site = Site("docker", served, tmp_path / "store", image, {"PATH": PATH})
-        job = site.submit("echo ready; while [ ! -e $MUSTER_STORE/go-$RANK ]; do sleep 0.05; done", nodes=2)
+    served = Serving(tmp_path, "--engine", "docker", "--cpus", "4", "--lost-after", "10s")
+    site = Site("docker", served, tmp_path / "store", {"image": SUPERVISED, **host_files()}, {"PATH": PATH})
+    job = site.submit("echo ready; while [ ! -e $MUSTER_STORE/go-$RANK ]; do sleep 0.05; done", nodes=2)
+
+    def nodes() -> Any:
+        found = served.detail(job)
+        assert (found["status"], len(found["attempts"])) == ("RUNNING", 1), found["statusReason"]
+        return found["attempts"][0]["nodes"]
+
+    try:
         site.ready(job, 1, 2)
-
-        def nodes() -> Any:
-            found = served.detail(job)
-            assert (found["status"], len(found["attempts"])) == ("RUNNING", 1), found["statusReason"]
-            return found["attempts"][0]["nodes"]
-
+        served.wait(job, "RUNNING")
         wait_for(lambda: nodes()[1].get("met"), 30, "node 1 on the bus")
         relay.cut()
         (site.volume / "go-1").touch()
@@ -154,6 +156,10 @@ def test_a_node_that_ends_while_docker_is_away_is_not_silent(tmp_path: Path, mon
         wait_for(lambda: nodes()[0].get("exitCode") == 0, 30, "its outcome counts, too")
         relay.open()
         assert served.wait(job)["status"] == "SUCCEEDED"
+    finally:
+        served.close()
+        for container in docker_client.containers.list(all=True, filters={"label": f"muster.gang={job}/1/1"}):
+            container.remove(force=True)
 
 
 def test_memory_beyond_the_limit_is_named_under_a_supervisor_too(served: Serving) -> None:
