@@ -205,14 +205,16 @@ def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBenc
 def test_a_driver_that_is_told_to_end_has_its_gang_save_and_leaves_one_that_waits_to_the_next_driver(
     bench: RayBench,
 ) -> None:
-    handle = bench.ready(bench.gang(POLITE))
-    waiting = bench.launch(bench.gang(POLITE, suffix="-2"))  # for room
+    handle = bench.ready(bench.gang(POLITE, cpus=2.0))
+    waiting = bench.launch(bench.gang(POLITE, cpus=2.0, suffix="-2"))  # for room
     wait_for(lambda: "waits for room" in bench.engine.observe(waiting)[0].words, 20, "it is placed")
     for driver in processes_of(bench.home / "home"):
         os.kill(driver, signal.SIGTERM)
     wait_for(lambda: bench.log().count("saved") == 3, 30, "all have saved")
-    assert [node.exit_code for node in bench.ended(handle, bench.new_engine())] == [75, 75, 75]
-    bench.ready(bench.gang(POLITE, suffix="-2"))
+    successor = bench.new_engine()
+    assert [node.exit_code for node in bench.ended(handle, successor)] == [75, 75, 75]
+    successor.close()
+    bench.ready(bench.gang(POLITE, cpus=2.0, suffix="-2"))
 
 
 def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> None:
