@@ -16,10 +16,12 @@ from shared_store.tracks import TrackError
 
 def test_a_new_store_is_made_where_there_was_nothing_and_opened_again_unchanged(tmp_path: Path) -> None:
     store = Store(tmp_path / "a" / "store").open()
-    assert json.loads((store.path / "store.json").read_text()) == {"format": FORMAT}
+    described = json.loads((store.path / "store.json").read_text())
+    assert described == {"format": FORMAT, "id": store.identity()} and len(described["id"]) == 32
     assert os.listdir(store.path / "runs") == []
     store.run("ant").create({"seed": 1})
     assert [run.name for run in Store(store.path).open().runs()] == ["ant"]
+    assert json.loads((store.path / "store.json").read_text()) == described
 
 
 NOT_A_STORE = {
