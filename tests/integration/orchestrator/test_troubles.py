@@ -160,7 +160,7 @@ def test_without_its_database_a_controller_accepts_nothing(
                 f"database {database} was replaced by another file while the controller runs; put the former one back, "
             )
             said += "or restart the controller to use this one"
-        health = httpx.get(f"{url}/healthz")
+        health = wait_for(lambda: (h := httpx.get(f"{url}/healthz")).is_error and h, 10, "that the loop has noticed")
         assert (health.status_code, health.json()["message"]) == (503, said)
         with pytest.raises(ApiError, match=re.escape(said)):
             Client.connect(url)
