@@ -39,7 +39,7 @@ def test_a_seed_always_tells_the_same_story_and_is_made_smaller() -> None:
     with MUTANTS["B4"]():
         seed = FOUND_AT["B4"]
         assert violation(seed) == violation(seed)
-        jobs, faults = shrink(seed)
+        jobs, faults = shrink(seed, range(6), range(4))
         assert violation(seed, jobs, faults) is not None and len(jobs) <= 2 and len(faults) <= 2
     assert command(seed, [3], [1, 2]) == f"python -m tests.support.simulation {seed} --jobs=3 --faults=1,2"
 
