@@ -138,7 +138,7 @@ class Context:
 
     def reason(self, job: Job) -> str | None:
         """Why a job waits now, or a note for its user while it runs; None if its stored reason suffices."""
-        return self.reconciler.reason(job)
+        return self.reconciler.admission.reason(job)
 
 
 def reconciler_of(request: Request) -> Reconciler:

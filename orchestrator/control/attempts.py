@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,6 +23,7 @@ from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import Observer
 from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
+from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
 from orchestrator.domain.attempt import FINISHING, Phase, State, Terms, step
 from orchestrator.domain.attempt_events import (
@@ -61,14 +61,12 @@ from orchestrator.domain.job import Ending, Status, Verdict
 from orchestrator.engines.api import (
     CannotStart,
     EngineError,
-    EngineFault,
     Gang,
     GangStatus,
     NotYet,
     Plan,
 )
 from orchestrator.engines.registry import EngineSet
-from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Attempt, Job, JobQueue, SchedulingPolicy, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
@@ -82,14 +80,10 @@ NO_EPOCH = 0
 """Of an attempt that has none yet."""
 _READERS = 16
 """Threads for the store."""
-_STOPPERS = 128
-"""Threads for stops: each waits for its gang's grace time."""
 _CHECK_INTERVAL = 5.0
 """Seconds between two looks at a gang of which a node is silent, or whose cause is not known yet."""
 _LEAST, _LATER = 0.02, 60.0
 """Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
-_STOP_AGAIN, _STOP_RARELY = 2.0, 30.0
-"""Seconds until another try to stop a gang that could not be stopped: at first, and at most."""
 
 
 @dataclass
@@ -101,12 +95,8 @@ class _Memory:
     cause_since: int | None = None
     done_since: int | None = None
     """As in :class:`orchestrator.domain.attempt.State`."""
-    stop: Future[GangStatus] | None = None
-    """The stop that is under way."""
-    stopped: GangStatus | None = None
-    """The gang's last status, once it is stopped."""
     progress: Progress | None = None
-    """What the run holds since then."""
+    """What the run holds once the gang is stopped."""
 
 
 class Attempts:
@@ -128,17 +118,15 @@ class Attempts:
         self.engine, self.runs, self.bus = engine, runs, bus
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
         self._memories: dict[tuple[str, int], _Memory] = {}
-        self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
-        """Why the engine could not stop an attempt's gang when it was last asked."""
         self._pool = machine.pool("store", _READERS)
         self._errands = Errands(self._pool, changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
-        self._stops = machine.pool("stop", _STOPPERS)
+        self._stops = Stops(engine, changed, log)
 
     def close(self) -> None:
         """Leave the calls that are under way to themselves."""
-        for pool in (self._pool, self._stops):
-            pool.close()
+        self._pool.close()
+        self._stops.close()
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
         """Record a new attempt, and go on with it: after a crash in between, the next controller goes on from there."""
@@ -164,18 +152,17 @@ class Attempts:
 
     def _pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
-        key, memory = (job.id, attempt.number), self._memory(attempt)
-        state = self._state(job, attempt)
+        key, state = (job.id, attempt.number), self._state(job, attempt)
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
         elif (waits := self._errands.pause(key)) > 0:
             pause = waits
-        elif memory.stop is not None or memory.stopped is not None:
+        elif self._stops.has_begun(key):
             pause = _LATER
         elif state.done_since is not None:
             pause = (state.done_since + FINISHING - self.clock.now()) / 1000
         elif state.verdict is not None:
-            pause = self._denied.pause(key)
+            pause = self._stops.pause(key)
         elif state.cause_since is not None or any(
             self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes
         ):
@@ -347,28 +334,12 @@ class Attempts:
 
     def _stop(self, job: Job, attempt: Attempt, grace: float) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
-        key, memory = (job.id, attempt.number), self._memory(attempt)
-        if memory.stopped is not None:
-            return self._wind_up(job, attempt, memory.stopped)
-        if memory.stop is None and not self._denied.waits(key):
-            assert attempt.handle is not None
-            memory.stop = self._stops.submit(partial(self.engine.stop, attempt.handle, grace))
-            memory.stop.add_done_callback(partial(self._stop_returned, job.id))
-        if memory.stop is not None and memory.stop.done():
-            stop, memory.stop = memory.stop, None
-            error = stop.exception()
-            if error is None:
-                memory.stopped = stop.result()
-                return self._wind_up(job, attempt, memory.stopped)
-            why = " ".join(str(error).split()).removesuffix("; trying again")
-            said = f"attempt {attempt.number} can't be stopped: {why}; trying again"
-            expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
-            self._denied.failed(key, f"job {job.id}: {said}", None if expected else error)
-        said_last = self._denied.said(key)
-        return Delayed(said_last.removeprefix(f"job {job.id}: ")) if said_last else None
-
-    def _stop_returned(self, job: str, _: object) -> None:
-        self.changed(job)
+        key = (job.id, attempt.number)
+        assert attempt.handle is not None
+        if (stopped := self._stops.ask(key, attempt.handle, grace)) is not None:
+            return self._wind_up(job, attempt, stopped)
+        trouble = self._stops.trouble(key)
+        return Delayed(trouble) if trouble else None
 
     def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""
@@ -393,7 +364,7 @@ class Attempts:
 
     def _forget(self, key: Key) -> None:
         self._memories.pop(key, None)
-        self._denied.worked(key)
+        self._stops.forget(key)
         self._errands.forget(key)
         self._observer.forget(key)
 

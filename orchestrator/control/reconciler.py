@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Sequence
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
+from orchestrator.control.admission import Admission
 from orchestrator.control.attempts import Attempts
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
@@ -25,20 +25,17 @@ from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import RunStore
-from orchestrator.control.snapshot import holding_of, open_attempts, take_snapshot
+from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.control.store_identity import StoreAbsent, StoreIdentity
 from orchestrator.control.usage import forget_before
 from orchestrator.control.work_queue import WorkQueue
-from orchestrator.domain.job import TERMINAL, Status
+from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.models import Job, JobQueue, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
-from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
-from orchestrator.scheduling.reasons import WaitReport
-from orchestrator.scheduling.snapshot import Leading
 from shared_store.layout import Store
 
 _SETTLED_AT_ONCE = 200
@@ -47,10 +44,6 @@ _SETTLED_A_TICK = 1000
 """The same in one pass: a large array that ends must not delay the looks at running gangs."""
 _GATHERING = 0.02
 """Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
-_PASS_INTERVAL, _LONGEST_PASS_INTERVAL = 1.0, 16.0
-"""Seconds between scheduling passes while nothing changes, at first and at most: shares decay and limits run out by themselves."""
-_PASS_SHARE = 0.2
-"""Share of one CPU that passes may take."""
 _WITHOUT_DATABASE = 1.0
 """Seconds between two tries of a database that can't be used."""
 _SOON = 1.0
@@ -90,7 +83,7 @@ class Reconciler:
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
         self.calls = StoreCalls(store.path, lambda: self.disk.is_silent("store"))
         """The store, for requests."""
-        self._short, self._is_cut_off = False, False
+        self._is_cut_off = False
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
         self.clock = clock or Clock()
@@ -110,16 +103,22 @@ class Reconciler:
         bus.changed = engine.changed = self._gang_changed
         database.committed = self._committed
         database.changed = self._look_again
-        self._report: WaitReport | None = None
-        self._leading: Mapping[str, Leading] = {}
-        self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
-        self._pass_interval = _PASS_INTERVAL
         self._swept = self._kept = 0.0
         self._wake, self._ending = threading.Event(), threading.Event()
         self._ticking: int | None = None
         """The thread that makes a pass now."""
         self._isolation = Isolation(database, self._loaded, self.heartbeat)
         self._backoff = self._isolation.backoff
+        self.admission = Admission(
+            engine,
+            self.disk,
+            self.work_queue,
+            self._loaded,
+            self.clock,
+            self.monitoring,
+            self._isolation,
+            self.attempts,
+        )
         self._thread: threading.Thread | None = None
         with database.session() as session:
             self.clock.restore(session)
@@ -211,7 +210,7 @@ class Reconciler:
             finally:
                 self.work_queue.later(job_id, machine.monotonic() + _SOON)
         self._note_silence()
-        self._isolation.part("scheduling", self._admit)
+        self._isolation.part("scheduling", self.admission.look)
         self._isolation.part("clearing away", self._sweep)
 
     def _note_silence(self) -> None:
@@ -257,78 +256,6 @@ class Reconciler:
         self.work_queue.note([job])
         settle(session, job, self.clock)
 
-    # -- admission ----------------------------------------------------------------------------------------------------
-
-    def _admit(self) -> None:
-        """Make a scheduling pass, where something changed or time has passed, and enough space is free."""
-        shortage = self.disk.shortage()
-        if self._short != (shortage is not None):
-            log.warning("%s", shortage or "the volumes have enough free space again")
-            self._short = shortage is not None
-        if shortage is not None:
-            return
-        version, at, took = self._passed
-        pause = took / _PASS_SHARE
-        idle = machine.monotonic() - at
-        if idle < pause or (version == self.work_queue.version and idle < self._pass_interval):
-            return
-        same = version == self.work_queue.version
-        self._pass_interval = min(2 * self._pass_interval, _LONGEST_PASS_INTERVAL) if same else _PASS_INTERVAL
-        started, version = machine.monotonic(), self.work_queue.version
-        waiting = self.work_queue.waiting()
-        if self._backoff:  # seldom: there may be very many of them
-            waiting = [each for each in waiting if not self._backoff.waits(("start", each.job))]
-        if not waiting:
-            self._report, self._passed = None, (version, started, 0.0)
-            return
-        unknown = self.engine.unknown()  # before the capacity: an engine may tell it in between
-        with self._loaded.session() as session:
-            holding = holding_of(self._loaded.jobs(session, self.work_queue.active()).values())
-            snapshot = take_snapshot(
-                session,
-                self.clock,
-                self.engine.capacity(),
-                waiting,
-                holding,
-                self._leading,
-                self.engine.names[0],
-                unknown,
-            )
-        decisions = decide(snapshot)
-        self._report, self._leading = decisions.report, decisions.leading
-        took = machine.monotonic() - started
-        self._passed = (version, started, took)
-        self.monitoring.pass_took(took)
-        self._carry_out(decisions)
-
-    def _carry_out(self, decisions: Decisions) -> None:
-        """Carry out each decision by itself: one that fails does not stop the others."""
-        bodies: list[tuple[str, str, Callable[[Session, Job], None]]] = [
-            *(("cancel", each.job, partial(self._cancel, each)) for each in decisions.cancels),
-            *(("preempt", each.job, partial(self._preempt, each)) for each in decisions.preempts),
-            *(("start", each.job, partial(self._start, each)) for each in decisions.starts),
-        ]
-        for what, job_id, body in bodies:
-            if not self._backoff.waits((what, job_id)):
-                self._isolation.jobs(what, [job_id], body)
-
-    @staticmethod
-    def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
-        job.cancelled, job.stop_reason = True, cancel.reason
-
-    def _preempt(self, preempt: Preempt, session: Session, job: Job) -> None:
-        by = session.get_one(Job, preempt.by)
-        if attempt := job.open_attempt:
-            self.attempts.preempt(session, job, attempt, f"preempted by job {by.name} ({by.id[:8]})")
-            self.work_queue.hurry(job.id)
-
-    def _start(self, start: Start, session: Session, job: Job) -> None:
-        # a request may have ended the job since the snapshot was taken
-        if job.status == Status.RUNNABLE and job.stop_reason is None:
-            self.attempts.begin(session, job, start)
-        else:
-            self.work_queue.look_again([job.id])
-
     # -- what the API asks --------------------------------------------------------------------------------------------
 
     def check_writable(self, *, adds: bool) -> None:
@@ -343,36 +270,6 @@ class Reconciler:
             raise StoreAbsent(absent)
         if adds and (shortage := self.disk.shortage("database")):
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
-
-    def reason(self, job: Job) -> str | None:
-        """Why a job waits now, or a note for its user while it runs; None where its own reason says all."""
-        shortage, report = self.disk.shortage(), self._report
-        if job.status in (Status.STARTING, Status.RUNNING):
-            failed = self._backoff.said(("preempt", job.id)) if report and report.preempts(job.id) else None
-            said = failed.removeprefix(f"job {job.id}: ") if failed else job.status_reason
-            return f"{said}; {shortage}" if shortage is not None and shortage not in (said or "") else failed and said
-        if job.status != Status.RUNNABLE or self.work_queue.since(job.id) is None:
-            return None
-        if shortage is not None or report is None:
-            return shortage
-        try:
-            return report.reason(job.id)
-        except KeyError:
-            return None  # submitted since the last pass
-
-    def front(self, queue: str, count: int) -> tuple[Sequence[str], Mapping[str, int]]:
-        """The first waiting jobs of a queue in the order in which they will start, and since when each waits [ms].
-
-        Of the first one: since when it is the first.
-        """
-        report, leading = self._report, self._leading.get(queue)
-        order = [
-            job for job in (report.order(queue)[:count] if report else []) if self.work_queue.since(job) is not None
-        ]
-        times = {job: since for job in order if (since := self.work_queue.since(job)) is not None}
-        if leading is not None and leading.job in times:
-            times[leading.job] = leading.since + self.clock.drift
-        return order, times
 
     def drain(self, session: Session, queue: JobQueue) -> None:
         """Ask all jobs of a queue to end."""

@@ -90,7 +90,7 @@ def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[st
     """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and the resources in use."""
     queue = context.queue(request["jobQueue"], deleting=True)
     permissions.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
-    order, times = context.reconciler.front(queue.name, 100)
+    order, times = context.reconciler.admission.front(queue.name, 100)
     jobs = [{"jobArn": job_arn(job), "earliestTimeAtPosition": times.get(job, now())} for job in order]
     return {
         "frontOfQueue": {"jobs": jobs, "lastUpdatedAt": now()},

@@ -120,7 +120,7 @@ def _row(reconciler: Reconciler, job: Job) -> tuple[dict[str, Any], _Training | 
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "statusReason": reconciler.reason(job) or job.status_reason,
+        "statusReason": reconciler.admission.reason(job) or job.status_reason,
         "queue": job.queue,
         "owner": job.owner,
         "run": job.run,

@@ -111,7 +111,7 @@ def _counts(session: Session) -> dict[str, dict[str, int]]:
 
 def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> list[dict[str, Any]]:
     """The jobs of a queue that start next, in their order, with why each waits and since when [Unix ms]."""
-    order, times = reconciler.front(queue, most)
+    order, times = reconciler.admission.front(queue, most)
     jobs = {job.id: job for job in session.scalars(select(Job).where(Job.id.in_(order)))}
     waiting = [jobs[each] for each in order if each in jobs and jobs[each].status == Status.RUNNABLE]
     return [
@@ -120,7 +120,7 @@ def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> l
             "name": job.name,
             "owner": job.owner,
             "share": job.share,
-            "reason": reconciler.reason(job) or job.status_reason,
+            "reason": reconciler.admission.reason(job) or job.status_reason,
             "since": times.get(job.id),
         }
         for job in waiting

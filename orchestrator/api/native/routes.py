@@ -157,7 +157,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 "runIsReplaced": is_replaced,
                 "kind": job_list.kind_of(gang.spec),
                 "status": job.status,
-                "statusReason": reconciler.reason(job) or job.status_reason,
+                "statusReason": reconciler.admission.reason(job) or job.status_reason,
                 "queue": job.queue,
                 "share": job.share,
                 "createdAt": job.created_at,
