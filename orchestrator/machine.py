@@ -21,10 +21,6 @@ class PoolFull(Exception):
     """All threads of a pool are busy, and no more calls may wait; the message says since when."""
 
 
-class Overdue(Exception):
-    """A call has not returned in time; its thread is still busy with it."""
-
-
 class Pool(Protocol):
     """Carries out calls that may hang, on a bounded number of threads."""
 
