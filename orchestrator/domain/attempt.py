@@ -164,7 +164,7 @@ def step(state: State, event: Event) -> Instructions:
         case Phase.LAUNCHING, Due():
             return (Launch(again=state.verdict is None and state.stop_reason is None),)
         case Phase.LAUNCHING, Launched(handle):
-            return Keep(handle), Save()
+            return Keep(handle), Save(), Observe()
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
             return (WindUp(),)
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
