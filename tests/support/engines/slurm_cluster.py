@@ -149,7 +149,7 @@ class SlurmCluster:
         wait_for(idle, 30, "all nodes are idle")
 
     def begin_anew(self) -> None:
-        """All daemons without a memory: what one test left does not fail those after it."""
+        """Restart all daemons with an empty state, so that a test which broke the cluster does not fail the next one."""
         self.close()
         shutil.rmtree(self.home / "state")
         (self.home / "state").mkdir()
@@ -186,7 +186,7 @@ class SlurmCluster:
         return done.stdout.strip()
 
     def shown(self) -> str:
-        """Its nodes, jobs and processes, for whoever looks for a test's fault."""
+        """The cluster's nodes, jobs and processes, as text for an error message."""
         answers = [
             self.run(*words, check=False) for words in (("sinfo", "-N", "-o", "%N %T %E"), ("squeue", "-t", "all"))
         ]
