@@ -36,6 +36,7 @@ from orchestrator.domain.attempt_events import (
     LaunchRefused,
     Preempted,
     Prepared,
+    PrepareDelayed,
     PrepareRefused,
 )
 from orchestrator.domain.attempt_instructions import (
@@ -119,7 +120,7 @@ class Attempts:
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
         self._memories: dict[tuple[str, int], _Memory] = {}
         self._pool = machine.pool("store", _READERS)
-        self._errands = Errands(self._pool, changed)
+        self._errands = Errands(self._pool, str(runs.store.path), changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
         self._stops = Stops(engine, changed, log)
 
@@ -252,14 +253,16 @@ class Attempts:
                 self._close(session, job, attempt, instruction)
         return None
 
-    def _prepare(self, session: Session, job: Job, attempt: Attempt) -> Prepared | PrepareRefused | Delayed | None:
+    def _prepare(
+        self, session: Session, job: Job, attempt: Attempt
+    ) -> Prepared | PrepareDelayed | PrepareRefused | Delayed | None:
         """Look at the run, record its owner, then take it."""
         memory, key = self._memory(attempt), (job.id, attempt.number)
         try:
             if memory.run is None:
                 memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run), again=False)
             if (run := memory.run) is None:
-                return None
+                return self._errands.delayed(key)
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
             known = list(session.scalars(select(Attempt.epoch).join(Job).where(Job.run == job.run)))
             if run.epoch not in known and run.writer:
@@ -272,10 +275,10 @@ class Attempts:
             taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim)
             epoch = self._errands.result(key, "claim", taking, again=False)
         except StoreUnavailable as error:
-            return Delayed(str(error))
+            return PrepareDelayed(str(error))
         except (RunRefused, ValueError) as error:
             return PrepareRefused(str(error))
-        return Prepared(epoch) if epoch is not None else None
+        return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
 
     def _launch(self, session: Session, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:

@@ -51,7 +51,8 @@ class Observer:
         if status is None:
             return None  # the engine's first look is under way
         if not self.know_outcomes(job, attempt, status):
-            return self._errands.delayed((job.id, attempt.number))
+            away = next((node.words or node.stale for node in status if node.phase is NodePhase.UNREACHABLE or node.stale), "")
+            return self._errands.delayed((job.id, attempt.number), away)
         ends = self.ends(job, attempt, status)
         head = status[job.gang.main]
         return Observed(
@@ -98,7 +99,7 @@ class Observer:
         reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, nodes)
         found = self._errands.result((job.id, attempt.number), "outcomes", reading)
         if found is None:
-            if self._errands.trouble((job.id, attempt.number)):
+            if self._errands.failure((job.id, attempt.number)):
                 memory.asked = None
             return not ended
         memory.asked, memory.checked = None, began

@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from math import inf
 from typing import Any, TypeVar
 
+from orchestrator import machine
 from orchestrator.control.peers import Peers
 from orchestrator.domain.attempt_events import Delayed
 from orchestrator.engines.toolkit.backoff import Backoff
@@ -29,6 +31,8 @@ log = logging.getLogger("muster.controller")
 T = TypeVar("T")
 Key = tuple[str, int]
 """Job and number of an attempt."""
+OVERDUE = 10.0
+"""Seconds after which a store whose call has not returned counts as not answering."""
 
 
 class StoreUnavailable(Exception):
@@ -143,10 +147,11 @@ class RunStore:
 class Errands:
     """Calls on the store for attempts: one at a time for each attempt, on a pool. The loop collects the results, and never waits."""
 
-    def __init__(self, pool: Pool, changed: Callable[[str], None]) -> None:
-        """``changed``: called, on any thread, with the job whose result is there."""
-        self._pool, self._changed = pool, changed
-        self._under_way: dict[Key, tuple[str, Future[Any]]] = {}
+    def __init__(self, pool: Pool, store: str, changed: Callable[[str], None]) -> None:
+        """``store``: its path, for messages; ``changed``: called, on any thread, with the job whose result is there."""
+        self._pool, self._store, self._changed = pool, store, changed
+        self._under_way: dict[Key, tuple[str, Future[Any], float]] = {}
+        """By attempt: the name of its errand, the result, and since when it is under way (monotonic [s])."""
         self._failing = Backoff(log)
 
     def result(self, key: Key, name: str, body: Callable[[], T], again: bool = True) -> T | None:
@@ -165,10 +170,10 @@ class Errands:
         if under_way is None:
             if not self._failing.waits(key):
                 future = self._pool.submit(body)
-                self._under_way[key] = name, future
+                self._under_way[key] = name, future, machine.monotonic()
                 future.add_done_callback(lambda _: self._changed(key[0]))
             return None
-        started, future = under_way
+        started, future, _ = under_way
         if not future.done():
             return None
         del self._under_way[key]
@@ -182,17 +187,29 @@ class Errands:
         self._failing.worked(key)
         return result if started == name else self.result(key, name, body, again)
 
-    def delayed(self, key: Key) -> Delayed | None:
-        """That the store could not be used for the attempt the last time, as an event."""
-        return Delayed(trouble) if (trouble := self.trouble(key)) else None
+    def delayed(self, key: Key, more: str = "") -> Delayed | None:
+        """That the store does not answer, or could not be used for the attempt the last time, as an event; ``more``: what else is amiss."""
+        reason = "; ".join(each for each in (more, self._silence(key) or self.failure(key)) if each)
+        return Delayed(reason) if reason else None
 
-    def trouble(self, key: Key) -> str | None:
-        """Why the store could not be used for the attempt the last time; None where it could."""
-        return said.removeprefix(f"job {key[0]}: ") if (said := self._failing.said(key)) else None
+    def failure(self, key: Key) -> str:
+        """Why the store could not be used for the attempt the last time; empty where it could."""
+        return (self._failing.said(key) or "").removeprefix(f"job {key[0]}: ")
 
     def pause(self, key: Key) -> float:
-        """Seconds until the store is tried again for the attempt; infinity while a call is under way."""
-        return inf if key in self._under_way else self._failing.pause(key)
+        """Seconds until the store is tried again for the attempt, or is overdue; then infinity until it answers."""
+        if key not in self._under_way:
+            return self._failing.pause(key)
+        left = self._under_way[key][2] + OVERDUE - machine.monotonic()
+        return left if left > 0 else inf
+
+    def _silence(self, key: Key) -> str:
+        """That the store does not answer, and since when; empty while it does, or is not overdue."""
+        since = self._under_way[key][2] if key in self._under_way else inf
+        if (passed := machine.monotonic() - since) < OVERDUE:
+            return ""
+        began = datetime.fromtimestamp(machine.wall() - passed, UTC)
+        return f"store {self._store} has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
 
     def forget(self, key: Key) -> None:
         """The attempt is closed."""

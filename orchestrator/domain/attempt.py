@@ -21,6 +21,7 @@ from orchestrator.domain.attempt_events import (
     Observed,
     Preempted,
     Prepared,
+    PrepareDelayed,
     PrepareRefused,
     Silence,
 )
@@ -157,7 +158,7 @@ def step(state: State, event: Event) -> Instructions:
             return (Prepare(),)
         case Phase.PREPARING, Prepared(epoch):
             return TakeEpoch(epoch), Save(), Launch()
-        case Phase.PREPARING, Delayed(reason):
+        case Phase.PREPARING, PrepareDelayed(reason):
             return (Withdraw(reason),)
         case Phase.PREPARING, PrepareRefused(reason):
             return Decide(Verdict(Ending.FATAL, reason)), WindUp()

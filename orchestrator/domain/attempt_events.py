@@ -90,8 +90,15 @@ class Observed:
 
 
 @dataclass(frozen=True)
+class PrepareDelayed:
+    """The run can't be taken now, and nothing that was asked of the store is under way."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
 class Delayed:
-    """The store can't be used now, or the gang can't be stopped; that is tried again."""
+    """The store can't be used now or does not answer, or the gang can't be stopped; that is tried again, or waited for."""
 
     reason: str
 
@@ -109,5 +116,15 @@ class Gone:
 
 
 Event = (
-    Due | Prepared | PrepareRefused | Launched | LaunchDelayed | LaunchRefused | Preempted | Observed | Delayed | Gone
+    Due
+    | Prepared
+    | PrepareDelayed
+    | PrepareRefused
+    | Launched
+    | LaunchDelayed
+    | LaunchRefused
+    | Preempted
+    | Observed
+    | Delayed
+    | Gone
 )

@@ -9,7 +9,7 @@ from orchestrator.domain.job import Status, Verdict
 
 @dataclass(frozen=True)
 class Prepare:
-    """Create the run where it is missing, and give it to the attempt: → Prepared, PrepareRefused or Delayed, or nothing yet."""
+    """Create the run where it is missing, and give it to the attempt: → Prepared, PrepareDelayed or PrepareRefused; Delayed or nothing yet."""
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,7 @@ class Cluster:
         )
         found.nodes = [SimulatedNode(found, index, each.host) for index, each in enumerate(gang.placements)]
         self.gangs[gang.name] = found
+        self._world.invariants.launched(found)
         for node in found.nodes:
             self._world.notice(node, self._rng.uniform(0.5, 3.0))
         self._machine.after(self._world.job(gang.job).breaks[gang.attempt - 1], lambda: self._break(found))

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _TOLD = 150.0
 """Seconds within which a controller notices whether its engine answers: the longest pause between two looks, and some more."""
+_SEEN = 30.0
+"""Seconds within which a gang whose engine answers is seen to run, whatever the bus and the store do."""
 _SLACK = 5.0
 """Seconds by which an end may be early: as long as clocks and leases are rounded."""
 
@@ -31,8 +33,12 @@ class Invariants:
         self._world = world
         self._state: tuple[int, bool, bool] | None = None
         """The controller's process, and whether its engine and its database are away."""
-        self._since: float | None = None
-        """Since when that is so [s]; None once it was checked."""
+        self._since = 0.0
+        """Since when that is so [s]."""
+        self._is_checked = False
+        """What reasons say of the engine was checked since then."""
+        self._launched: list[SimulatedGang] = []
+        """Gangs that have not been seen to run yet."""
 
     def check_launch(self, gang: Gang, same_process: bool) -> None:
         """Never two writers, nothing without its run, and nothing that is to end (but another process can't take back its request)."""
@@ -44,6 +50,11 @@ class Invariants:
         ending, _ = self._attempt(gang.job, gang.attempt)
         if ending is not None and same_process:
             raise Violation(f"{gang.name} is launched, although it is {ending}")
+
+    def launched(self, gang: SimulatedGang) -> None:
+        """A gang that is to be seen soon."""
+        if not (self._world.engine_down or self._world.database_down):
+            self._launched.append(gang)
 
     def check_cause(self, gang: SimulatedGang) -> None:
         """No gang is ended without a cause."""
@@ -94,14 +105,15 @@ class Invariants:
             raise Violation(f"{job.name} is FAILED ({reason}) after {spent} of {job.attempts} attempts")
 
     def check_reachable(self, process: int) -> None:
-        """Once the engine has answered, or not, for a while: a RUNNING gang says that it does not, and only then."""
+        """Once the engine has answered, or not, for a while: a RUNNING gang says that it does not, and only then; a new one is seen."""
         world = self._world
         state = process, world.engine_down, world.database_down
         if state != self._state:
-            self._state, self._since = state, world.machine.time
-        if self._since is None or world.machine.time - self._since < _TOLD:
+            self._state, self._since, self._is_checked, self._launched = state, world.machine.time, False, []
+        self._check_seen()
+        if self._is_checked or world.machine.time - self._since < _TOLD:
             return
-        began, self._since = self._since, None
+        began, self._is_checked = self._since, True
         rows = world.memory.execute(
             "SELECT jobs.name, jobs.status_reason, attempts.running_since FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
             " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NULL AND attempts.ending IS NULL"
@@ -111,10 +123,21 @@ class Invariants:
             seen = [gang for gang in world.cluster.gangs.values() if gang.run == name and gang.launched < began - _TOLD]
             if running is None or not seen or job.stop_asked:
                 continue
+            if world.engine_down and not any(gang.running for gang in seen):
+                continue  # the engine is not needed any more
             if (AWAY in reason) != world.engine_down:
                 raise Violation(
                     f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_down or 'answers'}"
                 )
+
+    def _check_seen(self) -> None:
+        """A gang that runs is RUNNING soon after its launch."""
+        while self._launched and self._world.machine.time - self._launched[0].launched > _SEEN:
+            gang = self._launched.pop(0)
+            query = "SELECT status, status_reason FROM jobs WHERE id = ?"
+            status, reason = self._world.memory.execute(query, (gang.job,)).fetchone()
+            if gang.nodes[0].alive and status == Status.STARTING:
+                raise Violation(f"{gang.name} runs, and its job is {status} ({reason})")
 
     def _attempt(self, job_id: str, number: int) -> tuple[str | None, str | None]:
         query = "SELECT ending, status_reason FROM attempts WHERE job_id = ? AND number = ?"

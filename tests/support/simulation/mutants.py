@@ -12,7 +12,7 @@ from orchestrator.control import attempts, endings
 from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, RunStore
 from orchestrator.domain import attempt as rules
-from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Silence
+from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Launched, Silence
 from orchestrator.domain.attempt_instructions import Explain, Instructions, Launch
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
@@ -76,6 +76,17 @@ def what_is_to_end_is_launched() -> Mutant:
     return mock.patch.object(attempts, "step", stepped)
 
 
+def a_launched_gang_waits_for_its_look() -> Mutant:
+    """A gang is launched, and nobody looks at it until the next look at an attempt for which nothing is due."""
+    step = rules.step
+
+    def stepped(state: rules.State, event: Event) -> Instructions:
+        done = step(state, event)
+        return done[:-1] if isinstance(event, Launched) and done else done
+
+    return mock.patch.object(attempts, "step", stepped)
+
+
 def any_volume_is_the_store() -> Mutant:
     """T1: what is missing on another volume counts as missing."""
     init = RunStore.__init__
@@ -103,6 +114,7 @@ MUTANTS: Mapping[str, Callable[[], Mutant]] = {
     "B3": the_loop_shares_its_connections,
     "B4": the_loop_reads_the_store,
     "B9": what_is_to_end_is_launched,
+    "look": a_launched_gang_waits_for_its_look,
     "T1": any_volume_is_the_store,
     "T2": without_an_outcome_is_killed,
 }

@@ -20,6 +20,7 @@ from orchestrator.domain.attempt_events import (
     Observed,
     Preempted,
     Prepared,
+    PrepareDelayed,
     PrepareRefused,
     Silence,
 )
@@ -116,7 +117,8 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         PrepareRefused("it is damaged"),
         [Decide(Verdict(Ending.FATAL, "it is damaged")), WindUp()],
     ),
-    "while its run can't be read, others may have its room": (PREPARING, Delayed("away"), [Withdraw("away")]),
+    "while its run can't be read, others may have its room": (PREPARING, PrepareDelayed("away"), [Withdraw("away")]),
+    "but not while a call on the store is under way": (PREPARING, Delayed("silent"), [Explain("silent")]),
     "one that is not needed takes nothing": (asked(PREPARING), Due(), [Decide(STOPPED), WindUp()]),
     "nor one that was preempted": (ending(Ending.PREEMPTED, of=PREPARING), Due(), [WindUp()]),
     "the scheduler may take its place": (PREPARING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
@@ -308,6 +310,7 @@ EVENTS = (
     *(
         Due(),
         Prepared(7),
+        PrepareDelayed("why"),
         PrepareRefused("why"),
         Launched("handle"),
         LaunchDelayed("why", False),

@@ -27,7 +27,10 @@ silences = st.just([None] * NODES) | st.lists(st.none() | silence, min_size=NODE
 words = st.sampled_from(["", "words"])
 delays = st.builds(attempt_events.LaunchDelayed, words, st.booleans())
 prepared = st.just(attempt_events.Prepared(7))
-prepares = st.one_of(prepared, prepared, prepared, st.none(), st.just(attempt_events.PrepareRefused("refused")))
+prepares = st.one_of(
+    *[prepared] * 3,
+    *(st.none(), st.just(attempt_events.Delayed("silent")), st.just(attempt_events.PrepareRefused("refused"))),
+)
 launches = st.one_of(
     *[st.just(attempt_events.Launched("handle"))] * 4, delays, st.just(attempt_events.LaunchRefused("refused"))
 )
