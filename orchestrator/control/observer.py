@@ -51,7 +51,9 @@ class Observer:
         if status is None:
             return None  # the engine's first look is under way
         if not self.know_outcomes(job, attempt, status):
-            away = next((node.words or node.stale for node in status if node.phase is NodePhase.UNREACHABLE or node.stale), "")
+            away = next(
+                (node.words or node.stale for node in status if node.phase is NodePhase.UNREACHABLE or node.stale), ""
+            )
             return self._errands.delayed((job.id, attempt.number), away)
         ends = self.ends(job, attempt, status)
         head = status[job.gang.main]

@@ -52,6 +52,8 @@ class Presence:
         self.lost_after, self._monotonic, self._wall = lost_after, monotonic, wall
         self._lock = threading.Lock()
         self._expected: dict[tuple[str, int], int] = {}
+        self._unmet: dict[tuple[str, int], float] = {}
+        """Attempts of which no node has come or ended yet, and since when they are expected."""
         self._nodes: dict[Node, _Heard] = {}
         self._silent = 0
         """How many of them are silent."""
@@ -66,6 +68,8 @@ class Presence:
     def expect(self, job: str, attempt: int, nodes: int) -> None:
         """Note an attempt's nodes from now on, until :meth:`forget`."""
         with self._lock:
+            if (job, attempt) not in self._expected:
+                self._unmet[job, attempt] = self._monotonic()
             self._expected[job, attempt] = nodes
 
     def expects(self, node: Node) -> bool:
@@ -145,6 +149,7 @@ class Presence:
     def _set(self, node: Node, heard: _Heard | None) -> None:
         """Note what is known of a node; None: nothing."""
         self._note_deafness()
+        self._unmet.pop(node[:2], None)
         before = self._nodes.pop(node, None)
         if heard is not None:
             self._nodes[node] = heard
@@ -170,6 +175,9 @@ class Presence:
             return f"none of {nodes} nodes is heard, so the controller may be cut off"
         if nodes == 1 and not self._hears_itself:
             return "the bus does not hear the controller either"
+        gone = next(iter(self._nodes.values())).gone
+        if nodes == 1 and gone is not None and any(since > gone for since in self._unmet.values()):
+            return "no node of the gangs that were launched since is heard, so the controller may be cut off"
         return None
 
     def _silent_together(self) -> int:

@@ -298,10 +298,12 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
             return to(Status.FAILED, f"{state.stop_reason}{progress}" if native else state.stop_reason)
         case Ending.SUCCEEDED:
             return to(Status.SUCCEEDED, verdict.reason)
-        case Ending.PREEMPTED if (
+        case Ending.PREEMPTED | Ending.LOST if (
             head is not None and head.exit_code == 0
         ):  # to leave with work to do is 75, or a signal's
-            return to(Status.SUCCEEDED, "done before it was preempted")
+            return to(
+                Status.SUCCEEDED, f"done before it was {'preempted' if ending == Ending.PREEMPTED else 'stopped'}"
+            )
         case Ending.PREEMPTED:
             return to(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
         case Ending.REQUEUE if is_free or is_left:

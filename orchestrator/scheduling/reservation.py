@@ -75,12 +75,15 @@ def reserve(job: Waiting, ces: tuple[str, ...], free: FreeResources, holders: It
         holders: Every gang that holds resources.
     """
     hosts = free.reach(ces)
-    ends = sorted(
+    near = (
         each for each in holders if each.compute_environment in ces or any(p.host in hosts for p in each.placements)
     )
+    # what is being stopped before what is overdue: a job gets the room of the gangs that were stopped for it, and no other
+    ends = sorted(near, key=lambda each: (each.end, not each.ending, each))
     count = _fewest(job.shape, ces, free, [(each.compute_environment, each.placements) for each in ends])
     at = ends[count - 1].end if count else inf
-    while count < len(ends) and ends[count].end == at < inf:  # gangs that end at the same time make room for others
+    while count < len(ends) and ends[count].end == at < inf and ends[count].ending == ends[count - 1].ending:
+        # gangs that end at the same time make room for others
         count += 1
     then = free.copy()
     for each in ends[:count]:

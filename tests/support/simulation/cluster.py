@@ -77,8 +77,8 @@ class Cluster:
     def __init__(self, world: Simulation) -> None:
         self._world, self._machine, self._rng = world, world.machine, world.rng
         self.gangs: dict[str, SimulatedGang] = {}
-        self._asked: dict[str, tuple[float, int]] = {}
-        """When each launch was asked for first, and by which process of the controller."""
+        self._asked: dict[str, float] = {}
+        """When each launch was asked for first."""
 
     @property
     def running(self) -> list[SimulatedNode]:
@@ -86,14 +86,14 @@ class Cluster:
 
     def pulls(self, gang: Gang) -> bool:
         """Whether its image is still being pulled: since its launch was asked for."""
-        since, _ = self._asked.setdefault(gang.name, (self._machine.time, self._machine.process))
+        since = self._asked.setdefault(gang.name, self._machine.time)
         return gang.name not in self.gangs and self._machine.time - since < self._world.job(gang.job).pulling
 
     def launch(self, gang: Gang) -> None:
         """Start it, once for a name."""
         if gang.name in self.gangs:
             return
-        self._world.invariants.check_launch(gang, same_process=self._asked[gang.name][1] == self._machine.process)
+        self._world.invariants.check_launch(gang)
         found = SimulatedGang(
             gang.name, gang.job, gang.attempt, gang.epoch, gang.run, self._world.router, self._machine.time
         )

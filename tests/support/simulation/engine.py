@@ -41,6 +41,7 @@ class SimulatedEngine:
         return Hosts([Host(f"{self.name}/h{index}", CORES, (), 64_000) for index in range(HOSTS)])
 
     def plan(self, gang: Gang) -> Plan[Gang]:
+        self._world.invariants.check_request(gang)
         addresses = [f"10.0.0.{index + 1}" for index in range(len(gang.commands))]
         return Plan(gang, node_plans(gang, addresses, 29500), gang)
 

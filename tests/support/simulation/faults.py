@@ -69,6 +69,8 @@ def _break_bus(world: Simulation, seconds: float) -> None:
         for node in world.cluster.running:
             world.notice(node, world.rng.uniform(0.5, _LEASE))
 
+    if not world.bus_down:
+        world.bus_down_since = world.machine.time
     _during(world, seconds, "bus_down")
     notice()
     world.machine.after(seconds + 0.1, notice)
@@ -113,7 +115,7 @@ def isolate_node(world: Simulation, rng: Random) -> None:
 
 
 def _silence(world: Simulation, rng: Random, how: str) -> None:
-    if (node := _some_node(world, rng)) is None:
+    if (node := _some_node(world, rng)) is None or node.silent_since is not None:
         return
     seconds = _seconds(rng)
     world.note(f"{node} is {how} for {seconds:.0f} s")

@@ -10,6 +10,7 @@ from orchestrator.engines.api import Gang
 from tests.support.simulation.cluster import SimulatedGang
 from tests.support.simulation.engine import AWAY
 from tests.support.simulation.jobs import SimulatedJob
+from tests.support.simulation.machine import Violation
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
@@ -22,12 +23,8 @@ _SLACK = 5.0
 """Seconds by which an end may be early: as long as clocks and leases are rounded."""
 
 
-class Violation(AssertionError):
-    """Something does not hold that always must."""
-
-
 class Invariants:
-    """Checks, by what is true in the cluster and what the database says. Each raises :class:`Violation`."""
+    """Checks, by what is true in the cluster and what the database says. Each raises :class:`tests.support.simulation.machine.Violation`."""
 
     def __init__(self, world: Simulation) -> None:
         self._world = world
@@ -40,16 +37,19 @@ class Invariants:
         self._launched: list[SimulatedGang] = []
         """Gangs that have not been seen to run yet."""
 
-    def check_launch(self, gang: Gang, same_process: bool) -> None:
-        """Never two writers, nothing without its run, and nothing that is to end (but another process can't take back its request)."""
+    def check_request(self, gang: Gang) -> None:
+        """The launch of nothing that is to end is asked for."""
+        ending, _ = self._attempt(gang.job, gang.attempt)
+        if ending is not None:
+            raise Violation(f"{gang.name} is to be launched, although it is {ending}")
+
+    def check_launch(self, gang: Gang) -> None:
+        """Never two writers, and nothing without its run."""
         if gang.run not in self._world.volume.runs:
             raise Violation(f"{gang.name} is launched, and the store does not have its run")
         for other in self._world.cluster.gangs.values():
             if other.run == gang.run and any(self._world.cluster.can_write(node) for node in other.running):
                 raise Violation(f"{gang.name} is launched while {other.name} runs")
-        ending, _ = self._attempt(gang.job, gang.attempt)
-        if ending is not None and same_process:
-            raise Violation(f"{gang.name} is launched, although it is {ending}")
 
     def launched(self, gang: SimulatedGang) -> None:
         """A gang that is to be seen soon."""
@@ -64,6 +64,10 @@ class Invariants:
         if job.timeout is not None and moment - gang.launched > job.timeout - _SLACK:
             return
         silences = [node.silent_since for node in gang.nodes if node.silent_since is not None]
+        if (
+            self._world.bus_down and self._world.heard <= 1
+        ):  # whether the only node or the router is cut off can't be told
+            silences.append(self._world.bus_down_since)
         if any(moment - since > LOST_AFTER - _SLACK for since in silences):
             return
         ending, reason = self._attempt(gang.job, gang.attempt)

@@ -15,6 +15,10 @@ from orchestrator.machine import Machine, Pool
 T = TypeVar("T")
 
 
+class Violation(BaseException):
+    """Something does not hold that always must. Not an Exception, which the control plane would take for a fault of an engine."""
+
+
 class Crash(BaseException):
     """The controller's process is killed at this point."""
 
@@ -125,6 +129,8 @@ class SimulatedPool:
         error: BaseException | None = None
         try:
             result = body()
+        except Violation:
+            raise  # to those who look at the world, past those who would collect the result
         except BaseException as raised:
             error = raised
         machine.sleep(takes - before)

@@ -20,9 +20,9 @@ from tests.support.simulation.cluster import Cluster, SimulatedNode
 from tests.support.simulation.database import SimulatedDatabase, new_memory
 from tests.support.simulation.engine import SimulatedEngine
 from tests.support.simulation.faults import draw_fault
-from tests.support.simulation.invariants import Invariants, Violation
+from tests.support.simulation.invariants import Invariants
 from tests.support.simulation.jobs import SUBMITTING, SimulatedJob, draw_job
-from tests.support.simulation.machine import Crash, LoopWaits, SimulatedMachine
+from tests.support.simulation.machine import Crash, LoopWaits, SimulatedMachine, Violation
 from tests.support.simulation.store import SimulatedDisk, SimulatedRunStore, Volume
 
 JOBS = range(50)
@@ -51,6 +51,8 @@ class Simulation:
         self.cluster = Cluster(self)
         self.invariants = Invariants(self)
         self.engine_down = self.bus_down = self.database_down = False
+        self.bus_down_since = 0.0
+        """Since when the bus is down, or was the last time [s]."""
         self.crowded = False
         """Requests hold every connection to the database that they can get."""
         self.in_loop = False
@@ -184,6 +186,11 @@ class Simulation:
         return self.rng.choice((0.002, 0.01, 0.05, 0.3, 1.5)) if not pool.startswith("stop") else 0.01
 
     # -- the bus ------------------------------------------------------------------------------------------------------
+
+    @property
+    def heard(self) -> int:
+        """How many nodes the controller's router has met, and does not know to have ended."""
+        return len(self._bus.presence._nodes) if self._bus is not None else 0
 
     def hears(self, node: SimulatedNode) -> bool:
         """Whether the controller's router hears the node."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from tests.support.simulation.invariants import Violation
+from tests.support.simulation.machine import Violation
 from tests.support.simulation.run import FAULTS, JOBS, simulate
 
 

@@ -91,6 +91,21 @@ def test_where_the_controller_may_be_cut_off_nodes_are_unreachable_for_a_long_ti
     assert cluster.lost() == silent
 
 
+def test_where_gangs_that_are_launched_meanwhile_are_not_heard_either_the_router_s_own_voice_proves_nothing() -> None:
+    cluster = Cluster(1)
+    cluster.presence.expect("pulls its image", 1, 1)
+    cluster.silence(0)
+    cluster.wait(100)
+    cluster.presence.expect("next", 1, 1)
+    cluster.wait(300)
+    assert cluster.lost() == [] and "launched since" in (cluster.presence.cut_off or "")
+    cluster.presence.ended(("next", 1, 0))
+    cluster.wait(L)
+    assert cluster.lost() == []
+    cluster.wait(1)
+    assert cluster.lost() == [0], "by itself for its whole time"
+
+
 def test_ten_minutes_of_outage_end_nothing_though_the_nodes_come_back_one_by_one() -> None:
     cluster = Cluster(8)
     for index in range(8):

@@ -284,6 +284,7 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "over time when it was asked to stop": (asked(ending(Ending.TIMEOUT)), (), SPENT, S.FAILED, "why"),
     "preempted": (ending(Ending.PREEMPTED), BOTH_LEFT, FREE, S.RUNNABLE, PREEMPTED_SO),
     "preempted before its launch": (ending(Ending.PREEMPTED, of=LAUNCHING), (), FREE, S.RUNNABLE, PREEMPTED_SO),
+    "done before it was stopped": (ending(Ending.LOST), MAIN_LAST, SPENT, S.SUCCEEDED, "done before it was stopped"),
     "done before it was preempted": (ending(Ending.PREEMPTED), MAIN_LAST, FREE, S.SUCCEEDED, DONE_SO),
     "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=2), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
     "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),

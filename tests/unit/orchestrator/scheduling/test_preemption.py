@@ -104,6 +104,14 @@ def test_no_more_are_preempted_than_needed_and_none_while_some_stop() -> None:
     assert [report.preempts(each.job) for each in held] == [False, True]
 
 
+def test_nothing_starts_where_a_job_waits_for_the_gang_that_it_preempts_though_another_one_is_overdue() -> None:
+    overdue = running("overdue", on("a", 2), on("b", 2), on("c", 2), queue="high", timeout=1, for_seconds=9)
+    held = [overdue, cart(2, host="b"), running("fixed", on("a", 2), queue="high")]
+    waiting = [job("ant", gang(node(2), node(2)), queue="high"), job("small", 2, queue="low")]
+    decided = Pass([host("a"), host("b"), host("c")], waiting, held, HIGH)
+    assert (decided.preempted, decided.starts) == ("cart", ())
+
+
 def test_in_a_share_a_higher_priority_preempts_a_lower_one() -> None:
     for share, priority, expected in (("s", 2, "cart"), ("s", 1, ""), (None, 2, "cart")):
         waiting, held = [job("ant", share=share, priority=priority)], [cart(queue="default", share=share, priority=1)]
