@@ -27,8 +27,8 @@ class _Seen:
 
     outcomes: dict[int, Outcome | None] = field(default_factory=dict)
     """Of nodes that have ended, by index; None for one that has left none."""
-    asked: tuple[float, list[int]] | None = None
-    """Those that are being read: since when (monotonic [s]), and of which nodes."""
+    asked: tuple[float, list[int], list[int]] | None = None
+    """Those that are being read: since when (monotonic [s]), of nodes that had ended by then, and of others."""
     checked: float | None = None
     """When they were read last (monotonic [s])."""
 
@@ -96,17 +96,18 @@ class Observer:
         ]
         if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < _CHECK_INTERVAL)):
             return True
-        memory.asked = memory.asked or (moment, [*ended, *hidden])
-        began, nodes = memory.asked
-        reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, nodes)
+        memory.asked = memory.asked or (moment, ended, hidden)
+        began, over, others = memory.asked
+        reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, [*over, *others])
         found = self._errands.result((job.id, attempt.number), "outcomes", reading)
         if found is None:
             if self._errands.failure((job.id, attempt.number)):
                 memory.asked = None
             return not ended
         memory.asked, memory.checked = None, began
-        memory.outcomes |= {index: found.get(index) for index in nodes if index in ended or index in found}
-        return all(index in memory.outcomes for index in ended)
+        # a node that has ended since may have left its outcome after it was looked for
+        memory.outcomes |= {**dict.fromkeys(over), **found}
+        return all(index in memory.outcomes for index in ended) or self.know_outcomes(job, attempt, status)
 
     def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node; noted in the attempt's record with the other facts about its nodes."""

@@ -38,6 +38,8 @@ class SimulatedNode:
     """It was asked to end."""
     silent_since: float | None = None
     """Since when it is frozen or isolated [s]."""
+    was_silent: float = 0.0
+    """For how long it was, the longest time that is over [s]."""
 
     def __str__(self) -> str:
         return f"{self.gang.name} node {self.index}"

@@ -125,7 +125,7 @@ def _silence(world: Simulation, rng: Random, how: str) -> None:
 
     def back() -> None:
         setattr(node, how, False)
-        node.silent_since = None
+        node.was_silent, node.silent_since = max(node.was_silent, seconds), None
         world.notice(node, rng.uniform(0.2, 5.0))
 
     world.machine.after(seconds, back)

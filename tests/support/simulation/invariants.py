@@ -34,14 +34,18 @@ class Invariants:
         """Since when that is so [s]."""
         self._is_checked = False
         """What reasons say of the engine was checked since then."""
+        self._requests: set[tuple[int, str]] = set()
+        """Processes of the controller, and the gangs whose launch each has asked for."""
         self._launched: list[SimulatedGang] = []
         """Gangs that have not been seen to run yet."""
 
     def check_request(self, gang: Gang) -> None:
-        """The launch of nothing that is to end is asked for."""
+        """The launch of nothing that is to end is asked for, except once by a process that can't know whether an earlier one had it launched."""
         ending, _ = self._attempt(gang.job, gang.attempt)
-        if ending is not None:
+        request = self._world.machine.process, gang.name
+        if ending is not None and request in self._requests:
             raise Violation(f"{gang.name} is to be launched, although it is {ending}")
+        self._requests.add(request)
 
     def check_launch(self, gang: Gang) -> None:
         """Never two writers, and nothing without its run."""
@@ -63,12 +67,13 @@ class Invariants:
             return
         if job.timeout is not None and moment - gang.launched > job.timeout - _SLACK:
             return
-        silences = [node.silent_since for node in gang.nodes if node.silent_since is not None]
-        if (
-            self._world.bus_down and self._world.heard <= 1
-        ):  # whether the only node or the router is cut off can't be told
-            silences.append(self._world.bus_down_since)
-        if any(moment - since > LOST_AFTER - _SLACK for since in silences):
+        silences = [moment - node.silent_since for node in gang.nodes if node.silent_since is not None]
+        silences += [node.was_silent for node in gang.nodes]  # the engine may have been away since it was decided
+        if self._world.bus_down and self._world.heard <= 1:
+            silences.append(
+                moment - self._world.bus_down_since
+            )  # it can't be told who is cut off: the node or the router
+        if any(seconds > LOST_AFTER - _SLACK for seconds in silences):
             return
         ending, reason = self._attempt(gang.job, gang.attempt)
         if ending != "preempted" or job.urgent:
@@ -140,7 +145,7 @@ class Invariants:
             gang = self._launched.pop(0)
             query = "SELECT status, status_reason FROM jobs WHERE id = ?"
             status, reason = self._world.memory.execute(query, (gang.job,)).fetchone()
-            if gang.nodes[0].alive and status == Status.STARTING:
+            if all(node.alive for node in gang.nodes) and status == Status.STARTING:
                 raise Violation(f"{gang.name} runs, and its job is {status} ({reason})")
 
     def _attempt(self, job_id: str, number: int) -> tuple[str | None, str | None]:

@@ -1,0 +1,108 @@
+"""What the controller makes of the nodes' ends and of the outcomes that they leave, whichever comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from orchestrator.control.observer import Observer
+from orchestrator.control.presence import Presence
+from orchestrator.control.run_store import Errands
+from orchestrator.domain.attempt_events import Observed
+from orchestrator.engines.api import Cause, GangStatus, NodePhase, NodeStatus
+from orchestrator.engines.toolkit.endings import ended
+from orchestrator.persistence.models import Attempt, Node
+from shared_store.outcomes import Outcome
+from tests.support.orchestrator.rows import job
+
+AWAY = NodeStatus(NodePhase.UNREACHABLE, words="the engine is away")
+
+
+class SlowPool:
+    """Calls that return when the test says so."""
+
+    busy_since = None
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Callable[[], Any], Future[Any]]] = []
+
+    def submit(self, body: Callable[[], Any]) -> Future[Any]:
+        self.calls.append((body, Future()))
+        return self.calls[-1][1]
+
+    def close(self, patience: float = 0.0) -> None:
+        self.calls.clear()
+
+    def carry_out(self) -> None:
+        body, future = self.calls.pop()
+        future.set_result(body())
+
+
+class Gang:
+    """A gang of two nodes, the pool for the store, and the outcomes there."""
+
+    def __init__(self) -> None:
+        self.pool, self.written, self.status = SlowPool(), dict[int, Outcome](), list[NodeStatus]()
+        errands = Errands(self.pool, "/store", lambda _: None)
+        engine = SimpleNamespace(observe=lambda _: self.status, asked=lambda _: 0.0)
+        self.observer = Observer(
+            engine,  # type: ignore[arg-type]
+            SimpleNamespace(outcomes=self._outcomes),  # type: ignore[arg-type]
+            errands,
+            SimpleNamespace(presence=Presence()),  # type: ignore[arg-type]
+            SimpleNamespace(now=lambda: 0),  # type: ignore[arg-type]
+        )
+        self.job = job("job")
+        nodes = [Node(index=index, host=f"h{index}") for index in range(2)]
+        self.job.attempts = [Attempt(number=1, epoch=1, job_id="job", handle="{}", nodes=nodes, created_at=0)]
+
+    def _outcomes(self, _run: str, _job: str, _attempt: int, nodes: Sequence[int]) -> dict[int, Outcome]:
+        return {index: self.written[index] for index in nodes if index in self.written}
+
+    def look(self, *status: NodeStatus) -> Any:
+        self.status = list[NodeStatus](status)
+        return self.observer.observe(self.job, self.job.attempts[0])
+
+    def write(self, index: int, code: int) -> None:
+        self.written[index] = Outcome(index, 1, code, None, f"exit {code}", None, 1.0, 2.0)
+
+
+@pytest.mark.parametrize("end", [ended("", None), NodeStatus(NodePhase.ENDED, cause=Cause.EXIT, exit_code=0)])
+def test_an_outcome_that_was_not_there_before_the_node_ended_is_looked_for_again(end: NodeStatus) -> None:
+    gang = Gang()
+    assert isinstance(gang.look(AWAY, AWAY), Observed), "what can't be seen is looked for, and not waited for"
+    gang.pool.carry_out()  # it finds nothing
+    gang.write(0, 0)
+    running: GangStatus = [end, NodeStatus(NodePhase.RUNNING)]
+    assert gang.look(*running) is None
+    gang.pool.carry_out()
+    seen = gang.look(*running)
+    assert isinstance(seen, Observed) and seen.ends[1] is None
+    assert seen.ends[0] is not None and (seen.ends[0].exit_code, seen.ends[0].reason) == (0, "exit 0")
+
+
+def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_without_an_outcome() -> None:
+    gang = Gang()
+    gang.look(AWAY, AWAY)
+    body, future = gang.pool.calls.pop()
+    found = body()  # by now it has read that there is none
+    gang.write(0, 0)
+    future.set_result(found)
+    running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
+    assert gang.look(*running) is None
+    gang.pool.carry_out()
+    seen = gang.look(*running)
+    assert isinstance(seen, Observed) and seen.ends[0] is not None and seen.ends[0].exit_code == 0
+
+
+def test_a_node_that_has_ended_without_an_outcome_was_killed() -> None:
+    gang = Gang()
+    running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
+    assert gang.look(*running) is None
+    gang.pool.carry_out()
+    seen = gang.look(*running)
+    assert isinstance(seen, Observed) and seen.ends[0] is not None and seen.ends[0].exit_code == 137
