@@ -69,14 +69,12 @@ class Observer:
         )
 
     def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
-        """The silence of a node; it counts only where its engine says that it runs, and it has left no outcome."""
+        """The silence of a node, by what its engine and the store say of it."""
         assert attempt.handle is not None
-        checked = self._of(attempt).checked
-        is_seen = status.phase is not NodePhase.UNREACHABLE and not status.stale
-        asked = self._engine.asked(attempt.handle) if is_seen and checked is not None else None
-        if asked is not None and checked is not None:
-            asked = max(asked, machine.monotonic() - checked)
-        return self._bus.presence.silence((attempt.job_id, attempt.number, node.index), asked)
+        checked, asked = self._of(attempt).checked, self._engine.asked(attempt.handle)
+        asked = None if asked is None or checked is None else max(asked, machine.monotonic() - checked)
+        runs = status.phase is not NodePhase.UNREACHABLE and not status.stale
+        return self._bus.presence.silence((attempt.job_id, attempt.number, node.index), asked, runs)
 
     def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.

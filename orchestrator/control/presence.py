@@ -1,8 +1,9 @@
 """The nodes that the bus hears, and what the silence of the others proves. Pure: no network, no thread, no clock but the one it gets.
 
 Silence proves nothing by itself: the node may have died, its network may be down, or this controller is the one that is cut off. A node is
-lost once it alone has been silent for ``lost_after``, while its engine answers and somebody else is heard. Otherwise it is unreachable.
-What stays unreachable for another five times as long, while its engine answers, is lost too.
+lost once it alone has been silent for ``lost_after``, while its engine says that it runs and somebody else is heard. Otherwise it is
+unreachable, and waited for: for five times as long where its engine answers and can't tell, without end where the engine does not answer or
+says that it runs.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from shared_store.bus import Node
 LOST_AFTER = 120.0
 """Seconds of silence after which a node is lost, by default."""
 UNREACHABLE = 5
-"""Times ``lost_after`` for which a node may be unreachable beyond that."""
+"""Times ``lost_after`` for which a node may be unreachable of which its engine can't tell whether it runs."""
+_FRESH = 10.0
+"""Seconds for which an engine's answer counts, or a quarter of ``lost_after`` where that is more."""
 _BURST = 10.0
 """Seconds within which the nodes fall silent that the controller's own network takes away."""
 _FEWEST = 3
@@ -37,6 +40,8 @@ class _Heard:
     """The same, for people."""
     answered: float = 0.0
     """From when its engine has answered without a break."""
+    confirmed: float = 0.0
+    """From when its engine has said without a break that it runs."""
 
 
 class Presence:
@@ -94,7 +99,7 @@ class Presence:
         if self.expects(node):
             now, since = self._monotonic(), datetime.fromtimestamp(self._wall(), UTC)
             with self._lock:
-                self._set(node, _Heard(now, f"{since:%H:%M:%S} UTC", now))
+                self._set(node, _Heard(now, f"{since:%H:%M:%S} UTC", now, now))
 
     def ended(self, node: Node) -> None:
         """A node has ended, so that its silence means nothing."""
@@ -126,12 +131,13 @@ class Presence:
             since = self._deaf_since
         return why if since is not None and self._monotonic() - since > UNHEARD else None
 
-    def silence(self, node: Node, asked: float | None) -> Silence | None:
+    def silence(self, node: Node, asked: float | None, runs: bool = True) -> Silence | None:
         """The silence of a node that was connected to this router; None where it is heard, or never was.
 
         Args:
             node: The node.
-            asked: Seconds since its engine was asked and answered that it runs; None where it does not answer.
+            asked: Seconds since its engine was asked, and answered; None where it does not answer.
+            runs: Whether it answered that the node runs; otherwise it can't tell.
         """
         with self._lock:
             heard = self._nodes.get(node)
@@ -139,11 +145,12 @@ class Presence:
                 return None
             now = self._monotonic()
             deaf = self._note_deafness()
-            if asked is None or asked > now - heard.gone:
-                heard.answered = now
-            alone = now - max(heard.gone, heard.answered, self._deaf_at)
-            patience = (1 + UNREACHABLE) * self.lost_after
-            is_lost = alone > self.lost_after or now - heard.answered > patience
+            if asked is None or asked > min(now - heard.gone, max(_FRESH, self.lost_after / 4)):
+                heard.answered = heard.confirmed = now
+            if not runs:
+                heard.confirmed = now
+            alone = now - max(heard.confirmed, self._deaf_at)
+            is_lost = alone > self.lost_after or (not runs and now - heard.answered > UNREACHABLE * self.lost_after)
             return Silence(now - heard.gone, heard.since, is_lost, deaf or "")
 
     def _set(self, node: Node, heard: _Heard | None) -> None:

@@ -172,6 +172,8 @@ def step(state: State, event: Event) -> Instructions:
             return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
         case Phase.LAUNCHING, LaunchDelayed(reason) if reason:
             return (Explain(reason),)
+        case Phase.LAUNCHING, LaunchRefused() if state.verdict is not None:
+            return (WindUp(),)
         case Phase.LAUNCHING, LaunchRefused(reason, True):
             return Decide(Verdict(Ending.FATAL, f"can't start the gang: {reason}")), WindUp()
         case Phase.LAUNCHING, LaunchRefused(reason):
@@ -298,9 +300,7 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
             return to(Status.FAILED, f"{state.stop_reason}{progress}" if native else state.stop_reason)
         case Ending.SUCCEEDED:
             return to(Status.SUCCEEDED, verdict.reason)
-        case Ending.PREEMPTED | Ending.LOST if (
-            head is not None and head.exit_code == 0
-        ):  # to leave with work to do is 75, or a signal's
+        case Ending.PREEMPTED | Ending.LOST | Ending.TIMEOUT if _was_done(ending, native, head):
             return to(
                 Status.SUCCEEDED, f"done before it was {'preempted' if ending == Ending.PREEMPTED else 'stopped'}"
             )
@@ -313,6 +313,13 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         case Ending.FAILED | Ending.LOST if native:
             return to(Status.FAILED, f"{verdict.reason} (attempt {spent} of {terms.allowed})")
     return to(Status.FAILED, verdict.reason)
+
+
+def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
+    """Whether the main node had finished its work when it was to end. A native one leaves work with 75; others may leave it with 0, too."""
+    if head is None or head.exit_code != 0:
+        return False
+    return not head.asked or ending == Ending.PREEMPTED or (native and ending == Ending.LOST)
 
 
 def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:

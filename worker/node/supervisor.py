@@ -354,6 +354,13 @@ class Supervisor:
         store = self.run.path.parent.parent
         return not os.path.lexists(self.run.path) and os.path.lexists(store / "store.json")
 
+    def _is_there(self) -> bool:
+        """Whether the volume has the run: an empty directory in its place would take the outcome. Raises OSError."""
+        try:
+            return read_epoch(self.run) > 0
+        except ValueError:
+            return True  # damaged, and there
+
     def _commit(self, outcome: Outcome) -> int:
         """Write the outcome until it stands, or the node is asked to leave; returns its exit code, by which the engine knows it too.
 
@@ -361,16 +368,13 @@ class Supervisor:
         """
         with contextlib.suppress(OSError):
             self._log.sync()
-        if (
-            self.stopping != _ASKED
-        ):  # the time that ranks had to leave is over; whoever asks the node to leave gives it more
+        # the time that ranks had to leave is over; whoever asks the node to leave gives it more
+        if self.stopping != _ASKED:
             self.stopping = self.deadline = None
         trouble = ""
         while not self._is_deleted():
             try:
-                if not read_epoch(
-                    self.run
-                ):  # an empty directory is in the place of the volume: it would take the outcome
+                if not self._is_there():
                     raise OSError(f"run {self.run.name} is not in the store; see whether its volume is mounted")
                 write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
                 break

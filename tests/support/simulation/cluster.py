@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _SAVING = 30.0
 """Seconds of work between two checkpoints."""
+_CLOSING = 20.0
+"""Seconds from the last checkpoint to the end, at most."""
 _TRIES = 60
 """Seconds for which a node tries to write its outcome."""
 
@@ -132,7 +134,8 @@ class Cluster:
         job = self._world.job(gang.job)
         left = job.work - job.done
         if left <= 0:
-            self._finish(gang.nodes[0], job.code)
+            closing = self._rng.uniform(0.1, _CLOSING)
+            self._machine.after(closing, lambda: self._finish(gang.nodes[0], job.code))
             return
         piece = min(left, _SAVING)
         self._machine.after(piece, lambda: self._save(gang, piece))
@@ -169,25 +172,29 @@ class Cluster:
         if node.acts:
             self._finish(node, EX_TEMPFAIL)
 
-    def _finish(self, node: SimulatedNode, code: int, tries: int = _TRIES) -> None:
-        """The node ends: it writes its outcome until that stands, or leaves without one after a while."""
+    def _finish(self, node: SimulatedNode, code: int, tries: int = _TRIES, asked: bool | None = None) -> None:
+        """The node ends: it writes its outcome until that stands, or leaves without one after a while.
+
+        ``asked``: whether it was asked to end when its work ended; None: as it is now.
+        """
         if not node.alive:
             return
+        was_asked = node.asked if asked is None else asked
         if not node.acts:
-            self._machine.after(5.0, lambda: self._finish(node, code, tries))
+            self._machine.after(5.0, lambda: self._finish(node, code, tries, was_asked))
             return
         gang, volume = node.gang, self._world.volume
         can_write = not volume.unusable and gang.run in volume.runs
         if not can_write and tries and not node.asked:
-            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1))
+            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1, was_asked))
             return
         if can_write:
             wall, words = self._machine.wall(), f"exit {code}"
-            outcome = Outcome(node.index, gang.epoch, code, None, words, None, wall - 1, wall, asked=node.asked)
+            outcome = Outcome(node.index, gang.epoch, code, None, words, None, wall - 1, wall, asked=was_asked)
             volume.runs[gang.run].outcomes[gang.job, gang.attempt, node.index] = outcome
         node.alive, node.exit_code = False, code
         if node.index == 0 and code != EX_TEMPFAIL:
-            self._world.job(gang.job).main_ends.append((gang.attempt, code))
+            self._world.job(gang.job).main_ends.append((gang.attempt, code, was_asked))
         self._world.notice(node, 0.2)
         if node.index == 0 and code == 0:
             for other in gang.running:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 HOSTS = 6
 CORES = 2.0
 AWAY = "the simulated engine can't be reached"
+HANGS = "the simulated engine has not answered since"
 
 
 class SimulatedEngine:
@@ -69,6 +70,8 @@ class SimulatedEngine:
         """Gangs go on."""
 
     def _reach(self) -> None:
+        while self._world.engine_hangs:
+            self._world.machine.sleep(1.0)
         if self._world.engine_down:
             raise OSError(AWAY)
 

@@ -33,7 +33,7 @@ def _during(world: Simulation, seconds: float, name: str, of: object | None = No
 
 
 def _seconds(rng: Random) -> float:
-    return rng.choice((5.0, 30.0, 90.0, 300.0, 600.0)) * rng.uniform(0.7, 1.0)
+    return rng.choice((5.0, 30.0, 90.0, 300.0, 600.0, 1500.0)) * rng.uniform(0.7, 1.0)
 
 
 def crash_at_a_write(world: Simulation, rng: Random) -> None:
@@ -58,6 +58,11 @@ def partition(world: Simulation, rng: Random) -> None:
 
 def engine_outage(world: Simulation, rng: Random) -> None:
     _during(world, _seconds(rng), "engine_down")
+
+
+def hang_engine(world: Simulation, rng: Random) -> None:
+    """Calls of the engine do not return."""
+    _during(world, _seconds(rng), "engine_hangs")
 
 
 def bus_outage(world: Simulation, rng: Random) -> None:
@@ -156,7 +161,7 @@ def _some_node(world: Simulation, rng: Random) -> SimulatedNode | None:
 
 
 KINDS: tuple[Fault, ...] = (
-    *(crash_at_a_write, crash_at_a_write, move, partition, engine_outage, bus_outage, step_clock),
+    *(crash_at_a_write, crash_at_a_write, move, partition, engine_outage, hang_engine, bus_outage, step_clock),
     *(database_outage, crowd_database),
     *(stall_volume, fill_volume, unmount_volume, break_volume, freeze_node, isolate_node, lose_host, kill_node),
 )

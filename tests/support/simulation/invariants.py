@@ -8,9 +8,10 @@ from orchestrator.control.presence import LOST_AFTER
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.api import Gang
 from tests.support.simulation.cluster import SimulatedGang
-from tests.support.simulation.engine import AWAY
+from tests.support.simulation.engine import AWAY, HANGS
 from tests.support.simulation.jobs import SimulatedJob
 from tests.support.simulation.machine import Violation
+from tests.support.simulation.store import NO_VOLUME
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
@@ -28,8 +29,8 @@ class Invariants:
 
     def __init__(self, world: Simulation) -> None:
         self._world = world
-        self._state: tuple[int, bool, bool] | None = None
-        """The controller's process, and whether its engine and its database are away."""
+        self._state: tuple[int, bool, bool, bool] | None = None
+        """The controller's process, and whether its engine, its database and its volume are away."""
         self._since = 0.0
         """Since when that is so [s]."""
         self._is_checked = False
@@ -57,7 +58,7 @@ class Invariants:
 
     def launched(self, gang: SimulatedGang) -> None:
         """A gang that is to be seen soon."""
-        if not (self._world.engine_down or self._world.database_down):
+        if not (self._world.engine_away or self._world.database_down):
             self._launched.append(gang)
 
     def check_cause(self, gang: SimulatedGang) -> None:
@@ -76,7 +77,8 @@ class Invariants:
         if any(seconds > LOST_AFTER - _SLACK for seconds in silences):
             return
         ending, reason = self._attempt(gang.job, gang.attempt)
-        if ending != "preempted" or job.urgent:
+        urgent = any(each.urgent and each.acknowledged and not each.final for each in self._world.jobs)
+        if ending != "preempted" or job.urgent or not urgent:
             raise Violation(f"{gang.name} is ended without a cause: {ending}, {reason}")
 
     def look(self) -> None:
@@ -99,30 +101,34 @@ class Invariants:
 
     def _check_end(self, job: SimulatedJob, status: str, reason: str) -> None:
         """Every end is the true end, and a job that failed has spent its attempts."""
-        succeeded = any(code == 0 for _, code in job.main_ends)
+        succeeded = any(code == 0 for _, code, _ in job.main_ends)
+        in_time = any(code == 0 and not (asked and job.timeout) for _, code, asked in job.main_ends)
         if status == Status.SUCCEEDED and job.name not in self._world.volume.runs:
             raise Violation(f"{job.name} is SUCCEEDED, and the store does not have its run")
         if status == Status.SUCCEEDED and not succeeded:
             raise Violation(f"{job.name} is SUCCEEDED, and its main node did not end with 0: {job.main_ends}")
-        if status != Status.FAILED or job.stop_asked or job.timeout is not None:
+        if status != Status.FAILED or job.stop_asked:
             return
-        if succeeded:
-            raise Violation(f"{job.name} is FAILED ({reason}), and its main node ended with 0")
+        if in_time:
+            raise Violation(f"{job.name} is FAILED ({reason}), and its main node ended with 0: {job.main_ends}")
+        if job.timeout is not None:
+            return
         query = "SELECT count(*) FROM attempts WHERE job_id = ? AND spent"
         spent = self._world.memory.execute(query, (job.id,)).fetchone()[0]
         if spent < job.attempts:
             raise Violation(f"{job.name} is FAILED ({reason}) after {spent} of {job.attempts} attempts")
 
     def check_reachable(self, process: int) -> None:
-        """Once the engine has answered, or not, for a while: a RUNNING gang says that it does not, and only then; a new one is seen."""
+        """Once all has been as it is for a while: a RUNNING gang says whether its engine is away; a new gang is seen; jobs say why they wait."""
         world = self._world
-        state = process, world.engine_down, world.database_down
+        state = process, world.engine_away, world.database_down, world.volume.unusable
         if state != self._state:
             self._state, self._since, self._is_checked, self._launched = state, world.machine.time, False, []
         self._check_seen()
         if self._is_checked or world.machine.time - self._since < _TOLD:
             return
         began, self._is_checked = self._since, True
+        self._check_waiting()
         rows = world.memory.execute(
             "SELECT jobs.name, jobs.status_reason, attempts.running_since FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
             " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NULL AND attempts.ending IS NULL"
@@ -132,12 +138,20 @@ class Invariants:
             seen = [gang for gang in world.cluster.gangs.values() if gang.run == name and gang.launched < began - _TOLD]
             if running is None or not seen or job.stop_asked:
                 continue
-            if world.engine_down and not any(gang.running for gang in seen):
+            if world.engine_away and not any(gang.running for gang in seen):
                 continue  # the engine is not needed any more
-            if (AWAY in reason) != world.engine_down:
+            if (AWAY in reason or HANGS in reason) != world.engine_away:
                 raise Violation(
-                    f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_down or 'answers'}"
+                    f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_away or 'answers'}"
                 )
+
+    def _check_waiting(self) -> None:
+        """A job that waits says why, and that the volume is away if that is so, and only then."""
+        world = self._world
+        away = world.volume.stalled or world.volume.full or world.volume.absent
+        for name, reason in world.reasons():
+            if not reason or (NO_VOLUME in reason) != away:
+                raise Violation(f"{name} waits ({reason}), and its volume {'is away' if away else 'answers'}")
 
     def _check_seen(self) -> None:
         """A gang that runs is RUNNING soon after its launch."""

@@ -42,8 +42,8 @@ class SimulatedJob:
     stop_asked: bool = False
     done: float = 0.0
     """Seconds of work that its checkpoints hold."""
-    main_ends: list[tuple[int, int]] = field(default_factory=list)
-    """Attempt and exit code of each main node that ended by itself."""
+    main_ends: list[tuple[int, int, bool]] = field(default_factory=list)
+    """Attempt and exit code of each main node that ended by itself, and whether it had been asked to end by then."""
     final: str = ""
     """The state that was shown once, and must stay."""
 

@@ -25,7 +25,7 @@ Mutant = AbstractContextManager[Any]
 def silence_alone_counts() -> Mutant:
     """B1: a node counts as dead when it is silent for 20 s, whatever its engine says, and however many others are."""
 
-    def silence(self: Presence, node: Node, asked: float | None) -> Silence | None:
+    def silence(self: Presence, node: Node, asked: float | None, runs: bool = True) -> Silence | None:
         heard = self._nodes.get(node)
         if heard is None or heard.gone is None:
             return None
@@ -55,7 +55,7 @@ def the_loop_shares_its_connections() -> Mutant:
 def the_loop_reads_the_store() -> Mutant:
     """B4: the loop waits for the volume."""
 
-    def result(self: Errands, key: object, name: str, body: Callable[[], Any]) -> Any:
+    def result(self: Errands, key: object, name: str, body: Callable[[], Any], again: bool = True) -> Any:
         return body()
 
     return mock.patch.object(Errands, "result", result)
@@ -70,7 +70,7 @@ def what_is_to_end_is_launched() -> Mutant:
             if isinstance(event, Due):
                 return (Launch(),)
             if isinstance(event, LaunchDelayed):
-                return (Explain(event.reason),)
+                return (Explain(event.reason),) if event.reason else ()
         return step(state, event)
 
     return mock.patch.object(attempts, "step", stepped)

@@ -50,7 +50,7 @@ class Simulation:
         self.volume = Volume()
         self.cluster = Cluster(self)
         self.invariants = Invariants(self)
-        self.engine_down = self.bus_down = self.database_down = False
+        self.engine_down = self.engine_hangs = self.bus_down = self.database_down = False
         self.bus_down_since = 0.0
         """Since when the bus is down, or was the last time [s]."""
         self.crowded = False
@@ -85,6 +85,11 @@ class Simulation:
             finally:
                 if self._reconciler is not None:
                     self._reconciler.engine.close()
+
+    @property
+    def engine_away(self) -> bool:
+        """Whether the engine refuses calls, or does not return from them."""
+        return self.engine_down or self.engine_hangs
 
     def job(self, name: str) -> SimulatedJob:
         """The job of this name or id."""
@@ -184,6 +189,13 @@ class Simulation:
 
     def _latency(self, pool: str) -> float:
         return self.rng.choice((0.002, 0.01, 0.05, 0.3, 1.5)) if not pool.startswith("stop") else 0.01
+
+    def reasons(self) -> list[tuple[str, str]]:
+        """The jobs that wait for room, and the reason that the user of each sees."""
+        assert self._reconciler is not None
+        query = "SELECT id, name, status, status_reason FROM jobs WHERE status = 'RUNNABLE'"
+        rows = [Job(id=row[0], name=row[1], status=row[2], status_reason=row[3]) for row in self.memory.execute(query)]
+        return [(job.name, self._reconciler.admission.reason(job) or job.status_reason or "") for job in rows]
 
     # -- the bus ------------------------------------------------------------------------------------------------------
 

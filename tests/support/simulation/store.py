@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
 
 
+NO_VOLUME = "the volume of the store does not answer, is full, or is another one"
 _NOTICED = 5.0
 """Seconds after which the controller knows of a volume that can't be used."""
 
@@ -148,4 +149,4 @@ class SimulatedDisk:
         self._since = (self._since if self._since is not None else machine.time) if bad else None
         if purpose == "database" or self._since is None or machine.time - self._since < _NOTICED:
             return None
-        return "the volume of the store does not answer, is full, or is another one"
+        return NO_VOLUME

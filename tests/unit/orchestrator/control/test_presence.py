@@ -29,14 +29,14 @@ class Cluster:
         for index in indices:
             self.presence.left(self.nodes[index])
 
-    def wait(self, seconds: float, *, answers: bool = True) -> None:
+    def wait(self, seconds: float, *, answers: bool = True, runs: bool = True) -> None:
         """Let time pass, with a look at every node each second, as the controller has."""
         for _ in range(int(seconds)):
             self.time += 1.0
-            self.lost(answers=answers)
+            self.lost(answers=answers, runs=runs)
 
-    def lost(self, *, answers: bool = True) -> list[int]:
-        found = [self.presence.silence(node, AGO if answers else None) for node in self.nodes]
+    def lost(self, *, answers: bool = True, runs: bool = True) -> list[int]:
+        found = [self.presence.silence(node, AGO if answers else None, runs) for node in self.nodes]
         return [index for index, silence in enumerate(found) if silence is not None and silence.is_lost]
 
 
@@ -75,7 +75,7 @@ def test_the_only_node_is_lost_where_the_router_hears_itself() -> None:
         (5, True, [0, 1, 2], "3 of 5 nodes fell silent within 10 s, so the controller seems to be cut off"),
     ],
 )
-def test_where_the_controller_may_be_cut_off_nodes_are_unreachable_for_a_long_time(
+def test_where_the_controller_may_be_cut_off_nodes_that_run_are_waited_for(
     nodes: int, itself: bool, silent: list[int], cause: str
 ) -> None:
     cluster = Cluster(nodes, itself=itself)
@@ -83,12 +83,29 @@ def test_where_the_controller_may_be_cut_off_nodes_are_unreachable_for_a_long_ti
     assert cluster.presence.cut_off is None, "at once it may be the end of a gang"
     cluster.wait(12)
     assert cluster.presence.cut_off == cause
-    cluster.wait(6 * L - 12)
+    cluster.wait(50 * L)
     assert cluster.lost() == []
     silence = cluster.presence.silence(cluster.nodes[0], AGO)
     assert silence is not None and silence.cause == cause
+
+
+@pytest.mark.parametrize("silent", [[0], [0, 1, 2]], ids=["alone", "with all others"])
+def test_a_node_of_which_its_engine_can_t_tell_is_waited_for_five_times_as_long(silent: list[int]) -> None:
+    cluster = Cluster(3)
+    cluster.silence(*silent)
+    cluster.wait(5 * L, runs=False)
+    assert cluster.lost(runs=False) == []
+    cluster.wait(1, runs=False)
+    assert cluster.lost(runs=False) == silent
+
+
+def test_only_a_fresh_answer_counts() -> None:
+    cluster = Cluster(3)
+    cluster.silence(1)
     cluster.wait(1)
-    assert cluster.lost() == silent
+    cluster.time += 2 * L
+    silence = cluster.presence.silence(cluster.nodes[1], 50.0)
+    assert silence is not None and not silence.is_lost
 
 
 def test_where_gangs_that_are_launched_meanwhile_are_not_heard_either_the_router_s_own_voice_proves_nothing() -> None:

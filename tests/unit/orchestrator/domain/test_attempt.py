@@ -87,6 +87,7 @@ DONE = Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
 STOPPED = Verdict(Ending.STOPPED, "enough")
 FAILED = Verdict(Ending.FAILED, "main node: exit 1", 1)
 MAIN_LAST = (end(0), end(0))
+ASKED_LAST = (end(0, asked=True), end(0))
 KILLED = end(143, asked=True)
 UNSURE = Verdict(Ending.FAILED, "main node: exit 143", 143, certain=False)
 QUIET = Silence(121.0, "12:00:00 UTC", False, "none is heard")
@@ -136,6 +137,11 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
     "one that is not needed is given up": (asked(LAUNCHING), LaunchDelayed("full", False), [Decide(STOPPED), WindUp()]),
     "unless something may run": (asked(LAUNCHING), LaunchDelayed("silent", True), [Explain("silent")]),
+    "a refusal of what is to end anyway changes nothing": (
+        ending(Ending.PREEMPTED, of=LAUNCHING),
+        LaunchRefused("gone", is_final=False),
+        [WindUp()],
+    ),
     "a refusal is final": (LAUNCHING, LaunchRefused("no such image"), [Decide(REFUSED), WindUp()]),
     "a start that failed is an attempt that failed": (
         LAUNCHING,
@@ -270,6 +276,7 @@ FAILED_LAST = with_terms(ending(Ending.FAILED), spent=2)
 AT_ONCE = ran(ending(REQUEUE), LEFT - 1)
 S = Status
 DONE_SO, LAST_SO = "done before it was preempted", "why (attempt 2 of 3)"
+STOPPED_LATE = "done before it was stopped"
 
 # state, the nodes' ends → whether the attempt is spent, the job's state, and its reason
 CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
@@ -284,7 +291,12 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "over time when it was asked to stop": (asked(ending(Ending.TIMEOUT)), (), SPENT, S.FAILED, "why"),
     "preempted": (ending(Ending.PREEMPTED), BOTH_LEFT, FREE, S.RUNNABLE, PREEMPTED_SO),
     "preempted before its launch": (ending(Ending.PREEMPTED, of=LAUNCHING), (), FREE, S.RUNNABLE, PREEMPTED_SO),
-    "done before it was stopped": (ending(Ending.LOST), MAIN_LAST, SPENT, S.SUCCEEDED, "done before it was stopped"),
+    "done before it was stopped": (ending(Ending.LOST), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "done when it was stopped": (ending(Ending.LOST), ASKED_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "done before it was stopped, on AWS": (on_aws(ending(Ending.LOST)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "stopped with 0, on AWS": (on_aws(with_terms(ending(Ending.LOST), spent=2)), ASKED_LAST, SPENT, S.FAILED, "why"),
+    "done before its time was over": (ending(Ending.TIMEOUT), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "stopped with 0 when its time was over": (ending(Ending.TIMEOUT), ASKED_LAST, SPENT, S.FAILED, "why"),
     "done before it was preempted": (ending(Ending.PREEMPTED), MAIN_LAST, FREE, S.SUCCEEDED, DONE_SO),
     "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=2), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
     "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),
