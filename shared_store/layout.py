@@ -191,7 +191,9 @@ class Store:
             )
 
     def _not_writable(self, why: str) -> StoreError:
-        return StoreError(f"store {self.path}: not writable ({why}); choose another with --store")
+        return StoreError(
+            f"store {self.path}: not writable ({why}); see whether its volume is mounted, or choose another with --store"
+        )
 
     def open(self) -> Store:
         """Create a missing layout, give the store an identity, and check that it can be written.

@@ -131,8 +131,12 @@ class Admission:
         shortage, report = self._disk.shortage(), self._report
         if job.status in (Status.STARTING, Status.RUNNING):
             failed = self._backoff.said(("preempt", job.id)) if report and report.preempts(job.id) else None
-            said = failed.removeprefix(f"job {job.id}: ") if failed else job.status_reason
-            return f"{said}; {shortage}" if shortage is not None and shortage not in (said or "") else failed and said
+            reason = failed.removeprefix(f"job {job.id}: ") if failed else job.status_reason
+            return (
+                f"{reason}; {shortage}"
+                if shortage is not None and shortage not in (reason or "")
+                else failed and reason
+            )
         if job.status != Status.RUNNABLE or self._work_queue.since(job.id) is None:
             return None
         if shortage is not None or report is None:

@@ -5,7 +5,8 @@ can neither send a command nor read a message. A node's message counts only with
 commands carry that proof to the node (:mod:`shared_store.bus`).
 
 The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval, and its
-silence counts as :mod:`orchestrator.control.presence` says; a message that is lost costs nothing. With the bus off everything works from the store and the engine, slower.
+silence counts as :mod:`orchestrator.control.presence` says; a message that is lost costs nothing. With the bus off everything works from the
+store and the engine, slower.
 """
 
 from __future__ import annotations
@@ -151,19 +152,20 @@ class Bus:
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
+        direct = zenoh.handlers.Callback  # they run on the network's thread, and only note what came
         try:
             self._session = zenoh.open(config)
+            self._declared = [
+                self._session.liveliness().declare_subscriber(
+                    "muster/*/*/*/alive/*", direct(self._presence, indirect=False), history=True
+                ),
+                self._session.declare_subscriber("muster/*/*/*/progress", direct(self._note, indirect=False)),
+            ]
+            self._hear_itself(port)
         except zenoh.ZError as error:
             log.info("no router on port %d: %s", port, error)
+            self.close()
             return False
-        direct = zenoh.handlers.Callback  # they run on the network's thread, and only note what came
-        self._declared = [
-            self._session.liveliness().declare_subscriber(
-                "muster/*/*/*/alive/*", direct(self._presence, indirect=False), history=True
-            ),
-            self._session.declare_subscriber("muster/*/*/*/progress", direct(self._note, indirect=False)),
-        ]
-        self._hear_itself(port)
         return True
 
     def _hear_itself(self, port: int) -> None:

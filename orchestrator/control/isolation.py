@@ -72,8 +72,10 @@ class Isolation:
         reason = excerpt(storable(reason), LONGEST_REASON)
         if self.backoff.failed((what, job_id), f"job {job_id}: {reason}", error):
             with self._database.session() as session:  # by its id alone: its row may be what is damaged
-                told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
-                session.execute(told)
+                explained = (
+                    update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
+                )
+                session.execute(explained)
             self._loaded.changed([job_id])
 
 

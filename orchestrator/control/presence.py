@@ -41,7 +41,7 @@ class _Heard:
     answered: float = 0.0
     """From when its engine has answered without a break."""
     confirmed: float = 0.0
-    """From when its engine has said without a break that it runs."""
+    """From when its engine has reported without a break that it runs."""
 
 
 class Presence:

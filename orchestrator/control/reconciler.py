@@ -261,8 +261,8 @@ class Reconciler:
     def check_writable(self, *, adds: bool) -> None:
         """Whether a request may change the database, to which it ``adds`` something or not.
 
-        Raises StoreAbsent for an addition while the store is not there, DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
-        little room for an addition.
+        Raises StoreAbsent for an addition while the store is not there, DatabaseError while the database can't be used or is another
+        controller's, DatabaseFull where its volume has too little room for an addition.
         """
         if (trouble := self.trouble) is not None and (adds or not self._isolation.is_full):
             raise DatabaseError(trouble)

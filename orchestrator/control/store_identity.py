@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 from sqlalchemy import select
@@ -33,7 +34,7 @@ class StoreIdentity:
             raise OSError(problem)
 
     def problem(self) -> str | None:
-        """Why what is under the store's path is not the store; None where it is, or where that can't be read now. May hang."""
+        """Why what is under the store's path is not the store, or can't be read; None where it is. May hang."""
         try:
             found = self.store.identity()
         except FileNotFoundError:
@@ -81,4 +82,4 @@ def _has_runs(session: Session, store: Store) -> bool:
     """Whether the store has one of the newest runs that the database knows; True where it knows none."""
     query = select(Job.run).join(Attempt).order_by(Job.created_at.desc()).limit(_NEWEST)
     runs = dict.fromkeys(session.scalars(query))
-    return not runs or any(store.run(run).description() is not None for run in runs)
+    return not runs or any(os.path.lexists(store.run(run).path / "run.json") for run in runs)

@@ -231,13 +231,13 @@ def _end(state: State, seen: Observed) -> Instructions:
     """Once the end is decided: the gang is stopped, unless its children may end by themselves."""
     if (verdict := state.verdict) is None:
         return ()
-    said = (Explain(f"{verdict.reason}; waits for {seen.stale}"),) if seen.stale else ()
+    explained = (Explain(f"{verdict.reason}; waits for {seen.stale}"),) if seen.stale else ()
     if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
         since = seen.moment if state.done_since is None else state.done_since
         if seen.moment - since < FINISHING:
-            return *said, AwaitChildren(since)
+            return *explained, AwaitChildren(since)
     is_broken = verdict.ending in (Ending.FAILED, Ending.FATAL)
-    return *said, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
+    return *explained, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
 
 
 def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:
@@ -300,7 +300,7 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
             return to(Status.FAILED, f"{state.stop_reason}{progress}" if native else state.stop_reason)
         case Ending.SUCCEEDED:
             return to(Status.SUCCEEDED, verdict.reason)
-        case Ending.PREEMPTED | Ending.LOST | Ending.TIMEOUT if _was_done(ending, native, head):
+        case Ending.PREEMPTED | Ending.LOST | Ending.FAILED | Ending.TIMEOUT if _was_done(ending, native, head):
             return to(
                 Status.SUCCEEDED, f"done before it was {'preempted' if ending == Ending.PREEMPTED else 'stopped'}"
             )
@@ -316,10 +316,13 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
 
 
 def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
-    """Whether the main node had finished its work when it was to end. A native one leaves work with 75; others may leave it with 0, too."""
+    """Whether the main node had finished its work, which decides, also where its end was seen after another node's was.
+
+    A native one leaves work with 75. Others may leave it with 0, too, once they are asked to end.
+    """
     if head is None or head.exit_code != 0:
         return False
-    return not head.asked or ending == Ending.PREEMPTED or (native and ending == Ending.LOST)
+    return not head.asked or ending == Ending.PREEMPTED or (native and ending != Ending.TIMEOUT)
 
 
 def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:

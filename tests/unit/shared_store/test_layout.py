@@ -45,7 +45,10 @@ def test_a_path_becomes_absolute_or_is_named_with_the_reason_why_it_can_be_no_di
     path = tmp_path / "file" / "store"
     with pytest.raises(StoreError) as caught:
         Store(path).open()
-    assert str(caught.value) == f"store {path}: not writable (Not a directory); choose another with --store"
+    assert (
+        str(caught.value)
+        == f"store {path}: not writable (Not a directory); see whether its volume is mounted, or choose another with --store"
+    )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/somebody")
     assert Store("store").path == tmp_path / "store"

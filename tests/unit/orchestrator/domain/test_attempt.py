@@ -293,6 +293,7 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "preempted before its launch": (ending(Ending.PREEMPTED, of=LAUNCHING), (), FREE, S.RUNNABLE, PREEMPTED_SO),
     "done before it was stopped": (ending(Ending.LOST), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
     "done when it was stopped": (ending(Ending.LOST), ASKED_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "done when a child had failed": (ending(Ending.FAILED), (end(0), end(1)), SPENT, S.SUCCEEDED, STOPPED_LATE),
     "done before it was stopped, on AWS": (on_aws(ending(Ending.LOST)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
     "stopped with 0, on AWS": (on_aws(with_terms(ending(Ending.LOST), spent=2)), ASKED_LAST, SPENT, S.FAILED, "why"),
     "done before its time was over": (ending(Ending.TIMEOUT), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
