@@ -21,7 +21,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import Observer
-from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
+from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
@@ -59,14 +59,7 @@ from orchestrator.domain.attempt_instructions import (
 )
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status, Verdict
-from orchestrator.engines.api import (
-    CannotStart,
-    EngineError,
-    Gang,
-    GangStatus,
-    NotYet,
-    Plan,
-)
+from orchestrator.engines.api import CannotStart, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Attempt, Job, JobQueue, SchedulingPolicy, now
 from orchestrator.persistence.ownership import first_description, record_owner
@@ -80,7 +73,7 @@ GRACE = 30.0
 NO_EPOCH = 0
 """Of an attempt that has none yet."""
 _READERS = 16
-"""Threads for the store."""
+"""Threads for the store. An open attempt has one call there at most, and of a run's closed attempts only the last one has any."""
 _CHECK_INTERVAL = 5.0
 """Seconds between two looks at a gang of which a node is silent, or whose cause is not known yet."""
 _LEAST, _LATER = 0.02, 60.0
@@ -119,14 +112,13 @@ class Attempts:
         self.engine, self.runs, self.bus = engine, runs, bus
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
         self._memories: dict[tuple[str, int], _Memory] = {}
-        self._pool = machine.pool("store", _READERS)
-        self._errands = Errands(self._pool, str(runs.store.path), changed)
+        self._errands = Errands(machine.pool("store", _READERS), str(runs.store.path), changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
         self._stops = Stops(engine, changed, log)
 
     def close(self) -> None:
         """Leave the calls that are under way to themselves."""
-        self._pool.close()
+        self._errands.close()
         self._stops.close()
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
@@ -260,6 +252,7 @@ class Attempts:
         memory, key = self._memory(attempt), (job.id, attempt.number)
         try:
             if memory.run is None:
+                self._errands.await_earlier(job.run)
                 memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run), again=False)
             if (run := memory.run) is None:
                 return self._errands.delayed(key)
@@ -341,8 +334,8 @@ class Attempts:
         assert attempt.handle is not None
         if (stopped := self._stops.ask(key, attempt.handle, grace)) is not None:
             return self._wind_up(job, attempt, stopped)
-        trouble = self._stops.trouble(key)
-        return Delayed(trouble) if trouble else None
+        reason = self._stops.reason(key)
+        return Delayed(reason) if reason else None
 
     def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""
@@ -362,17 +355,18 @@ class Attempts:
         job.attempts.remove(attempt)
         job.move(Status.RUNNABLE, reason)
         session.commit()
-        self._forget((job.id, attempt.number))
+        self._forget(job, attempt)
         self.withdrawn(job.id, reason)
 
-    def _forget(self, key: Key) -> None:
+    def _forget(self, job: Job, attempt: Attempt) -> None:
+        key, release = (job.id, attempt.number), partial(self.runs.release, job.run)
         self._memories.pop(key, None)
         self._stops.forget(key)
-        self._errands.forget(key)
+        self._errands.forget(key, job.run, release, attempt.epoch if attempt.epoch != NO_EPOCH else None)
         self._observer.forget(key)
 
     def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> None:
-        memory, key = self._memory(attempt), (job.id, attempt.number)
+        memory = self._memory(attempt)
         ran = close.moment - (attempt.running_since or close.moment)
         attempt.started_at = attempt.started_at or now()
         attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
@@ -384,10 +378,8 @@ class Attempts:
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
         session.commit()
-        self._forget(key)
-        self.bus.forget(*key)
-        if attempt.epoch != NO_EPOCH:
-            self._pool.submit(partial(self.runs.release, job.run, attempt.epoch))
+        self._forget(job, attempt)
+        self.bus.forget(job.id, attempt.number)
         self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
 
     @staticmethod

@@ -7,11 +7,12 @@ controller knows, after it was read.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from math import inf
 from typing import Any, TypeVar
 
@@ -94,29 +95,36 @@ class RunStore:
 
     def examine(self, name: str) -> RunFacts:
         """A run before an attempt begins. Raises RunRefused."""
-        with self._using(f"read run {name}"):
+
+        def body() -> RunFacts:
             run = self.store.run(name)
             return replace(facts_of(run), epoch=read_epoch(run), writer=self.peers.writer(run))
-        raise AssertionError
+
+        return self._call(f"read run {name}", body)
 
     def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
         """Create the run, where it is missing, and give it to an attempt; returns the epoch, greater than ``after``. Raises RunRefused."""
-        with self._using(f"prepare run {name}"):
+
+        def body() -> int:
             run = self.store.run(name)
             run.create(dict(description))
             return take_epoch(run, after, claim)
-        raise AssertionError
+
+        return self._call(f"prepare run {name}", body)
 
     def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
         """The outcomes of those of these nodes that have left one."""
-        with self._using("read outcomes"):
+
+        def body() -> Mapping[int, Outcome]:
             found = {node: read_outcome(self.store.run(name), job, attempt, node) for node in nodes}
             return {node: outcome for node, outcome in found.items() if outcome is not None}
-        raise AssertionError
+
+        return self._call("read outcomes", body)
 
     def progress(self, name: str, epoch: int) -> Progress:
         """What the run holds after the attempt of this epoch."""
-        with self._using(f"read the checkpoints of run {name}"):
+
+        def body() -> Progress:
             checkpoints = list_checkpoints(self.store.run(name))
             iteration = checkpoints[-1].iteration if checkpoints else None
             for checkpoint in reversed(checkpoints):
@@ -124,20 +132,22 @@ class RunStore:
                     with suppress(DamagedCheckpoint, KeyError, TypeError, ValueError):
                         return Progress(iteration, float(checkpoint.manifest["created"]))
             return Progress(iteration)
-        raise AssertionError
+
+        return self._call(f"read the checkpoints of run {name}", body)
 
     def release(self, name: str, epoch: int) -> None:
         """The attempt of this epoch is closed: while this controller lives, another one may then say that the run is written."""
         with suppress(OSError, DamagedFile):
             close_claim(self.store.run(name), epoch)
 
-    @contextmanager
-    def _using(self, what: str) -> Iterator[None]:
+    def _call(self, what: str, body: Callable[[], T]) -> T:
+        """The result of ``body``; ``what`` it does, for messages."""
         path = self.store.path
         try:
             self._check()  # before a write, and after a read: what is missing may be missing because the volume is
-            yield
+            result = body()
             self._check()
+            return result
         except (OSError, StaleEpoch) as error:
             raise StoreUnavailable(f"store {path}: can't {what} now ({error}); trying again") from error
         except (StoreError, ValueError) as error:
@@ -145,14 +155,31 @@ class RunStore:
 
 
 class Errands:
-    """Calls on the store for attempts: one at a time for each attempt, on a pool. The loop collects the results, and never waits."""
+    """Calls on the store for attempts: one at a time for each attempt, on a pool. The loop collects the results, and never waits.
+
+    Where an attempt is closed while its call hangs, the run's next attempt makes none until that one has returned: a bad directory holds
+    one thread, and two claims of a run never overtake each other, of which the later one to land would fence off the other's gang.
+    """
 
     def __init__(self, pool: Pool, store: str, changed: Callable[[str], None]) -> None:
         """``store``: its path, for messages; ``changed``: called, on any thread, with the job whose result is there."""
         self._pool, self._store, self._changed = pool, store, changed
         self._under_way: dict[Key, tuple[str, Future[Any], float]] = {}
         """By attempt: the name of its errand, the result, and since when it is under way (monotonic [s])."""
+        self._left: dict[str, Future[Any]] = {}
+        """By run: the call of a closed attempt that had not returned."""
         self._failing = Backoff(log)
+
+    def close(self) -> None:
+        """Leave the calls that are under way to themselves."""
+        self._pool.close()
+
+    def await_earlier(self, run: str) -> None:
+        """Raises StoreUnavailable while a call of an earlier attempt on the run has not returned."""
+        if run in self._left and not self._left[run].done():
+            raise StoreUnavailable(
+                f"store {self._store}: can't read run {run} now (it has not answered the attempt before yet); trying again"
+            )
 
     def result(self, key: Key, name: str, body: Callable[[], T], again: bool = True) -> T | None:
         """The result of ``body``, once; None until it is there.
@@ -211,7 +238,18 @@ class Errands:
         began = datetime.fromtimestamp(machine.wall() - passed, UTC)
         return f"store {self._store} has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
 
-    def forget(self, key: Key) -> None:
-        """The attempt is closed."""
-        self._under_way.pop(key, None)
+    def forget(self, key: Key, run: str, release: Callable[[int], None], epoch: int | None) -> None:
+        """The attempt on a run is closed.
+
+        Args:
+            release: Called, on the pool, with the epoch that the attempt has, or gets by a claim that lands later.
+            epoch: The attempt's; None where it has none yet.
+        """
         self._failing.worked(key)
+        name, call, _ = self._under_way.pop(key, ("", None, 0.0))
+        if call is not None:
+            self._left = {each: left for each, left in self._left.items() if not left.done()} | {run: call}
+        if epoch is not None:
+            self._pool.submit(partial(release, epoch))
+        elif call is not None and name == "claim":
+            call.add_done_callback(lambda _: call.exception() or self._pool.submit(partial(release, call.result())))

@@ -5,35 +5,49 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import partial
 
 from orchestrator import machine
 from orchestrator.control.run_store import Key
-from orchestrator.engines.api import EngineError, EngineFault, GangStatus
+from orchestrator.engines.api import EngineError, EngineFault, GangStatus, read_handle
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.machine import Pool
 
 _THREADS = 128
-"""Stops that are under way at once."""
+"""Stops that are under way at once on one engine: those on another one wait for none of them."""
 _AGAIN, _RARELY = 2.0, 30.0
 """Seconds until another try to stop a gang that could not be stopped: at first, and at most."""
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """A stop that was asked for."""
+
+    engine: str
+    waited: bool
+    """Whether all threads for the engine were busy."""
+    result: Future[GangStatus]
 
 
 class Stops:
     """On the controller's thread alone, which never waits here."""
 
     def __init__(self, engine: EngineSet, changed: Callable[[str], None], log: logging.Logger) -> None:
-        """``changed``: called, from any thread, with a job whose gang's stop has returned."""
+        """``changed``: called, from any thread, with a job whose gang's stop has returned, or begins after it had to wait."""
         self._engine, self._changed = engine, changed
         self._denied = Backoff(log, _AGAIN, _RARELY)
         """Why the engine could not stop an attempt's gang when it was last asked."""
-        self._under_way: dict[Key, Future[GangStatus]] = {}
+        self._under_way: dict[Key, _Stop] = {}
         self._stopped: dict[Key, GangStatus] = {}
-        self._pool = machine.pool("stop", _THREADS)
+        self._pools: dict[str, Pool] = {}
+        """By engine."""
 
     def close(self) -> None:
         """Leave the stops that are under way to themselves."""
-        self._pool.close()
+        for pool in self._pools.values():
+            pool.close()
 
     def ask(self, key: Key, handle: str, grace: float) -> GangStatus | None:
         """The last status of an attempt's gang, which is stopped now; None while it is not. The first call begins the stop.
@@ -46,10 +60,9 @@ class Stops:
         if key in self._stopped:
             return self._stopped[key]
         if key not in self._under_way and not self._denied.waits(key):
-            self._under_way[key] = self._pool.submit(partial(self._engine.stop, handle, grace))
-            self._under_way[key].add_done_callback(partial(self._returned, key[0]))
-        if key in self._under_way and self._under_way[key].done():
-            stop = self._under_way.pop(key)
+            self._begin(key, handle, grace)
+        if key in self._under_way and self._under_way[key].result.done():
+            stop = self._under_way.pop(key).result
             if (error := stop.exception()) is None:
                 self._stopped[key] = stop.result()
                 return self._stopped[key]
@@ -59,13 +72,19 @@ class Stops:
             self._denied.failed(key, said, None if expected else error)
         return None
 
-    def trouble(self, key: Key) -> str | None:
-        """Why the engine could not stop the gang when it was last asked; None where it has not failed."""
-        said = self._denied.said(key)
-        return said.removeprefix(f"job {key[0]}: ") if said else None
+    def reason(self, key: Key) -> str | None:
+        """Why the gang is not stopped yet, for the job's user; None where nothing is amiss."""
+        if failure := self._denied.said(key):
+            return failure.removeprefix(f"job {key[0]}: ")
+        stop = self._under_way.get(key)
+        if stop is None or not stop.waited:
+            return None
+        if not (stop.result.running() or stop.result.done()):
+            return f"attempt {key[1]} waits for its turn to be stopped: the {stop.engine} engine is stopping {_THREADS} others"
+        return f"attempt {key[1]} is being stopped"
 
     def has_begun(self, key: Key) -> bool:
-        """Whether a stop is under way or has ended the gang."""
+        """Whether a stop waits for its turn, is under way or has ended the gang."""
         return key in self._under_way or key in self._stopped
 
     def pause(self, key: Key) -> float:
@@ -78,5 +97,16 @@ class Stops:
         self._stopped.pop(key, None)
         self._denied.worked(key)
 
-    def _returned(self, job: str, _: object) -> None:
-        self._changed(job)
+    def _begin(self, key: Key, handle: str, grace: float) -> None:
+        engine = read_handle(handle).engine
+        if engine not in self._pools:
+            self._pools[engine] = machine.pool(f"stop {engine}", _THREADS)
+        waits = sum(stop.engine == engine for stop in self._under_way.values()) >= _THREADS
+        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, waits))
+        self._under_way[key] = _Stop(engine, waits, result)
+        result.add_done_callback(lambda _: self._changed(key[0]))
+
+    def _stop(self, job: str, handle: str, grace: float, waited: bool) -> GangStatus:
+        if waited:
+            self._changed(job)
+        return self._engine.stop(handle, grace)

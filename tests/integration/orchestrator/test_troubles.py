@@ -30,6 +30,7 @@ from orchestrator.home import HomeLock
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
+from shared_store import epoch, files
 from tests.conftest import submit_gang, wait_for
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.orchestrator.rows import job
@@ -295,5 +296,37 @@ def test_a_hanging_volume_is_named_and_delays_no_request(inside: Server, monkeyp
             wait_for(lambda: missing in detail(client, waiting)["statusReason"], 30, "the reason why it waits")
             answers.set()
             await_status(client, waiting, "SUCCEEDED")
+    finally:
+        answers.set()
+
+
+def test_a_claim_that_lands_late_fences_off_no_later_gang_and_is_released(
+    inside: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish, hangs, answers = files.write_atomic, threading.Event(), threading.Event()
+
+    def hanging(path: Path, data: bytes) -> None:
+        if path.name == "EPOCH" and not hangs.is_set():
+            hangs.set()
+            answers.wait()
+        publish(path, data)
+
+    monkeypatch.setattr(epoch, "write_atomic", hanging)
+    run, env = inside.store.run("shared"), {"MUSTER_RUN": "shared"}
+    try:
+        with Client(inside.url) as client:
+            first = submit_gang(client, "pass", env=env)
+            assert hangs.wait(30)
+            client.batch("TerminateJob", jobId=first, reason="enough")
+            await_status(client, first, "FAILED")
+            second = submit_gang(client, FOREVER, env=env)
+            why = f"store {inside.store.path}: can't read run shared now (it has not answered the attempt before yet); trying again"
+            wait_for(lambda: detail(client, second)["statusReason"] == why, 10, "the reason why it waits")
+            answers.set()
+            await_status(client, second, "RUNNING")
+            assert epoch.read_epoch(run) == 2 and epoch.read_claim(run, 2) is not None
+            wait_for(lambda: epoch.read_claim(run, 1) is None, 10, "that the first claim is released")
+            client.batch("TerminateJob", jobId=second, reason="enough")
+            await_status(client, second, "FAILED")
     finally:
         answers.set()

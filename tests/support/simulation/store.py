@@ -26,6 +26,8 @@ class SimulatedRun:
 
     description: Mapping[str, Any] | None = None
     epoch: int = 0
+    taken: int = 0
+    """The greatest epoch that was claimed, published or not."""
     iteration: int | None = None
     """Of its newest checkpoint."""
     saved: dict[int, float] = field(default_factory=dict)
@@ -92,36 +94,42 @@ class SimulatedRunStore(RunStore):
             self._world.machine.sleep(1.0)
 
     def examine(self, name: str) -> RunFacts:
-        with self._using(f"read run {name}"):
+        def body() -> RunFacts:
             self._wait()
             run = self._world.volume.read(name)
             return RunFacts(name, run.description is None, run.description, epoch=run.epoch)
-        raise AssertionError
+
+        return self._call(f"read run {name}", body)
 
     def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
-        with self._using(f"prepare run {name}"):
+        def body() -> int:
             self._wait()
             run = self._world.volume.write(name)
             run.description = run.description or description
             self._world.write("before an epoch")
-            run.epoch = max(run.epoch, after) + 1
+            epoch = run.taken = max(run.epoch, run.taken, after) + 1
+            self._wait()  # between the two writes of a claim
+            run.epoch = epoch
             self._world.write("after an epoch")
-            return run.epoch
-        raise AssertionError
+            return epoch
+
+        return self._call(f"prepare run {name}", body)
 
     def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
-        with self._using("read outcomes"):
+        def body() -> Mapping[int, Outcome]:
             self._wait()
             found = self._world.volume.read(name).outcomes
             return {node: found[job, attempt, node] for node in nodes if (job, attempt, node) in found}
-        raise AssertionError
+
+        return self._call("read outcomes", body)
 
     def progress(self, name: str, epoch: int) -> Progress:
-        with self._using(f"read the checkpoints of run {name}"):
+        def body() -> Progress:
             self._wait()
             run = self._world.volume.read(name)
             return Progress(run.iteration, run.saved.get(epoch))
-        raise AssertionError
+
+        return self._call(f"read the checkpoints of run {name}", body)
 
     def release(self, name: str, epoch: int) -> None:
         """There is no other controller."""

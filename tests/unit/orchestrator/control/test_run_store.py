@@ -1,0 +1,105 @@
+"""Calls on the store for attempts that are closed before these return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.control.peers import Peers
+from orchestrator.control.run_store import Errands, RunStore, StoreUnavailable
+from shared_store.epoch import Claim, read_claim, read_epoch
+from shared_store.layout import Store
+
+
+class SlowPool:
+    """Calls that return when the test says so, the oldest first."""
+
+    busy_since = None
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Callable[[], Any], Future[Any]]] = []
+
+    def submit(self, body: Callable[[], Any]) -> Future[Any]:
+        self.calls.append((body, Future()))
+        return self.calls[-1][1]
+
+    def close(self, patience: float = 0.0) -> None:
+        self.calls.clear()
+
+    def carry_out(self) -> None:
+        body, future = self.calls.pop(0)
+        try:
+            future.set_result(body())
+        except Exception as error:
+            future.set_exception(error)
+
+
+class Attempts:
+    """Two attempts on a run: the first one is closed while its call is under way."""
+
+    def __init__(self, home: Path) -> None:
+        self.pool, store = SlowPool(), Store(home)
+        self.run = store.run("run")
+        self.runs = RunStore(store, Peers(store, home))
+        self.errands = Errands(self.pool, str(home), lambda _: None)
+
+    def claim(self, number: int, after: int) -> int | None:
+        claim = Claim(self.runs.peers.id, "job", number)
+        return self.errands.result(("job", number), "claim", partial(self.runs.claim, "run", {}, after, claim))
+
+    def close(self, number: int, epoch: int | None = None) -> None:
+        self.errands.forget(("job", number), "run", partial(self.runs.release, "run"), epoch)
+
+
+@pytest.fixture
+def attempts(tmp_path: Path) -> Attempts:
+    return Attempts(tmp_path)
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_a_claim_that_lands_when_its_attempt_is_closed_is_released(attempts: Attempts, late: bool) -> None:
+    attempts.claim(1, 0)
+    if not late:
+        attempts.pool.carry_out()  # it has landed, and nobody has collected it
+    attempts.close(1)
+    if late:
+        attempts.pool.carry_out()
+    assert read_epoch(attempts.run) == 1 and read_claim(attempts.run, 1) == Claim(attempts.runs.peers.id, "job", 1)
+    attempts.pool.carry_out()
+    assert read_claim(attempts.run, 1) is None and not attempts.pool.calls
+
+
+def test_the_next_attempt_on_a_run_waits_for_the_call_of_the_one_before(attempts: Attempts) -> None:
+    attempts.claim(1, 0)
+    attempts.errands.await_earlier("run")  # its own calls do not hold up an attempt
+    attempts.close(1)
+    attempts.errands.await_earlier("another run")
+    with pytest.raises(
+        StoreUnavailable, match=r": can't read run run now \(it has not answered the attempt before yet"
+    ):
+        attempts.errands.await_earlier("run")
+    attempts.pool.carry_out()
+    attempts.errands.await_earlier("run")
+    attempts.claim(2, read_epoch(attempts.run))
+    while attempts.pool.calls:
+        attempts.pool.carry_out()
+    assert attempts.claim(2, 1) == 2 == read_epoch(attempts.run)
+    attempts.close(2, 2)
+    attempts.pool.carry_out()
+    assert read_claim(attempts.run, 2) is None and not attempts.pool.calls
+    assert not attempts.errands.pause(("job", 2))
+
+
+def test_a_late_claim_that_fails_leaves_nothing_to_release(attempts: Attempts) -> None:
+    attempts.run.path.mkdir(parents=True)
+    (attempts.run.path / "EPOCH").write_text("damaged")
+    attempts.claim(1, 0)
+    attempts.close(1)
+    attempts.pool.carry_out()
+    assert not attempts.pool.calls
+    attempts.errands.await_earlier("run")
