@@ -24,6 +24,8 @@ _WHOLE = 512 << 10
 """More than the longest line."""
 _ROUNDS = 16
 """Pieces of each log that are read for a window: few of its lines may be of the rank that is wanted."""
+_FORWARD = 64 << 10
+"""Bytes that are read of each log at once, forwards: a window takes few of them."""
 _CHUNK = 1 << 20
 _SEARCHED = 32 << 20
 """Bytes that one search reads."""
@@ -174,9 +176,16 @@ def _merged_before(sources: Sequence[_Back], rank: int | None, most: int, first:
 
 
 def lines_after(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_WINDOW) -> Window:
-    """The lines after a place; of a log that ``place`` does not name, from its beginning. Raises OSError."""
-    follower = LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(place))
+    """The lines after a place; of a log that ``place`` does not name, from its beginning.
+
+    Reads a bounded part of each log: it may return fewer lines than there are, and then has ``more``. Raises OSError.
+    """
+    follower = LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(place), _FORWARD)
     lines = follower.poll()
+    for _ in range(_ROUNDS - 1):
+        if len(lines) >= most or not follower.behind:
+            break
+        lines += follower.poll()
     if len(lines) <= most:
         return Window(lines, dict(place), dict(follower.offsets), follower.behind)
     taken = {f"{line.attempt}/{line.node}": line.position for line in lines[:most]}

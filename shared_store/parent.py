@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import threading
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
@@ -35,7 +36,7 @@ class RunExists(Exception):
 class WeightsCopy:
     """An unfinished copy of the weights of ``source``, a checkpoint, under a hidden name among the runs.
 
-    As a context manager it is closed at the end, and discarded after an error.
+    As a context manager it is closed at the end, and discarded after an error. Its methods wait for each other.
 
     Args:
         store: Store of the runs.
@@ -47,8 +48,11 @@ class WeightsCopy:
 
     def __init__(self, store: Store, owner: str, source: Checkpoint) -> None:
         self._store, self._owner, self.source = store, owner, source
-        self.hidden = store.path / "runs" / f".{owner}.{uuid.uuid4().hex[:12]}.clone"
+        self.job = str(uuid.uuid4())
+        """Id of the job that it is made for."""
+        self.hidden = store.path / "runs" / f".{owner}.{self.job.replace('-', '')[:12]}.clone"
         self._published: Path | None = None
+        self._using = threading.RLock()
 
     def __enter__(self) -> Self:
         return self
@@ -66,6 +70,10 @@ class WeightsCopy:
             DamagedCheckpoint: The source is missing, truncated or altered.
             OSError: The volume is full or gone.
         """
+        with self._using:
+            self._copy(place)
+
+    def _copy(self, place: str) -> None:
         manifest = self.source.manifest
         if WEIGHTS not in manifest["files"]:
             raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
@@ -89,16 +97,18 @@ class WeightsCopy:
 
     def discard(self) -> None:
         """Delete the unfinished copy."""
-        with suppress(OSError):
-            shutil.rmtree(self.hidden, ignore_errors=True)
-            if self._published is not None:
-                os.rename(self._published, self.hidden)
-        self.close()
+        with self._using:
+            with suppress(OSError):
+                shutil.rmtree(self.hidden, ignore_errors=True)
+                if self._published is not None:
+                    os.rename(self._published, self.hidden)
+            self.close()
 
     def close(self) -> None:
         """End the copy: no part of it has a hidden name any more."""
-        shutil.rmtree(self.hidden, ignore_errors=True)
-        self._in_progress.discard(self.hidden)
+        with self._using:
+            shutil.rmtree(self.hidden, ignore_errors=True)
+            self._in_progress.discard(self.hidden)
 
     def _clear_leftovers(self) -> None:
         with suppress(OSError):
@@ -128,17 +138,18 @@ class NewRun(WeightsCopy):
     def publish(self, name: str, description: Mapping[str, Any]) -> Run:
         """Publish it as run ``name`` with this ``run.json`` (and :attr:`lineage`), by one rename. Raises RunExists, OSError."""
         run = self._store.run(name)
-        write_json(self.hidden / "run.json", {**description, "parent": self.lineage})
-        if os.path.lexists(run.path):
-            raise RunExists
-        try:
-            os.rename(self.hidden, run.path)
-        except OSError as error:
-            if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
-                raise RunExists from None  # another controller was faster
-            raise
-        self._published = run.path
-        sync_directory(run.path.parent)
+        with self._using:
+            write_json(self.hidden / "run.json", {**description, "parent": self.lineage})
+            if os.path.lexists(run.path):
+                raise RunExists
+            try:
+                os.rename(self.hidden, run.path)
+            except OSError as error:
+                if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+                    raise RunExists from None  # another controller was faster
+                raise
+            self._published = run.path
+            sync_directory(run.path.parent)
         return run
 
 
@@ -150,23 +161,27 @@ class TeacherCopy(WeightsCopy):
         self.teacher = teacher
 
     def publish(self, run: Path) -> None:
-        """Move it to the run in directory ``run``, by one rename; a second call moves it on to another run. Raises OSError."""
-        place = Run(run).teacher(self.teacher).checkpoints
-        target = place / self.source.name
-        if not target.exists():
-            place.mkdir(parents=True, exist_ok=True)
-            os.rename(self._published or self.hidden / "teacher" / self.source.name, target)
-            self._published = target
-            for each in (place, *place.parents[:4]):
-                sync_directory(each)
+        """Move it to the run in directory ``run``, by one rename. Raises DamagedFile, OSError."""
+        with self._using:
+            there = Run(run)
+            there.check_links()
+            place = there.teacher(self.teacher).checkpoints
+            target = place / self.source.name
+            if not target.exists():
+                place.mkdir(parents=True, exist_ok=True)
+                os.rename(self.hidden / "teacher" / self.source.name, target)
+                self._published = target
+                for each in (place, *place.parents[:4]):
+                    sync_directory(each)
 
     def discard(self) -> None:
         """Delete the copy and the directories that were created for it."""
-        super().discard()
-        if self._published is not None:
-            with suppress(OSError):  # not empty: it belongs to a run
-                for each in self._published.parents[:4]:
-                    each.rmdir()
+        with self._using:
+            super().discard()
+            if self._published is not None:
+                with suppress(OSError):  # not empty: it belongs to a run
+                    for each in self._published.parents[:4]:
+                        each.rmdir()
 
 
 def parent_checkpoint(run: Run) -> Checkpoint | None:

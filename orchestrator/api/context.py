@@ -24,7 +24,7 @@ from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRec
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
 from shared_store.layout import Run, StoreError
-from shared_store.parent import NewRun, TeacherCopy
+from shared_store.parent import NewRun, TeacherCopy, WeightsCopy
 from shared_store.wording import nearest
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
@@ -58,6 +58,12 @@ def with_store(reconciler: Reconciler, call: Callable[[Known], T]) -> T:
             return call(known)
         except StoreNeeded as needed:
             known[needed.key] = reconciler.calls.call(partial(_outcome, needed.body))
+
+
+def release(reconciler: Reconciler, copy: WeightsCopy) -> None:
+    """Let others write the run that :meth:`Context.publish` gave this copy: it stands in the database, or the copy was taken back."""
+    for name in [name for name, by in list(reconciler.beginning.items()) if by is copy]:
+        del reconciler.beginning[name]
 
 
 def _outcome(body: Callable[[], T]) -> Callable[[], T]:
@@ -94,6 +100,11 @@ class Context:
             raise StoreNeeded(key, body)
         found: T = self.known[key]()
         return found
+
+    def publish(self, name: str, copy: WeightsCopy, body: Callable[[], Any]) -> None:
+        """Have ``body`` put a copy into the run, which nobody else gets until :func:`release`. Raises StoreNeeded, and what it raises."""
+        self.reconciler.beginning[name] = copy
+        self.read(("publish", name), body)
 
     def found(self, name: str) -> RunFacts:
         """The run of that name, as it is in the store. Raises ClientError where no run can have it, StoreNeeded."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping
+from functools import partial
 from typing import Any
 
 from orchestrator.api.errors import ClientError
@@ -11,14 +12,17 @@ from shared_store.layout import Store
 from shared_store.leagues import LeagueError, digest_of_track
 
 
-def check_tracks(store: Store, spec: Mapping[str, Any] | None) -> None:
-    """Raise ClientError where a training of an installed racer's task names a track that does not exist or is damaged."""
-    check_names(store, _tracks(spec), "train.config.track")
+def check_tracks(
+    store: Store,
+    spec: Mapping[str, Any] | None,
+    read: Callable[[Hashable, Callable[[], None]], None] = lambda _, check: check(),
+) -> None:
+    """Raise ClientError where a training of an installed racer's task names a track that does not exist or is damaged.
 
-
-def names_tracks(spec: Mapping[str, Any] | None) -> bool:
-    """Whether :func:`check_tracks` reads the store."""
-    return _tracks(spec) is not None
+    ``read``: reads the store, as :meth:`.context.Context.read`. Raises what it raises.
+    """
+    if (named := _tracks(spec)) is not None:
+        read(("tracks", str(named)), partial(check_names, store, named, "train.config.track"))
 
 
 def _tracks(spec: Mapping[str, Any] | None) -> Any:

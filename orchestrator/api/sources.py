@@ -10,11 +10,11 @@ from functools import partial
 from typing import Any
 
 from orchestrator.api import permissions
-from orchestrator.api.context import Context, find_run
+from orchestrator.api.context import Context, find_run, release
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
-from orchestrator.api.racing_tracks import check_tracks, names_tracks
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
@@ -63,8 +63,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
         The teacher's weights, where the job's run has to hold a copy of them.
     """
     store, spec = context.reconciler.store, gang.spec
-    if names_tracks(spec):
-        context.read("tracks", lambda: check_tracks(store, spec))
+    check_tracks(store, spec, context.read)
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
     for source in sources_of(gang):
@@ -106,27 +105,37 @@ def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], 
     if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; the run has a copy of its teacher's weights", 503)
     copy = TeacherCopy(reconciler.store, reconciler.peers.id, needed.run, needed.checkpoint)
+    tidy = copy.discard
+
+    def end() -> None:
+        tidy()  # waits for a copy that hangs
+        release(reconciler, copy)
+
     try:
-        with copy:
-            copy.copy("teacher")
-            return submit(copy)
+        reconciler.calls.call(partial(copy.copy, "teacher"), works=True)
+        answer = submit(copy)
+        tidy = copy.close
+        return answer
     except DamagedCheckpoint as error:
         raise ClientError(f"{_TEACHER}: run {needed.run}: {error}") from None
     except OSError as error:
         raise ClientError(f"{_TEACHER}: the weights can't be copied ({error.strerror or error})", 503) from None
+    finally:
+        reconciler.calls.later(end)
 
 
 def hold_teacher(context: Context, run: str, needed: TeacherNeeded) -> None:
-    """Give the copy of its teacher to the run of a job that is being submitted. Raises TeacherNeeded where there is no copy yet, OSError."""
+    """Give the copy of its teacher to the run of a job that is being submitted.
+
+    Raises TeacherNeeded where there is no copy yet, StoreNeeded, DamagedFile, OSError.
+    """
     copy = context.teacher
     if copy is None or copy.teacher != needed.run:
         raise needed
     if context.making is not None:
-        copy.publish(context.making.hidden)
-        return
-    there = context.run(run)
-    there.check_links()
-    copy.publish(there.path)
+        context.read("teacher", partial(copy.publish, context.making.hidden))
+    else:
+        context.publish(run, copy, partial(copy.publish, context.run(run).path))
 
 
 def _is_held(context: Context, gang: GangSpec, source: Source) -> bool:

@@ -94,7 +94,7 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
     iteration, places = _had(last_id(request))
     log = LiveLog(chosen, chosen.end() if places is None else places)
-    return stream(request, _Feed(look, log, chosen.run, iteration).changes)
+    return stream(request, _Feed(look, log, chosen.run, iteration).changes, stored=True)
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:

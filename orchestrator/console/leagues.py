@@ -93,7 +93,9 @@ def race_stream(request: Request, name: str) -> Response:
     rows = Rows()
     look = partial(_races, request, name)
     api.read_league(request, name)
-    return stream(request, lambda: rows.changes(_recent.get((current_identity.get(), name), look), {}), _INTERVAL)
+    return stream(
+        request, lambda: rows.changes(_recent.get((current_identity.get(), name), look), {}), _INTERVAL, stored=True
+    )
 
 
 @router.post("/leagues/{name}/races")

@@ -15,11 +15,13 @@ from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import format_sse_event
 
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.access import Access
-from orchestrator.api.http.following import Following, looked
+from orchestrator.api.http.following import Following, looked_patiently
 from orchestrator.api.permissions import current_identity
 from orchestrator.console.pages import session
+from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.errors import Unavailable
 from shared_store.files import DamagedFile
 
@@ -27,6 +29,9 @@ INTERVAL = 0.5
 """Seconds between two looks."""
 _HEARTBEAT = 10.0
 """Seconds after which an idle stream sends a comment: that reveals a browser that has left."""
+_PATIENCE = 5.0
+"""Seconds for which a look may take until the page says so."""
+_SILENT = f"the store or the database has not answered for {_PATIENCE:.0f} s; the page goes on when it does"
 _LONGEST = 300.0
 """Seconds after which a stream ends; the browser reconnects at once, and is admitted again or refused."""
 _MOST_KEPT = 64
@@ -51,8 +56,8 @@ def last_id(request: Request) -> str:
     return request.headers.get("last-event-id") or request.query_params.get("last", "")
 
 
-def stream(request: Request, look: Look, interval: float = INTERVAL) -> StreamingResponse:
-    """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends.
+def stream(request: Request, look: Look, interval: float = INTERVAL, *, stored: bool = False) -> StreamingResponse:
+    """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends; ``stored``: it reads the store.
 
     It also ends where its reader would not be admitted any more: a deleted key, a session that is over. The browser comes back, and is
     sent to the login.
@@ -65,7 +70,8 @@ def stream(request: Request, look: Look, interval: float = INTERVAL) -> Streamin
         return access.still_admits(identity, given)
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
-    events = _events(look, interval, admitted, request.app.state.closing)
+    calls = reconciler_of(request).followed if stored else None
+    events = _events(look, calls, interval, admitted, request.app.state.closing)
     return _Live(events, media_type="text/event-stream", headers=headers)
 
 
@@ -76,17 +82,33 @@ class _Live(Following):
 
 
 async def _events(
-    look: Look, interval: float, admitted: Callable[[], bool], closing: threading.Event
+    look: Look, calls: StoreCalls | None, interval: float, admitted: Callable[[], bool], closing: threading.Event
 ) -> AsyncGenerator[bytes, None]:
     begun = spoken = time.monotonic()
+    is_troubled, found = False, None
+
+    def goes_on() -> bool:
+        return not closing.is_set() and time.monotonic() - begun < _LONGEST and admitted()
+
     yield format_sse_event(retry=1000, comment="Muster")
-    while not closing.is_set() and time.monotonic() - begun < _LONGEST and admitted():
+    while goes_on():
         try:
-            found = await looked(look)
+            async for answer in looked_patiently(lambda: (look(),), calls, _PATIENCE):
+                if answer is not None:
+                    (found,) = answer
+                elif goes_on():
+                    is_troubled = True
+                    yield _written(Event("trouble", _SILENT))
+                else:
+                    return
         except (ClientError, Unavailable, DamagedFile, OSError) as error:
+            is_troubled = True
             yield _written(Event("trouble", str(error)))
             await asyncio.sleep(5 * interval)
             continue
+        if is_troubled:
+            is_troubled = False
+            yield _written(Event("trouble", ""))
         if found is None:
             yield _written(Event("end", None))
             return

@@ -100,10 +100,12 @@ def file(request: Request, name: str, path: str) -> Response:
 
     async def blocks() -> AsyncIterator[bytes]:
         left = size  # a file that grows meanwhile has no more than was announced
-        with opened:
+        try:
             while left and (block := await reconciler.calls.answer(partial(opened.read, min(left, _BLOCK)))):
                 left -= len(block)
                 yield block
+        finally:
+            reconciler.calls.later(opened.close)  # waits for a read that hangs
 
     is_picture = path.endswith(_PICTURES)
     headers = {

@@ -68,7 +68,7 @@ def runs_stream(
 ) -> Response:
     """The changes in a page of the list, as events."""
     table, reconciler = Rows(), reconciler_of(request)
-    return stream(request, lambda: table.changes(_window(reconciler, search, after), {}), _INTERVAL)
+    return stream(request, lambda: table.changes(_window(reconciler, search, after), {}), _INTERVAL, stored=True)
 
 
 @router.get("/runs/{name}")
@@ -107,7 +107,7 @@ def run_stream(request: Request, name: str) -> Response:
             found.append(Event("changed", {"iteration": iteration}))
         return found
 
-    return stream(request, changes)
+    return stream(request, changes, stored=True)
 
 
 def _window(reconciler: Reconciler, search: str, after: str) -> dict[str, dict[str, Any]]:

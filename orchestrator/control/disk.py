@@ -102,9 +102,9 @@ class Disk:
         of = (volume for volume in self._volumes if purpose in (None, volume.name))
         return next((said for volume in of if (said := self._silence(volume) or volume.absent or volume.short)), None)
 
-    def is_silent(self, purpose: str) -> bool:
-        """Whether the volume of this purpose has not answered for a while."""
-        return any(volume.name == purpose and self._silence(volume) for volume in self._volumes)
+    def away(self, purpose: str) -> str | None:
+        """Why the volume of this purpose can't be read: it has not answered for a while, or is not there; None where it can, as far as was seen."""
+        return next((self._silence(each) or each.absent for each in self._volumes if each.name == purpose), None)
 
     def absent(self, purpose: str) -> str | None:
         """Why the volume of this purpose is not there; None where it is, as far as was seen."""

@@ -37,6 +37,7 @@ from orchestrator.persistence.models import Job, JobQueue, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 from shared_store.layout import Store
+from shared_store.parent import WeightsCopy
 
 _SETTLED_AT_ONCE = 200
 """Jobs a commit, of those that only change their state."""
@@ -81,8 +82,10 @@ class Reconciler:
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
-        self.calls = StoreCalls(store.path, lambda: self.disk.is_silent("store"))
+        self.calls = StoreCalls(store.path, lambda: self.disk.away("store"))
         """The store, for requests."""
+        self.followed = StoreCalls(store.path, lambda: self.disk.away("store"))
+        """The store, for those who follow logs and live pages: each has one call at most, however long that takes."""
         self._is_cut_off = False
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
@@ -99,6 +102,8 @@ class Reconciler:
         )
         self.writing = threading.Lock()
         """Held while something is registered, submitted or changed: checks must still hold at the commit."""
+        self.beginning: dict[str, WeightsCopy] = {}
+        """Runs that get files before the database has their jobs, by name; nobody else may write them. Entered under :attr:`writing`."""
         self.submissions = GroupCommit(database, self.writing)
         bus.changed = engine.changed = self._gang_changed
         database.committed = self._committed
@@ -160,6 +165,7 @@ class Reconciler:
             self._thread.join()
         self.attempts.close()
         self.calls.close()
+        self.followed.close()
 
     def problem(self) -> str | None:
         """Why the controller can't do its work now, as its loop has left it; waits for nothing."""

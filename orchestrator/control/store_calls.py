@@ -35,33 +35,36 @@ _inside = contextvars.ContextVar("_inside", default=False)
 
 
 class StoreSilent(Unavailable):
-    """The store does not answer in time, or too many requests wait for it."""
+    """The store is not there, it does not answer in time, or too many requests wait for it."""
 
 
 class StoreCalls:
     """Calls on the store for requests. Any thread may use it."""
 
-    def __init__(self, path: Path, is_silent: Callable[[], bool] = lambda: False) -> None:
-        """``is_silent``: whether the volume is known not to answer; then no call is tried."""
-        self._path, self._is_silent, self.patience = path, is_silent, PATIENCE
+    def __init__(self, path: Path, problem: Callable[[], str | None] = lambda: None) -> None:
+        """``problem``: why the store can't be read, as far as is known; then no call is tried."""
+        self._path, self._problem, self.patience = path, problem, PATIENCE
         self._pool = machine.pool("store of requests", THREADS, WAITING)
+        self._tidying = machine.pool("tidying the store", THREADS + 1)
+        """One thread more than calls that hang and may have to be waited for."""
         self._callers, self._lock = threading.Semaphore(_CALLERS), threading.Lock()
         self.open = self.refused = 0
         """Calls that have not returned, and those that were refused or late since the beginning."""
 
-    def call(self, body: Callable[[], T]) -> T:
-        """The result of ``body``, for a thread that waits. Raises StoreSilent, and what it raises."""
+    def call(self, body: Callable[[], T], *, works: bool = False) -> T:
+        """The result of ``body``, for a thread that waits; ``works``: it may take long. Raises StoreSilent, and what it raises."""
         if _inside.get():
             return body()
-        if self._is_silent() or not self._callers.acquire(timeout=_TURN):
-            raise self._silence("its volume is silent" if self._is_silent() else f"{_CALLERS} requests wait for it")
+        self._check()
+        if not self._callers.acquire(timeout=_TURN):
+            raise self._silence(f"{_CALLERS} requests wait for it")
         try:
-            future = self._submit(body)
+            future, seconds = self.submit(body), WORK if works else self.patience
             try:
-                return machine.result(future, self.patience)
+                return machine.result(future, seconds)
             except TimeoutError:
                 future.cancel()
-                raise self._silence(f"not within {self.patience:.0f} s") from None
+                raise self._silence(f"not within {seconds:.0f} s") from None
         finally:
             self._callers.release()
 
@@ -69,17 +72,22 @@ class StoreCalls:
         """The result of ``body``, for the event loop; ``works``: it may take long. Raises StoreSilent, and what it raises."""
         seconds = WORK if works else self.patience
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(self._submit(body)), seconds)
+            return await asyncio.wait_for(asyncio.wrap_future(self.submit(body)), seconds)
         except TimeoutError:
             raise self._silence(f"not within {seconds:.0f} s") from None
+
+    def later(self, body: Callable[[], object]) -> None:
+        """Let ``body`` close or delete what a call has left, also where it must wait for that call; nobody waits for it."""
+        self._tidying.submit(body)
 
     def close(self) -> None:
         """Leave the calls that hang to themselves."""
         self._pool.close()
+        self._tidying.close()
 
-    def _submit(self, body: Callable[[], T]) -> Future[T]:
-        if self._is_silent():
-            raise self._silence("its volume is silent")
+    def submit(self, body: Callable[[], T]) -> Future[T]:
+        """The result of ``body``, whenever the store gives it. Raises StoreSilent."""
+        self._check()
         context = contextvars.copy_context()
         context.run(_inside.set, True)
         try:
@@ -90,6 +98,11 @@ class StoreCalls:
             self.open += 1
         future.add_done_callback(self._returned)
         return future
+
+    def _check(self) -> None:
+        if (problem := self._problem()) is not None:
+            self.refused += 1
+            raise StoreSilent(problem)
 
     def _returned(self, _: Future[Any]) -> None:
         with self._lock:

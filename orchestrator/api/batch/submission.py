@@ -133,7 +133,8 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     _check_secrets(context, queue, gang)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
-    job_id = str(uuid.uuid4())
+    copy = context.making or context.teacher
+    job_id = copy.job if copy else str(uuid.uuid4())  # the same in each try: its run may have the copy already
     is_array = bool(request.get("arrayProperties"))
     named = gang.options.run
     run = named or f"{name[:110]}-{job_id[:8]}"
@@ -198,6 +199,8 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     restricted = named and permissions.visible_queues() is not None
     if restricted and (owner := owner_of(context.session, context.found(run))):
         permissions.check(Operation.SUBMIT_JOB, owner)
+    if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
+        raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
     if holder:
         raise ClientError(

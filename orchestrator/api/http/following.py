@@ -15,6 +15,7 @@ from starlette.types import Receive, Scope, Send
 from orchestrator import machine
 from orchestrator.api.http.auth import error_response
 from orchestrator.api.permissions import current_identity
+from orchestrator.control.store_calls import StoreCalls
 
 T = TypeVar("T")
 
@@ -22,14 +23,15 @@ MOST = 100
 """Answers of this kind that one key or user has at once."""
 PIECE = 64 << 10
 """Bytes of a log that are read for one of them at once: one whose client does not read keeps them, and as much again."""
-_THREADS = 4
+_THREADS = 24
+"""More than wait for the store at once, for the progress in a list of jobs: the others need no store."""
 _SHARE = 0.01
 """Seconds between two looks, for each open answer: all of them together look 100 times a second."""
 
 _open: Counter[str] = Counter()
 """Number of open answers by the name of their reader; used by the event loop alone."""
 _looks = machine.pool("followers", _THREADS)
-"""Each open answer has one call here at most."""
+"""Each open answer that needs no store has one call here at most."""
 
 
 class Following(StreamingResponse):
@@ -58,14 +60,18 @@ def pause(least: float) -> float:
     return max(least, _SHARE * _open.total())
 
 
-async def looked(look: Callable[[], T]) -> T:
-    """The result of ``look``, from a thread that serves these answers alone. Raises what it raises."""
-    return await asyncio.wrap_future(_looks.submit(partial(contextvars.copy_context().run, look)))
+async def looked(look: Callable[[], T], calls: StoreCalls | None) -> T:
+    """The result of ``look``, from a thread that serves these answers alone; one of ``calls`` where it reads the store.
+
+    Raises what it raises, StoreSilent.
+    """
+    future = calls.submit(look) if calls else _looks.submit(partial(contextvars.copy_context().run, look))
+    return await asyncio.wrap_future(future)
 
 
-async def looked_patiently(look: Callable[[], T], seconds: float) -> AsyncIterator[T | None]:
+async def looked_patiently(look: Callable[[], T], calls: StoreCalls | None, seconds: float) -> AsyncIterator[T | None]:
     """:func:`looked`, and before it None whenever so many seconds have passed: the store may hang."""
-    task = asyncio.ensure_future(looked(look))
+    task = asyncio.ensure_future(looked(look, calls))
     try:
         while not (await asyncio.wait({task}, timeout=seconds))[0]:
             yield None

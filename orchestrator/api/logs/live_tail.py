@@ -17,6 +17,7 @@ from orchestrator.api.logs.events import Event, LogFile
 from orchestrator.api.logs.filter import Matcher
 from orchestrator.api.logs.streams import newest_streams
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.models import now
 
 LONGEST_SESSION = 3 * 3600.0
@@ -29,6 +30,8 @@ _MOST_BEHIND = 4 << 20
 """Bytes of a stream that a session goes back to when its client was slow; what is older is left out."""
 _POLL = 0.025
 """Seconds between two looks at the files; longer where a look takes longer than a quarter of that."""
+_AGAIN = 1.0
+"""Seconds until a store that can't be read is tried again."""
 _REFRESH = 0.25
 """Seconds between two questions to the database about new streams."""
 _OVERLAP = 5000
@@ -47,6 +50,7 @@ class LiveTail:
         matches: Whether a line is asked for.
         """
         self._reconciler, self._wanted, self._matches = reconciler, wanted, matches
+        self.calls = reconciler.followed
         self._started = self._asked = now()
         self._next_refresh = 0.0
         self._read: dict[str, int] = {}
@@ -115,10 +119,11 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
     while not closing.is_set():
         before = time.monotonic()
         try:
-            events, sampled = await looked(tail.poll)
-        except OSError as error:  # the store is away: it may come back, and nothing is lost
+            events, sampled = await looked(tail.poll, tail.calls)
+        except (OSError, StoreSilent) as error:  # the store is away: it may come back, and nothing is lost
             log.warning("live tail: %s", error)
             events, sampled = [], False
+            await asyncio.sleep(_AGAIN)
         except Exception:
             log.exception("a live tail failed")
             yield eventstream.exception("SessionStreamingException", "the controller's log has the details")

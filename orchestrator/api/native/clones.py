@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context, Known, with_store
+from orchestrator.api.context import Context, Known, release, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import Changes, answered, check, submit
 from orchestrator.api.native.runs import spec_of
@@ -102,7 +102,8 @@ def _clone(
             forget_gone_run(session, new)
             answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
             # before the commit: a job without its weights must not start
-            making.publish(new.name, first_description(new, job, job.owner, job.queue))
+            description = first_description(new, job, job.owner, job.queue)
+            context.publish(new.name, making, partial(making.publish, new.name, description))
             return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
 
     try:
@@ -116,6 +117,8 @@ def _clone(
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
+    finally:
+        release(reconciler, making)
     reconciler.wake()
     return answer
 

@@ -14,7 +14,7 @@ from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
 from orchestrator.api.native.fitting import fit_of
-from orchestrator.api.racing_tracks import check_tracks, names_tracks
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import GangSpec, gang_needs
@@ -69,9 +69,7 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
     permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(context.queue(spec.queue).name))
-    document = spec.model_dump(mode="json", exclude_none=True)
-    if names_tracks(document):
-        context.read("tracks", lambda: check_tracks(context.reconciler.store, document))
+    check_tracks(context.reconciler.store, spec.model_dump(mode="json", exclude_none=True), context.read)
     limits.check_document("RegisterJobDefinition", definition)
     return definition
 

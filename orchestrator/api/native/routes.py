@@ -39,7 +39,7 @@ from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
-from orchestrator.control.store_calls import StoreSilent
+from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import Status
@@ -65,6 +65,8 @@ router.include_router(plan_routes.router)
 
 _POLL = 0.05
 """Seconds between two looks at a log that is followed, while few are."""
+_AGAIN = 1.0
+"""Seconds until a store that can't be read is tried again."""
 _PATIENCE = 30.0
 """Seconds for which a log that is not followed may keep its reader waiting."""
 _HEARTBEAT = 5.0
@@ -210,7 +212,8 @@ def job_logs(
             reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions), PIECE
         )
         job_id = job.id
-    lines = _follow(reconciler, job_id, follower, request.app.state.closing) if follow else _stored(follower)
+    followed, closing = reconciler.followed, request.app.state.closing
+    lines = _follow(reconciler, job_id, follower, closing) if follow else _stored(followed, follower)
     return Following(lines, media_type="application/x-ndjson")
 
 
@@ -291,15 +294,15 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
     }
 
 
-async def _stored(follower: LogFollower) -> AsyncIterator[str]:
+async def _stored(calls: StoreCalls, follower: LogFollower) -> AsyncIterator[str]:
     """All that is there, many lines at a time: each piece costs a hand-over between threads."""
     batches = follower.batches()
     try:
-        while (lines := await asyncio.wait_for(looked(lambda: next(batches, None)), _PATIENCE)) is not None:
+        while (lines := await asyncio.wait_for(looked(lambda: next(batches, None), calls), _PATIENCE)) is not None:
             yield _json_lines(lines)
     except TimeoutError:
         yield _trouble(OSError(f"the store has not answered for {_PATIENCE:.0f} s"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, StoreSilent) as error:
         yield _trouble(error)
 
 
@@ -328,11 +331,13 @@ async def _follow(
     while not closing.is_set():
         lines, over = "", False
         try:
-            async for found in looked_patiently(look, _HEARTBEAT):
+            async for found in looked_patiently(look, reconciler.followed, _HEARTBEAT):
                 if found is None:
                     yield "\n"
                 else:
                     lines, over = found
+        except StoreSilent:  # it may come back, and nothing is lost
+            await asyncio.sleep(_AGAIN)
         except (OSError, ValueError, DatabaseError) as error:
             yield _trouble(error)
             return
@@ -340,7 +345,7 @@ async def _follow(
             yield lines
             spoken = time.monotonic()
         if over:
-            async for lines in _stored(follower):
+            async for lines in _stored(reconciler.followed, follower):
                 yield lines
             return
         if time.monotonic() - spoken > _HEARTBEAT:

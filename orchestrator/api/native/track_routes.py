@@ -13,13 +13,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from orchestrator.api import permissions
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
+from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.permissions import Operation, Shared
 from orchestrator.api.turns import Turns
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.spec.tracks import ask
 
-router = APIRouter()
+router = APIRouter(route_class=StoreRoute)
 _turns = Turns("other tracks are being drawn")
 _Measure = Annotated[float | None, Field(default=None, allow_inf_nan=False)]
 

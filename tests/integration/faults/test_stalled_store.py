@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import html
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,14 @@ import httpx
 import pytest
 
 from orchestrator.client import Client
+from orchestrator.control.store_calls import THREADS
+from orchestrator.domain.errors import ApiError
 from orchestrator.server import Server
-from shared_store.layout import Run
+from orchestrator.spec.compile import compile_definition
+from orchestrator.spec.model import validate
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Run, Store
+from shared_store.parent import WeightsCopy
 from tests.conftest import submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.faults.stalled import stalled
@@ -35,6 +43,7 @@ PAGES = (
     *("/queues", "/submit/task/Cartpole", "/submit/yaml?job={reference}"),
 )
 AT_ONCE = 12
+CHATTING = "import time\nwhile True: print('still here', flush=True); time.sleep(0.5)"
 
 
 @pytest.fixture
@@ -140,8 +149,171 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
 
 def test_a_store_whose_volume_is_known_to_be_silent_is_not_even_tried(server: Server) -> None:
     with stalled(server.store.path):
-        silent: Callable[[], bool] = lambda: server.reconciler.disk.is_silent("store")  # noqa: E731
-        wait_for(silent, 60, "that the volume is silent")
+        wait_for(lambda: server.reconciler.disk.away("store"), 60, "that the volume is silent")
         answer = asked(server, "/api/runs")
-        assert answer.status_code == 503 and "its volume is silent" in answer.json()["message"]
+        assert answer.status_code == 503 and "has not answered since" in answer.json()["message"]
         assert asked(server, "/api/jobs").status_code == 200
+
+
+@pytest.mark.parametrize("there", ["nothing", "another store"])
+def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
+    server: Server, tmp_path: Path, there: str
+) -> None:
+    path = server.store.path
+    with Client(server.url) as client:
+        job = submit_gang(client, FOREVER, env={"MUSTER_RUN": "running"})
+        await_status(client, job, "RUNNING")
+        path.rename(tmp_path / "unmounted")
+        try:
+            if there == "another store":
+                add_run(Store(path).open(), "foreign")
+            wait_for(lambda: server.reconciler.disk.away("store"), 60, "that it is seen")
+            said = f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/tracks", "/runs/taught")]
+            for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
+                body = {"name": "copied"}
+                answers.append(httpx.post(f"{server.url}/api/{asks}", json=body, timeout=60))
+            for answer in answers:
+                assert answer.status_code == 503 and said in html.unescape(answer.text), answer.text
+            assert [each["id"] for each in asked(server, "/api/jobs").json()["jobs"]] == [job]
+            assert said in asked(server, f"/api/jobs/{job}").json()["storeProblem"]
+            client.batch("TerminateJob", jobId=job, reason="enough")
+        finally:
+            path.rename(tmp_path / "wrong") if path.exists() else None
+            (tmp_path / "unmounted").rename(path)
+        await_status(client, job, "FAILED")
+        wait_for(lambda: asked(server, "/api/runs/taught").status_code == 200, 30, "the store")
+
+
+def test_a_download_whose_file_stalls_is_cut_off_and_keeps_nobody_waiting(server: Server) -> None:
+    server.reconciler.calls.patience = 2.0
+    exports = server.store.run("taught").path / "exports"
+    exports.mkdir()
+    (exports / "policy.bin").write_bytes(b"policy")
+    with stalled(exports, reads=True):
+        with pytest.raises(httpx.RemoteProtocolError):
+            asked(server, "/runs/taught/files/exports/policy.bin")
+        assert httpx.get(f"{server.url}/healthz", timeout=10).status_code == 200
+        assert is_open(exports / "policy.bin")
+    wait_for(lambda: not is_open(exports / "policy.bin"), 20, "that the file is closed")
+
+
+def test_pages_that_wait_for_the_store_say_so_and_the_others_stay_live(server: Server) -> None:
+    with Client(server.url) as client, ThreadPoolExecutor(40) as threads:
+        job = submit_gang(client, CHATTING, env={"MUSTER_RUN": "running"})
+        await_status(client, job, "RUNNING")
+        waiting = [threads.submit(first_event, server, f"/jobs/{job}/stream", "trouble") for _ in range(2)]
+        assert all(first_event(server, f"/jobs/{job}/stream", "facts") for _ in range(2))
+        with stalled(*hanging(server.store.run("running"))):
+            followers = [threads.submit(first_line, server, job) for _ in range(THREADS)]
+            assert all("has not answered for 5 s" in each.result() for each in waiting)
+            wait_for(lambda: server.reconciler.followed.open >= THREADS, 30, "looks that hang")
+            for path, name in (("/queues/stream", "queues"), ("/keys/stream", "rows"), ("/jobs/stream", "rows")):
+                assert first_event(server, path, name)
+        assert all(each.result() for each in followers), "they go on"
+        client.batch("TerminateJob", jobId=job, reason="enough")
+
+
+def first_event(server: Server, path: str, name: str) -> str:
+    """The data of the first event of that name."""
+    with httpx.stream("GET", f"{server.url}{path}", timeout=60) as events:
+        lines, over = events.iter_lines(), time.monotonic() + 60
+        while time.monotonic() < over:
+            if next(lines) == f"event: {name}":
+                return next(lines)
+    raise AssertionError(f"{path} sent no event {name}")
+
+
+def first_line(server: Server, job: str) -> str:
+    """The first line of a log that is followed."""
+    with httpx.stream("GET", f"{server.url}/api/jobs/{job}/logs?follow=true", timeout=60) as lines:
+        return next(filter(None, lines.iter_lines()))
+
+
+def test_a_clone_whose_publication_hangs_holds_neither_the_database_nor_the_lock(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Client(server.url) as client, ThreadPoolExecutor(1) as threads, ExitStack() as stack:
+        stall_after_the_copy(server, stack, monkeypatch)
+        cloned = threads.submit(
+            httpx.post, f"{server.url}/api/runs/taught/clone", json={"name": "copied"}, timeout=60, trust_env=False
+        )
+        wait_for(lambda: "copied" in server.reconciler.beginning, 30, "the publication")
+        assert_all_else_goes_on(server, client)
+        with pytest.raises(ApiError, match="run copied is being begun by another request"):
+            submit_gang(client, "pass", env={"MUSTER_RUN": "copied"})
+        assert not cloned.done()
+        stack.close()
+        answer = cloned.result().json()
+        description = server.store.run("copied").description() or {}
+        assert answer["run"] == "copied" and description["job"] == answer["jobId"]
+        assert client.batch("DescribeJobs", jobs=[answer["jobId"]])["jobs"] and not server.reconciler.beginning
+
+
+def test_a_teacher_whose_publication_hangs_is_taken_back_when_the_store_answers_again(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.reconciler.calls.patience = 6.0
+    with Client(server.url) as client, ThreadPoolExecutor(1) as threads, ExitStack() as stack:
+        pupil = distilling(client)
+        stall_after_the_copy(server, stack, monkeypatch)
+        submitted = threads.submit(httpx.post, f"{server.url}/v1/submitjob", json=pupil, timeout=60, trust_env=False)
+        wait_for(lambda: server.reconciler.beginning, 30, "the publication")
+        assert_all_else_goes_on(server, client)
+        answer = submitted.result()
+        assert answer.status_code == 503 and "does not answer (not within 6 s)" in answer.json()["message"]
+        stack.close()
+        wait_for(lambda: not server.reconciler.beginning, 30, "that the copy is taken back")
+        assert [path.name for path in (server.store.path / "runs").iterdir() if "pupil" in path.name] == []
+        job = client.batch("SubmitJob", **pupil)["jobId"]
+        run = server.store.run(client.batch("DescribeJobs", jobs=[job])["jobs"][0]["jobName"] + f"-{job[:8]}")
+        assert [each.iteration for each in list_checkpoints(run.teacher("taught"))] == [3]
+
+
+def test_copies_of_teachers_that_hang_leave_threads_for_other_requests(server: Server) -> None:
+    with Client(server.url) as client, ThreadPoolExecutor(40) as threads:
+        pupil = distilling(client)
+        with stalled(*server.store.run("taught").checkpoints.glob("*/learner.pt")):
+            sent = [
+                threads.submit(httpx.post, f"{server.url}/v1/submitjob", json=pupil, timeout=90, trust_env=False)
+                for _ in range(40)
+            ]
+            wait_for(lambda: server.reconciler.calls.open == THREADS, 30, "copies that hang")
+            assert_all_else_goes_on(server, client)
+        codes = [each.result().status_code for each in sent]
+        assert set(codes) == {200, 503} and codes.count(200) >= THREADS
+
+
+def stall_after_the_copy(server: Server, stack: ExitStack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the directory of the runs stall as soon as weights are copied."""
+    copy = WeightsCopy.copy
+
+    def copy_and_stall(self: WeightsCopy, place: str = "parent") -> None:
+        copy(self, place)
+        monkeypatch.undo()
+        stack.enter_context(stalled(server.store.path / "runs"))
+
+    monkeypatch.setattr(WeightsCopy, "copy", copy_and_stall)
+
+
+def distilling(client: Client) -> dict[str, Any]:
+    """The submission of a job that imitates run ``taught``."""
+    settings = {"algorithm": {"class_name": "Distillation"}, "teacher_checkpoint": "taught@3"}
+    train = {"task": "Cartpole", "worlds": 4, "iterations": 2, "algorithm": "rsl_rl", "rsl_rl": settings}
+    spec = validate({"name": "pupil", "resources": {"cpus": 1, "memory": 64}, "train": train}, "pupil")
+    client.batch("RegisterJobDefinition", **compile_definition(spec, "/"))
+    return {"jobName": "pupil", "jobQueue": "default", "jobDefinition": "pupil"}
+
+
+def assert_all_else_goes_on(server: Server, client: Client) -> None:
+    """Nothing is locked, and jobs are submitted, described and stopped."""
+    wait_for(lambda: not server.reconciler.writing.locked(), 2, "that the lock is free")
+    assert connections_of(server) == 0
+    job = submit_gang(client, "pass")
+    client.batch("TerminateJob", jobId=job, reason="enough")
+    assert client.batch("DescribeJobs", jobs=[job])["jobs"]
+    assert httpx.get(f"{server.url}/healthz", timeout=10).status_code == 200
+
+
+def is_open(path: Path) -> bool:
+    return any(each.resolve() == path for each in Path("/proc/self/fd").iterdir())

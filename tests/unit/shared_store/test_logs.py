@@ -7,13 +7,14 @@ import random
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared_store.layout import Run
-from shared_store.log_files import LEAST_LIMIT, LogWriter
+from shared_store.log_files import LEAST_LIMIT, Chunk, LogWriter, read_log
 from shared_store.log_windows import Chosen, first_error, lines_after, lines_before, search
 from shared_store.logs import LogFollower, LogLine, format_line, parse_line, timestamp
 
@@ -186,6 +187,21 @@ def test_going_on_from_any_window_gives_what_follows_it(kept: Run, most: int) ->
     assert seen(after.lines) == everything[begin + most : begin + 2 * most] and after.more
     rest = lines_after(chosen, after.last, 10_000)
     assert seen(rest.lines) == everything[begin + 2 * most :] and not rest.more
+
+
+def test_a_window_of_long_logs_reads_little_of_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, nodes, read = Run(tmp_path / "run"), 8, list[int]()
+    for node in range(nodes):
+        append(run, "".join(line(second, "word " * 20) for second in range(10_000)), node)
+
+    def counted(*given: Any) -> Chunk:
+        chunk = read_log(*given)
+        read.append(len(chunk.data))
+        return chunk
+
+    monkeypatch.setattr("shared_store.logs.read_log", counted)
+    window = lines_after(Chosen(run, "job"), {}, 100)
+    assert len(window.lines) == 100 and window.more and sum(read) <= nodes * 64 << 10
 
 
 def test_a_follower_goes_on_from_the_end_of_the_last_window(more: Run) -> None:

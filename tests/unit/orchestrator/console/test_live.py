@@ -62,7 +62,13 @@ def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
         raise ClientError("the run is gone")
 
     blocks = written([failing, lambda: [Event("a", 1)], lambda: None])
-    assert [block.split("\n")[0] for block in blocks[1:]] == ["event: trouble", "event: a", "event: end"]
+    assert [block.split("\n")[0] for block in blocks[1:]] == [
+        "event: trouble",
+        "event: trouble",
+        "event: a",
+        "event: end",
+    ]
+    assert 'data: ""' in blocks[2], "the trouble is over"
     assert "the run is gone" in blocks[1]
 
 
