@@ -206,8 +206,11 @@ def test_a_reason_that_no_column_can_hold_is_written_out(bench: Bench) -> None:
     bench.runs_and_ends("good")
 
 
-@pytest.mark.parametrize("part", ["begin", "advance", "preempt"])
-@pytest.mark.parametrize("words", ["no words for it", HALF], ids=["plain", "half a character"])
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [("begin", "no words for it"), ("advance", HALF), ("preempt", "no words for it")],
+    ids=["begin", "advance", "preempt"],
+)
 def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: str, words: str
 ) -> None:
