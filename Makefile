@@ -3,7 +3,7 @@
 # make test   lint, the unit tests, and every command of the README for real: minutes
 # make check            everything: the tiers below, whose tests also run alone, two lanes beside each other
 # make unit integration training long robots services console engines    one tier of tests; docs/contributing.md says what each is
-# make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
+# make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks, outages
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make mutants          small faults in the pure modules, and in a sample of PPO: which ones do the unit tests not notice?
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down

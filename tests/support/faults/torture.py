@@ -41,6 +41,8 @@ from tests.support.processes import end_all
 
 BLOWS = 12
 """At most so many in one run, besides those that hit a controller while it starts."""
+_SOON = ("--lost-after", "30s")
+"""Options of ``muster serve``: a supervisor that is frozen while its ranks train is found by its silence, and runs wait for that."""
 ROUNDS: dict[str, Callable[[Path, int], tuple[Counter[str], list[str]]]] = {
     "hostile jobs": hostile_round,
     "full disk": full_disk_round,
@@ -88,7 +90,7 @@ class Torture:
         self.kills = self._total()
 
     def _lane(self, lane: int) -> None:
-        home = Home(self.directory / f"home-{lane}")
+        home = Home(self.directory / f"home-{lane}", *_SOON)
         try:
             while name := self._next():
                 blows = min(BLOWS, max(1, self.kills - self._total()))
@@ -99,7 +101,7 @@ class Torture:
                 self._tell(result)
                 if result.verdict.violations:  # its home is kept for whoever looks; the next run gets a new one
                     home.close()
-                    home = Home(self.directory / f"home-{lane}-after-{plan.seed}")
+                    home = Home(self.directory / f"home-{lane}-after-{plan.seed}", *_SOON)
                 else:
                     shutil.rmtree(fire.run.path)
         finally:
