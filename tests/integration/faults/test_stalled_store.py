@@ -225,9 +225,12 @@ def first_event(server: Server, path: str, name: str) -> str:
 
 
 def first_line(server: Server, job: str) -> str:
-    """The first line of a log that is followed."""
-    with httpx.stream("GET", f"{server.url}/api/jobs/{job}/logs?follow=true", timeout=60) as lines:
-        return next(filter(None, lines.iter_lines()))
+    """The first line of a log that is followed; on a busy machine it may be refused at first, since too many others ask at once."""
+    while True:
+        with httpx.stream("GET", f"{server.url}/api/jobs/{job}/logs?follow=true", timeout=60) as lines:
+            if lines.status_code != 503:
+                return next(filter(None, lines.iter_lines()))
+        time.sleep(0.2)
 
 
 def test_a_clone_whose_publication_hangs_holds_neither_the_database_nor_the_lock(
