@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol, TypeVar
@@ -154,6 +156,29 @@ def monotonic() -> float:
 def wall() -> float:
     """Unix time [s]."""
     return _current.wall()
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When something began."""
+
+    monotonic: float
+    """Seconds of the clock that no one sets."""
+    wall: float
+    """Unix time [s]."""
+
+    @property
+    def passed(self) -> float:
+        """Seconds since then."""
+        return monotonic() - self.monotonic
+
+    def __str__(self) -> str:
+        return f"{datetime.fromtimestamp(self.wall, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def moment() -> Moment:
+    """Now."""
+    return Moment(monotonic(), wall())
 
 
 def boot() -> str:

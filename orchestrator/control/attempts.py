@@ -20,7 +20,7 @@ from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
 from orchestrator.control.monitoring import Monitoring
-from orchestrator.control.observer import Observer
+from orchestrator.control.observer import CHECK_INTERVAL, Observer
 from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
@@ -74,8 +74,6 @@ NO_EPOCH = 0
 """Of an attempt that has none yet."""
 _READERS = 16
 """Threads for the store. An open attempt has one call there at most, and of a run's closed attempts only the last one has any."""
-_CHECK_INTERVAL = 5.0
-"""Seconds between two looks at a gang of which a node is silent, or whose cause is not known yet."""
 _LEAST, _LATER = 0.02, 60.0
 """Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
 
@@ -159,7 +157,7 @@ class Attempts:
         elif state.cause_since is not None or any(
             self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes
         ):
-            pause = _CHECK_INTERVAL
+            pause = CHECK_INTERVAL
         elif job.timeout is not None and attempt.running_since is not None:
             pause = attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000
         else:

@@ -7,7 +7,6 @@ import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -57,8 +56,8 @@ class _Volume:
     path: Path
     short: str | None = None
     absent: str | None = None
-    asked: tuple[float, float] | None = None
-    """Start of the look under way, by the monotonic clock [s] and in Unix time [s]."""
+    asked: machine.Moment | None = None
+    """Start of the look under way."""
 
 
 class Disk:
@@ -113,17 +112,16 @@ class Disk:
     @staticmethod
     def _silence(volume: _Volume) -> str | None:
         asked = volume.asked
-        if asked is None or machine.monotonic() - asked[0] < _PATIENCE:
+        if asked is None or asked.passed < _PATIENCE:
             return None
-        since = datetime.fromtimestamp(asked[1], UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         return (
-            f"the volume of the {volume.name} ({volume.path}) has not answered since {since}: no new gang starts until it does; "
+            f"the volume of the {volume.name} ({volume.path}) has not answered since {asked}: no new gang starts until it does; "
             "see whether its server can be reached"
         )
 
     def _watch(self, volume: _Volume) -> None:
         while not self._ended.wait(_INTERVAL):
-            volume.asked = (machine.monotonic(), machine.wall())
+            volume.asked = machine.moment()
             volume.short = self._look(volume)
             volume.asked = None
 

@@ -17,8 +17,8 @@ from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Attempt, Job, Node, now
 from shared_store.outcomes import Outcome
 
-_CHECK_INTERVAL = 5.0
-"""Seconds between two looks for the outcomes of nodes that can't be seen or heard."""
+CHECK_INTERVAL = 5.0
+"""Seconds between two looks at a gang of which a node can't be seen or heard, or whose cause is not known yet."""
 
 
 @dataclass
@@ -92,7 +92,7 @@ class Observer:
                 node.phase is NodePhase.UNREACHABLE or node.stale or presence.is_silent((job.id, attempt.number, index))
             )
         ]
-        if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < _CHECK_INTERVAL)):
+        if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < CHECK_INTERVAL)):
             return True
         memory.asked = memory.asked or (moment, ended, hidden)
         began, over, others = memory.asked

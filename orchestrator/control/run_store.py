@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from math import inf
 from typing import Any, TypeVar
@@ -164,7 +163,7 @@ class Errands:
     def __init__(self, pool: Pool, store: str, changed: Callable[[str], None]) -> None:
         """``store``: its path, for messages; ``changed``: called, on any thread, with the job whose result is there."""
         self._pool, self._store, self._changed = pool, store, changed
-        self._under_way: dict[Key, tuple[str, Future[Any], float]] = {}
+        self._under_way: dict[Key, tuple[str, Future[Any], machine.Moment]] = {}
         """By attempt: the name of its errand, the result, and since when it is under way (monotonic [s])."""
         self._left: dict[str, Future[Any]] = {}
         """By run: the call of a closed attempt that had not returned."""
@@ -197,7 +196,7 @@ class Errands:
         if under_way is None:
             if not self._failing.waits(key):
                 future = self._pool.submit(body)
-                self._under_way[key] = name, future, machine.monotonic()
+                self._under_way[key] = name, future, machine.moment()
                 future.add_done_callback(lambda _: self._changed(key[0]))
             return None
         started, future, _ = under_way
@@ -227,16 +226,14 @@ class Errands:
         """Seconds until the store is tried again for the attempt, or is overdue; then infinity until it answers."""
         if key not in self._under_way:
             return self._failing.pause(key)
-        left = self._under_way[key][2] + OVERDUE - machine.monotonic()
+        left = OVERDUE - self._under_way[key][2].passed
         return left if left > 0 else inf
 
     def _silence(self, key: Key) -> str:
         """That the store does not answer, and since when; empty while it does, or is not overdue."""
-        since = self._under_way[key][2] if key in self._under_way else inf
-        if (passed := machine.monotonic() - since) < OVERDUE:
+        if key not in self._under_way or (since := self._under_way[key][2]).passed < OVERDUE:
             return ""
-        began = datetime.fromtimestamp(machine.wall() - passed, UTC)
-        return f"store {self._store} has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
+        return f"store {self._store} has not answered since {since}"
 
     def forget(self, key: Key, run: str, release: Callable[[int], None], epoch: int | None) -> None:
         """The attempt on a run is closed.
@@ -246,7 +243,7 @@ class Errands:
             epoch: The attempt's; None where it has none yet.
         """
         self._failing.worked(key)
-        name, call, _ = self._under_way.pop(key, ("", None, 0.0))
+        name, call, _ = self._under_way.pop(key, ("", None, None))
         if call is not None:
             self._left = {each: left for each, left in self._left.items() if not left.done()} | {run: call}
         if epoch is not None:

@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from math import inf
 from typing import Any, TypeVar
@@ -104,8 +103,8 @@ class Runner:
         if since is None or (passed := machine.monotonic() - since) < OVERDUE:
             return None
         if (said := self._backoff.said("silence")) is None:
-            began = datetime.fromtimestamp(machine.wall() - passed, UTC)
-            said = f"the {self.engine.name} engine has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
+            began = machine.Moment(since, machine.wall() - passed)
+            said = f"the {self.engine.name} engine has not answered since {began}"
             self._backoff.failed("silence", said)
         return said
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,28 +17,9 @@ from orchestrator.engines.toolkit.endings import ended
 from orchestrator.persistence.models import Attempt, Node
 from shared_store.outcomes import Outcome
 from tests.support.orchestrator.rows import job
+from tests.support.orchestrator.slow_pool import SlowPool
 
 AWAY = NodeStatus(NodePhase.UNREACHABLE, words="the engine is away")
-
-
-class SlowPool:
-    """Calls that return when the test says so."""
-
-    busy_since = None
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[Callable[[], Any], Future[Any]]] = []
-
-    def submit(self, body: Callable[[], Any]) -> Future[Any]:
-        self.calls.append((body, Future()))
-        return self.calls[-1][1]
-
-    def close(self, patience: float = 0.0) -> None:
-        self.calls.clear()
-
-    def carry_out(self) -> None:
-        body, future = self.calls.pop()
-        future.set_result(body())
 
 
 class Gang:

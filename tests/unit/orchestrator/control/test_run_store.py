@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,29 +11,7 @@ from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import Errands, RunStore, StoreUnavailable
 from shared_store.epoch import Claim, read_claim, read_epoch
 from shared_store.layout import Store
-
-
-class SlowPool:
-    """Calls that return when the test says so, the oldest first."""
-
-    busy_since = None
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[Callable[[], Any], Future[Any]]] = []
-
-    def submit(self, body: Callable[[], Any]) -> Future[Any]:
-        self.calls.append((body, Future()))
-        return self.calls[-1][1]
-
-    def close(self, patience: float = 0.0) -> None:
-        self.calls.clear()
-
-    def carry_out(self) -> None:
-        body, future = self.calls.pop(0)
-        try:
-            future.set_result(body())
-        except Exception as error:
-            future.set_exception(error)
+from tests.support.orchestrator.slow_pool import SlowPool
 
 
 class Attempts:
