@@ -31,7 +31,7 @@ def follow(client: Client, job_id: str) -> int:
     if detail["kind"] != "train":
         return _follow_logs(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
-    seen, reason, attempts = 0, None, []
+    seen, reason, has_run = 0, None, False
     with display:
         while True:
             try:
@@ -41,9 +41,10 @@ def follow(client: Client, job_id: str) -> int:
                     reason = job.get("statusReason")
                     attempts = client.get(f"/api/jobs/{job_id}")["attempts"]
                     display.nodes = len(attempts[-1]["nodes"]) if attempts else display.nodes
+                    has_run = any(attempt["epoch"] for attempt in attempts)
                 records = []
-                # a job that never started has no run, even after its end
-                while attempts and (page := client.get(f"/api/runs/{detail['run']}/metrics", after=seen)):
+                # the run is there once an attempt has taken it: not yet at the beginning, and never where no attempt started
+                while has_run and (page := client.get(f"/api/runs/{detail['run']}/metrics", after=seen)):
                     records, seen = page, page[-1]["iteration"]
             except Unreachable:
                 client.await_return()

@@ -8,12 +8,15 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import httpx
 import pytest
 
+from orchestrator.cli.progress import follow
 from orchestrator.client import Client
+from orchestrator.control.run_store import RunStore
 from orchestrator.control.store_calls import THREADS
 from orchestrator.domain.errors import ApiError
 from orchestrator.server import Server
@@ -25,7 +28,7 @@ from shared_store.parent import WeightsCopy
 from tests.conftest import submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.faults.stalled import stalled
-from tests.support.orchestrator.jobs import FOREVER, await_status
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.waiting import wait_for
 
@@ -271,6 +274,29 @@ def test_a_teacher_whose_publication_hangs_is_taken_back_when_the_store_answers_
         job = client.batch("SubmitJob", **pupil)["jobId"]
         run = server.store.run(client.batch("DescribeJobs", jobs=[job])["jobs"][0]["jobName"] + f"-{job[:8]}")
         assert [each.iteration for each in list_checkpoints(run.teacher("taught"))] == [3]
+
+
+def test_who_follows_a_job_waits_while_the_store_is_slow_to_begin_its_run(
+    server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answered, claim = Event(), RunStore.claim
+    monkeypatch.setattr(RunStore, "claim", lambda *arguments: (answered.wait(60), claim(*arguments))[1])
+    printed = ""
+
+    def shows_a_start() -> bool:
+        nonlocal printed
+        printed += capsys.readouterr().out
+        return "STARTING" in printed or followed.done()
+
+    with Client(server.url) as client, ThreadPoolExecutor(1) as threads:
+        job = client.batch("SubmitJob", **distilling(client))["jobId"]
+        followed = threads.submit(follow, client, job)
+        wait_for(shows_a_start, 30, "a start that is shown")
+        assert [each["epoch"] for each in detail(client, job)["attempts"]] == [0] and not followed.done()
+        answered.set()
+        await_status(client, job, "RUNNING")
+        client.batch("TerminateJob", jobId=job, reason="enough")
+        assert followed.result(60) == 1
 
 
 def test_copies_of_teachers_that_hang_leave_threads_for_other_requests(server: Server) -> None:
