@@ -130,13 +130,9 @@ class Admission:
         """Why a job waits now, or a note for its user while it runs; None where its own reason says all."""
         shortage, report = self._disk.shortage(), self._report
         if job.status in (Status.STARTING, Status.RUNNING):
-            failed = self._backoff.said(("preempt", job.id)) if report and report.preempts(job.id) else None
-            reason = failed.removeprefix(f"job {job.id}: ") if failed else job.status_reason
-            return (
-                f"{reason}; {shortage}"
-                if shortage is not None and shortage not in (reason or "")
-                else failed and reason
-            )
+            failure = self._backoff.failure(("preempt", job.id)) if report and report.preempts(job.id) else None
+            reason = failure or job.status_reason or ""
+            return failure if shortage is None or shortage in reason else "; ".join(filter(None, (reason, shortage)))
         if job.status != Status.RUNNABLE or self._work_queue.since(job.id) is None:
             return None
         if shortage is not None or report is None:

@@ -119,7 +119,7 @@ class Deliveries:
                 "queues": webhook.queues,
                 "kinds": webhook.kinds,
                 "waiting": waiting.get(webhook.name, 0),
-                "problem": self._backoff.said(webhook.name),
+                "problem": self._backoff.failure(webhook.name),
                 "failed": _failed(session, WebhookDelivery.webhook == webhook.name),
             }
             for webhook in self.webhooks.values()

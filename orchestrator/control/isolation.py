@@ -70,7 +70,7 @@ class Isolation:
         """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
         reason = f"the controller failed on this job ({_words(error)}); trying again"
         reason = excerpt(storable(reason), LONGEST_REASON)
-        if self.backoff.failed((what, job_id), f"job {job_id}: {reason}", error):
+        if self.backoff.failed((what, job_id), reason, error, of=f"job {job_id}"):
             with self._database.session() as session:  # by its id alone: its row may be what is damaged
                 explained = (
                     update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)

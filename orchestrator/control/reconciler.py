@@ -154,7 +154,7 @@ class Reconciler:
 
     def _withdrawn(self, job_id: str, reason: str) -> None:
         """A job can't start now: it is tried again at growing intervals."""
-        self._backoff.failed(("start", job_id), f"job {job_id}: {reason}")
+        self._backoff.failed(("start", job_id), reason, of=f"job {job_id}")
 
     def close(self) -> None:
         """Leave the loop; running gangs continue, and the next controller on this database finds them."""

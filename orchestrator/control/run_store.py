@@ -208,7 +208,7 @@ class Errands:
         except StoreUnavailable as error:
             if not again:
                 raise
-            self._failing.failed(key, f"job {key[0]}: {error}")
+            self._failing.failed(key, str(error), of=f"job {key[0]}")
             return None
         self._failing.worked(key)
         return result if started == name else self.result(key, name, body, again)
@@ -220,7 +220,7 @@ class Errands:
 
     def failure(self, key: Key) -> str:
         """Why the store could not be used for the attempt the last time; empty where it could."""
-        return (self._failing.said(key) or "").removeprefix(f"job {key[0]}: ")
+        return self._failing.failure(key) or ""
 
     def pause(self, key: Key) -> float:
         """Seconds until the store is tried again for the attempt, or is overdue; then infinity until it answers."""

@@ -67,15 +67,15 @@ class Stops:
                 self._stopped[key] = stop.result()
                 return self._stopped[key]
             why = " ".join(str(error).split()).removesuffix("; trying again")
-            said = f"job {key[0]}: attempt {key[1]} can't be stopped: {why}; trying again"
+            failure = f"attempt {key[1]} can't be stopped: {why}; trying again"
             expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
-            self._denied.failed(key, said, None if expected else error)
+            self._denied.failed(key, failure, None if expected else error, of=f"job {key[0]}")
         return None
 
     def reason(self, key: Key) -> str | None:
         """Why the gang is not stopped yet, for the job's user; None where nothing is amiss."""
-        if failure := self._denied.said(key):
-            return failure.removeprefix(f"job {key[0]}: ")
+        if failure := self._denied.failure(key):
+            return failure
         stop = self._under_way.get(key)
         if stop is None or not stop.waited:
             return None

@@ -102,23 +102,23 @@ class Runner:
         since = self._thread.busy_since
         if since is None or (passed := machine.monotonic() - since) < OVERDUE:
             return None
-        if (said := self._backoff.said("silence")) is None:
+        if (silence := self._backoff.failure("silence")) is None:
             began = machine.Moment(since, machine.wall() - passed)
-            said = f"the {self.engine.name} engine has not answered since {began}"
-            self._backoff.failed("silence", said)
-        return said
+            silence = f"the {self.engine.name} engine has not answered since {began}"
+            self._backoff.failed("silence", silence)
+        return silence
 
     @property
     def unknown(self) -> str | None:
         """Why it is not known what the engine has; None once it has told that."""
         if self._capacity is not None:
             return None
-        return self.silence or self._backoff.said("hosts") or f"the {self.engine.name} engine has not answered yet"
+        return self.silence or self._backoff.failure("hosts") or f"the {self.engine.name} engine has not answered yet"
 
     @property
     def health(self) -> Health:
         """The engine's answers just now."""
-        problem = self.silence or self._backoff.said("hosts") or self.unknown
+        problem = self.silence or self._backoff.failure("hosts") or self.unknown
         gangs = {subject[1]: pause for subject, pause in self._backoff.pauses().items() if isinstance(subject, tuple)}
         return Health(self._told_at, problem, len(gangs), min(gangs.values(), default=None))
 
@@ -188,7 +188,7 @@ class Runner:
             self._observed[handle] = None
             self.look([handle])
         seen, _ = self._seen.get(handle, (None, 0.0))
-        if trouble := self.silence or self._backoff.said(subject):
+        if trouble := self.silence or self._backoff.failure(subject):
             away = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
             return [
                 replace(each, phase=away.phase, words=trouble) if each.running else each
@@ -205,7 +205,7 @@ class Runner:
 
     def asked(self, handle: Handle) -> float | None:
         """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
-        if handle not in self._seen or self.silence or self._backoff.said(("look", handle)):
+        if handle not in self._seen or self.silence or self._backoff.failure(("look", handle)):
             return None
         return machine.monotonic() - self._seen[handle][1]
 
@@ -288,7 +288,7 @@ class Runner:
 
     def _look(self, handle: Handle) -> None:
         subject = ("look", handle)
-        before = self._seen.get(handle, (None, 0.0))[0], self._backoff.said(subject)
+        before = self._seen.get(handle, (None, 0.0))[0], self._backoff.failure(subject)
         asked = machine.monotonic()
         try:
             status = self._call("look at the gang", lambda: self.engine.observe(handle))
@@ -300,7 +300,7 @@ class Runner:
                 if handle in self._observed:  # else it was forgotten meanwhile
                     self._seen[handle] = status, asked
         self._looks.discard(handle)
-        if before != (self._seen.get(handle, (None, 0.0))[0], self._backoff.said(subject)):
+        if before != (self._seen.get(handle, (None, 0.0))[0], self._backoff.failure(subject)):
             self._changed(handle.gang)
 
 

@@ -12,7 +12,7 @@ from orchestrator import machine
 
 @dataclass
 class _Trouble:
-    said: str
+    failure: str
     pause: float
     next: float
 
@@ -30,21 +30,22 @@ class Backoff:
         """Whether anything fails at present."""
         return bool(self._troubles)
 
-    def failed(self, subject: Hashable, said: str, error: BaseException | None = None) -> bool:
+    def failed(self, subject: Hashable, failure: str, error: BaseException | None = None, *, of: str = "") -> bool:
         """Note a failure; returns whether it differs from the subject's last one, and only then logs it.
 
         Args:
             subject: What failed.
-            said: One line, the same for the same failure.
+            failure: One line, the same for the same failure.
             error: Where given, its traceback is logged too: a bug.
+            of: What the log names before the failure, as ``job 3f0c``.
         """
         with self._lock:
             before = self._troubles.get(subject)
             pause = self._first if before is None else min(2 * before.pause, self._most)
-            self._troubles[subject] = _Trouble(said, pause, machine.monotonic() + pause)
-        if before is not None and before.said == said:
+            self._troubles[subject] = _Trouble(failure, pause, machine.monotonic() + pause)
+        if before is not None and before.failure == failure:
             return False
-        self._log.error("%s", said, exc_info=error)
+        self._log.error("%s", f"{of}: {failure}" if of else failure, exc_info=error)
         return True
 
     def waits(self, subject: Hashable) -> bool:
@@ -57,10 +58,10 @@ class Backoff:
         trouble = self._troubles.get(subject)
         return max(0.0, trouble.next - machine.monotonic()) if trouble else 0.0
 
-    def said(self, subject: Hashable) -> str | None:
+    def failure(self, subject: Hashable) -> str | None:
         """The last failure; None where the subject works."""
         trouble = self._troubles.get(subject)
-        return trouble.said if trouble else None
+        return trouble.failure if trouble else None
 
     def pauses(self) -> dict[Hashable, float]:
         """Seconds until the next try of each subject that fails at present; 0 where it may be tried now."""

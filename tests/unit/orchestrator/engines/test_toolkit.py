@@ -125,7 +125,7 @@ def test_an_action_that_is_not_tried_any_more_is_forgotten_and_a_waiting_one_is_
     waiting.failed(("start", "waits"), "can't start")
     for each in (backoff, waiting):
         each.tidy(idle=0.0)
-    assert not backoff and waiting.said(("start", "waits")) == "can't start"
+    assert not backoff and waiting.failure(("start", "waits")) == "can't start"
 
 
 def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer_each_time(
@@ -142,7 +142,7 @@ def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer
         assert not backoff.waits("job") and not backoff.worked("job", lasting=True)
     assert [record.getMessage() for record in caplog.records] == ["can't end"]
     moment += 3.9
-    assert not backoff.worked("job", lasting=True) and backoff.said("job") == "can't end"
+    assert not backoff.worked("job", lasting=True) and backoff.failure("job") == "can't end"
     moment += 0.1
     assert backoff.worked("job", lasting=True) and not backoff
 
