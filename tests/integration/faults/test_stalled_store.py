@@ -170,8 +170,9 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
         try:
             if there == "another store":
                 add_run(Store(path).open(), "foreign")
-            wait_for(lambda: server.reconciler.disk.away("store"), 60, "that it is seen")
             said = f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            # the look before may have found the path empty
+            wait_for(lambda: said in (server.reconciler.disk.away("store") or ""), 60, "that it is seen")
             answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/tracks", "/runs/taught")]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}
@@ -207,6 +208,7 @@ def test_pages_that_wait_for_the_store_say_so_and_the_others_stay_live(server: S
         await_status(client, job, "RUNNING")
         waiting = [threads.submit(first_event, server, f"/jobs/{job}/stream", "trouble") for _ in range(2)]
         assert all(first_event(server, f"/jobs/{job}/stream", "facts") for _ in range(2))
+        assert first_line(server, job), "the directory of its log is there"
         with stalled(*hanging(server.store.run("running"))):
             followers = [threads.submit(first_line, server, job) for _ in range(THREADS)]
             assert all("has not answered for 5 s" in each.result() for each in waiting)
