@@ -27,7 +27,7 @@ class Pool(Protocol):
     """Carries out calls that may hang, on a bounded number of threads."""
 
     def submit(self, body: Callable[[], T]) -> Future[T]:
-        """The result of ``body``, later. Raises PoolFull."""
+        """The result of ``body``, later; never, once the pool is closed. Raises PoolFull."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""A node's shim, the parent of its supervisor: ``python -I -S shim.py PARENT GROUP FILES COMMAND ...``.
+"""A node's shim, the parent of its supervisor: ``python -I -S shim.py PARENT GROUP FILES EXIT COMMAND ...``.
 
 It is a subreaper: processes of the node whose parent dies are re-parented to it, not to init. If control groups can be created, it
 puts the node into one. When the supervisor ends, however it ends, the shim kills and reaps all remaining processes and exits with the
@@ -26,10 +26,14 @@ SCRATCH = "muster-node-{pid}-"
 _PASSED_ON = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _ORPHANED = signal.SIGUSR1
 """Signal from the kernel to the shim when the process that it is tied to dies."""
+_DIGITS = 3
+"""Of an exit code."""
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 
 
-def shimmed(command: Sequence[str], group: str = "", *, tied_to: int = 0, files: int = 0) -> list[str]:
+def shimmed(
+    command: Sequence[str], group: str = "", *, tied_to: int = 0, files: int = 0, exit_file: str = ""
+) -> list[str]:
     """The command line that runs ``command``, a node's supervisor, below a shim.
 
     Args:
@@ -37,8 +41,9 @@ def shimmed(command: Sequence[str], group: str = "", *, tied_to: int = 0, files:
         group: Directory of a control group to create for it; empty for none.
         tied_to: Pid of the parent; the node ends when the parent's thread that starts the shim dies; 0 for none.
         files: Soft limit of open files for the node, at most the hard one; 0 for the limit of the process that starts the shim.
+        exit_file: The file of :func:`make_exit_file`, for engines that outlive the shim's parent.
     """
-    return [sys.executable, "-I", "-S", __file__, str(tied_to), group, str(files), *command]
+    return [sys.executable, "-I", "-S", __file__, str(tied_to), group, str(files), exit_file, *command]
 
 
 def group_of(command: Sequence[bytes]) -> str | None:
@@ -47,7 +52,22 @@ def group_of(command: Sequence[bytes]) -> str | None:
     return os.fsdecode(command[5]) if is_shim else None
 
 
-def main(parent: str, group: str, files: str, *command: str) -> None:
+def make_exit_file(path: str) -> None:
+    """Make the file in which a shim leaves its exit code, of its later size: at the end the volume may be full. Raises OSError."""
+    with open(path, "w") as file:
+        file.write(" " * _DIGITS)
+
+
+def exit_code_in(path: str) -> int | None:
+    """The exit code that a shim has left in its file; None where there is none."""
+    try:
+        with open(path) as file:
+            return int(file.read())
+    except (OSError, ValueError):
+        return None
+
+
+def main(parent: str, group: str, files: str, exit_file: str, *command: str) -> None:
     """Run ``command`` to its end; exits with its exit code, 128 + n for signal n."""
     import ctypes
 
@@ -70,7 +90,17 @@ def main(parent: str, group: str, files: str, *command: str) -> None:
         _end_the_rest(group, lambda: libc.prctl(_PR_SET_NAME, STUCK.encode(), 0, 0, 0))
     if code > 128:  # the supervisor did not get to remove it
         _remove_scratch(supervisor)
+    if exit_file:
+        _leave(exit_file, code)
     os._exit(code)
+
+
+def _leave(path: str, code: int) -> None:
+    try:
+        file = os.open(path, os.O_WRONLY | os.O_NOFOLLOW)
+        os.write(file, f"{code:{_DIGITS}}".encode())
+    except OSError:
+        pass  # the engine has forgotten the node
 
 
 def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:

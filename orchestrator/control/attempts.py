@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from typing import Any
 
 from sqlalchemy import select
@@ -146,8 +147,6 @@ class Attempts:
         key, state = (job.id, attempt.number), self._state(job, attempt)
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
-        elif (waits := self._errands.pause(key)) > 0:
-            pause = waits
         elif self._stops.has_begun(key):
             pause = _LATER
         elif state.done_since is not None:
@@ -162,7 +161,7 @@ class Attempts:
             pause = attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000
         else:
             pause = _LATER
-        return min(max(pause, 0.0) + _LEAST, _LATER)
+        return min(max(min(pause, self._errands.pause(key) or inf), 0.0) + _LEAST, _LATER)
 
     def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
         """Have an open attempt end in favour of another job."""
@@ -238,6 +237,8 @@ class Attempts:
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
+                if attempt.ending == Ending.FAILED:  # as AWS shows why a container did not start
+                    attempt.nodes[job.gang.main].reason = attempt.status_reason
                 return Gone(self.clock.now(), [], "")
             case Close():
                 self._close(session, job, attempt, instruction)

@@ -46,7 +46,8 @@ def seen_end(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
     code = _KILLED if node.exit_code is None else node.exit_code
     if node.cause is Cause.PREEMPTED and not is_native:
         code = _KILLED
-    words = node.words or "the supervisor died without an outcome"
     if node.cause is Cause.EXIT:
         words = f"exit {code}, outcome not written{f' ({node.words})' if node.words else ''}"
+        return NodeEnd(code, words, moment, asked=None)
+    words = node.words or "the supervisor died without an outcome"
     return NodeEnd(code, words, moment, lost=node.cause in _TAKEN)

@@ -10,7 +10,7 @@ from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.endings import node_end
 from orchestrator.control.run_store import Errands, Key, RunStore
-from orchestrator.domain.attempt_events import Delayed, Observed, Silence
+from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import AWS_EXITED, NodeEnd, lost_host
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.registry import EngineSet
@@ -27,8 +27,6 @@ class _Seen:
 
     outcomes: dict[int, Outcome | None] = field(default_factory=dict)
     """Of nodes that have ended, by index; None for one that has left none."""
-    asked: tuple[float, list[int], list[int]] | None = None
-    """Those that are being read: since when (monotonic [s]), of nodes that had ended by then, and of others."""
     checked: float | None = None
     """When they were read last (monotonic [s])."""
 
@@ -44,32 +42,31 @@ class Observer:
         """The attempt is closed."""
         self._seen.pop(key, None)
 
-    def observe(self, job: Job, attempt: Attempt) -> Observed | Delayed | None:
-        """A look at a gang that was launched; None before its engine's first look, and while its outcomes are read."""
+    def observe(self, job: Job, attempt: Attempt) -> Observed | None:
+        """A look at a gang that was launched; None before its engine's first look."""
         assert attempt.handle is not None
         status = self._engine.observe(attempt.handle)
         if status is None:
             return None  # the engine's first look is under way
-        if not self.know_outcomes(job, attempt, status):
-            away = next(
-                (node.words or node.stale for node in status if node.phase is NodePhase.UNREACHABLE or node.stale), ""
-            )
-            return self._errands.delayed((job.id, attempt.number), away)
+        known = self.know_outcomes(job, attempt, status)
         ends = self.ends(job, attempt, status)
-        head = status[job.gang.main]
+        head, away = status[job.gang.main], (node.words for node in status if node.phase is NodePhase.UNREACHABLE)
         return Observed(
             moment=self._clock.now(),
             ends=ends,
             silences=[self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)],
+            unread=None if known else self._errands.trouble((job.id, attempt.number)),
             waits=head.words
             if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
-            else "",
+            else ("" if known else next(away, "")),
             words=head.words if head.running else "",
             stale=next((node.stale for node in status if node.stale), ""),
         )
 
     def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
-        """The silence of a node, by what its engine and the store say of it."""
+        """The silence of a node, by what its engine and the store say of it; None for one that has ended."""
+        if not status.running:
+            return None
         assert attempt.handle is not None
         checked, asked = self._of(attempt).checked, self._engine.asked(attempt.handle)
         asked = None if asked is None or checked is None else max(asked, machine.monotonic() - checked)
@@ -94,26 +91,22 @@ class Observer:
         ]
         if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < CHECK_INTERVAL)):
             return True
-        memory.asked = memory.asked or (moment, ended, hidden)
-        began, over, others = memory.asked
-        reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, [*over, *others])
-        found = self._errands.result((job.id, attempt.number), "outcomes", reading)
+        reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, [*ended, *hidden])
+        found = self._errands.result((job.id, attempt.number), "outcomes", lambda: (moment, ended, reading()))
         if found is None:
-            if self._errands.failure((job.id, attempt.number)):
-                memory.asked = None
             return not ended
-        memory.asked, memory.checked = None, began
-        # a node that has ended since may have left its outcome after it was looked for
-        memory.outcomes |= {**dict.fromkeys(over), **found}
+        # of the call that has returned: a node that has ended since may have left its outcome after it was looked for
+        memory.checked, over, outcomes = found
+        memory.outcomes |= {**dict.fromkeys(over), **outcomes}
         return all(index in memory.outcomes for index in ended) or self.know_outcomes(job, attempt, status)
 
     def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
-        """The end of each node; noted in the attempt's record with the other facts about its nodes."""
+        """The end of each node, None while it is not known; noted in the attempt's record with the other facts about its nodes."""
         outcomes, ends = self._of(attempt).outcomes, list[NodeEnd | None]()
         for record, node in zip(attempt.nodes, status, strict=True):
             end, key = None, (job.id, attempt.number, record.index)
             outcome = outcomes.get(record.index)
-            if outcome is not None or not node.running:
+            if outcome is not None or (not node.running and record.index in outcomes):
                 end, stopped = node_end(outcome, node, job.gang.options.is_native, now())
                 record.exit_code, record.reason, record.error = end.exit_code, end.reason, end.error
                 if record.stopped_at is None:

@@ -77,10 +77,15 @@ class Presence:
                 self._unmet[job, attempt] = self._monotonic()
             self._expected[job, attempt] = nodes
 
+    def expected(self) -> set[tuple[str, int]]:
+        """The jobs and numbers of the attempts whose nodes are expected."""
+        with self._lock:
+            return set(self._expected)
+
     def expects(self, node: Node) -> bool:
         """Whether its attempt is open and has such a node."""
         with self._lock:
-            return 0 <= node[2] < self._expected.get(node[:2], 0)
+            return self._expects(node)
 
     def forget(self, job: str, attempt: int) -> None:
         """The attempt is closed."""
@@ -90,15 +95,15 @@ class Presence:
 
     def came(self, node: Node) -> None:
         """A node is connected; of one that is not expected nothing is noted."""
-        if self.expects(node):
-            with self._lock:
+        with self._lock:
+            if self._expects(node):
                 self._set(node, _Heard())
 
     def left(self, node: Node) -> None:
         """A node's connection is gone."""
-        if self.expects(node):
-            now, since = self._monotonic(), datetime.fromtimestamp(self._wall(), UTC)
-            with self._lock:
+        now, since = self._monotonic(), datetime.fromtimestamp(self._wall(), UTC)
+        with self._lock:
+            if self._expects(node):
                 self._set(node, _Heard(now, f"{since:%H:%M:%S} UTC", now, now))
 
     def ended(self, node: Node) -> None:
@@ -153,6 +158,9 @@ class Presence:
             is_lost = alone > self.lost_after or (not runs and now - heard.answered > UNREACHABLE * self.lost_after)
             return Silence(now - heard.gone, heard.since, is_lost, deaf or "")
 
+    def _expects(self, node: Node) -> bool:
+        return 0 <= node[2] < self._expected.get(node[:2], 0)
+
     def _set(self, node: Node, heard: _Heard | None) -> None:
         """Note what is known of a node; None: nothing."""
         self._note_deafness()
@@ -182,8 +190,9 @@ class Presence:
             return f"none of {nodes} nodes is heard, so the controller may be cut off"
         if nodes == 1 and not self._hears_itself:
             return "the bus does not hear the controller either"
-        gone = next(iter(self._nodes.values())).gone
-        if nodes == 1 and gone is not None and any(since > gone for since in self._unmet.values()):
+        gone, recent = next(iter(self._nodes.values())).gone, self._monotonic() - UNREACHABLE * self.lost_after
+        # a gang that has not come for longer never does: its hosts can't reach the bus
+        if nodes == 1 and gone is not None and any(since > max(gone, recent) for since in self._unmet.values()):
             return "no node of the gangs that were launched since is heard, so the controller may be cut off"
         return None
 

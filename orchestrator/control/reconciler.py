@@ -82,9 +82,9 @@ class Reconciler:
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
-        self.calls = StoreCalls(store.path, lambda: self.disk.away("store"))
+        self.calls = StoreCalls(store.path, self.store_problem)
         """The store, for requests."""
-        self.followed = StoreCalls(store.path, lambda: self.disk.away("store"))
+        self.followed = StoreCalls(store.path, self.store_problem)
         """The store, for those who follow logs and live pages: each has one call at most, however long that takes."""
         self._is_cut_off = False
         self.work_queue = WorkQueue()
@@ -127,9 +127,7 @@ class Reconciler:
         self._thread: threading.Thread | None = None
         with database.session() as session:
             self.clock.restore(session)
-            self.work_queue.load(session)
-            for job, attempt in open_attempts(session, self.work_queue.active()):
-                bus.expect(job.id, attempt.number, len(attempt.nodes))  # before the router is there for their nodes
+            self._take_up(session)  # before the router is there for the nodes
 
     @property
     def trouble(self) -> str | None:
@@ -166,6 +164,10 @@ class Reconciler:
         self.attempts.close()
         self.calls.close()
         self.followed.close()
+
+    def store_problem(self) -> str | None:
+        """Why the store can't be read; None where it can, as far as was seen."""
+        return self.disk.away("store")
 
     def problem(self) -> str | None:
         """Why the controller can't do its work now, as its loop has left it; waits for nothing."""
@@ -234,9 +236,19 @@ class Reconciler:
         if self.trouble is not None:
             with self.database.session() as session:
                 self.clock.rewrite(session)  # to be read is not enough: its volume may be full
-                self.work_queue.load(session)
+                self._loaded.forget()  # another controller may have had the database meanwhile
+                self._take_up(session)
             self._isolation.trouble = None
             log.warning("the database can be used again")
+
+    def _take_up(self, session: Session) -> None:
+        """Read the jobs, and expect the nodes of all open attempts, and of no other."""
+        self.work_queue.load(session)
+        found = open_attempts(session, self.work_queue.active())
+        for closed in self.bus.presence.expected() - {(job.id, attempt.number) for job, attempt in found}:
+            self.bus.forget(*closed)
+        for job, attempt in found:
+            self.bus.expect(job.id, attempt.number, len(attempt.nodes))
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:

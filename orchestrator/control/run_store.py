@@ -137,6 +137,7 @@ class RunStore:
     def release(self, name: str, epoch: int) -> None:
         """The attempt of this epoch is closed: while this controller lives, another one may then say that the run is written."""
         with suppress(OSError, DamagedFile):
+            self._check()  # another volume may have a run of this name
             close_claim(self.store.run(name), epoch)
 
     def _call(self, what: str, body: Callable[[], T]) -> T:
@@ -213,14 +214,13 @@ class Errands:
         self._failing.worked(key)
         return result if started == name else self.result(key, name, body, again)
 
-    def delayed(self, key: Key, more: str = "") -> Delayed | None:
-        """That the store does not answer, or could not be used for the attempt the last time, as an event; ``more``: what else is amiss."""
-        reason = "; ".join(each for each in (more, self._silence(key) or self.failure(key)) if each)
-        return Delayed(reason) if reason else None
+    def trouble(self, key: Key) -> str:
+        """That the store does not answer, or could not be used for the attempt the last time; empty where neither is so."""
+        return self._silence(key) or self._failing.failure(key) or ""
 
-    def failure(self, key: Key) -> str:
-        """Why the store could not be used for the attempt the last time; empty where it could."""
-        return self._failing.failure(key) or ""
+    def delayed(self, key: Key) -> Delayed | None:
+        """:meth:`trouble` as an event; None where there is none."""
+        return Delayed(trouble) if (trouble := self.trouble(key)) else None
 
     def pause(self, key: Key) -> float:
         """Seconds until the store is tried again for the attempt, or is overdue; then infinity until it answers."""

@@ -97,15 +97,15 @@ def holding_of(jobs: Iterable[Job]) -> list[tuple[Job, Attempt]]:
     return [(job, attempt) for job in jobs if (attempt := job.open_attempt) is not None and attempt.nodes]
 
 
-def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:
-    """The hosts for a gang in the queue if nothing else ran, or why it could never start; ``patience``: seconds to wait for the engines' newest hosts."""
+def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape) -> Fit:
+    """The hosts for a gang in the queue if nothing else ran, or why it could never start."""
     first = engine.names[0]
     rows = [
         row for name in queue.compute_environments if (row := session.get(models.ComputeEnvironment, name)) is not None
     ]
     engines = dict.fromkeys(engine_named_by(row.tags, first) for row in rows)
     before = engine.unknown()
-    capacities = engine.capacity(engines, patience)
+    capacities = engine.capacity(engines)
     unknown = {name: why for name, why in before.items() if name not in capacities}
     ces = {row.name: read_compute_environment(row, first, unknown) for row in rows}
     elastic = [name for name, ce in ces.items() if ce.engine is not None and engine.is_elastic([ce.engine])]

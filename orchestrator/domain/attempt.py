@@ -62,6 +62,7 @@ _FAILED_GRACE = 5.0
 """Seconds from SIGTERM to SIGKILL for a gang whose collectives are broken: there is nothing left to save."""
 _MARGIN = 5.0
 """Seconds that an engine waits beyond the grace time: supervisors count it too, and record what did not leave in time."""
+_DONE = "done before it was {}"
 
 
 class Phase(StrEnum):
@@ -202,6 +203,9 @@ def _observed(state: State, seen: Observed) -> Instructions:
 
 def _tell(state: State, seen: Observed) -> Instructions:
     """The reason that the job's user sees."""
+    if seen.unread is not None:
+        reason = "; ".join(each for each in (seen.waits, seen.stale, seen.unread) if each)
+        return (Explain(reason),) if reason and state.verdict is None else ()
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
     runs = "; ".join(each for each in (runs, _unheard(state.terms, seen), seen.stale) if each)
     if seen.waits:
@@ -212,11 +216,11 @@ def _tell(state: State, seen: Observed) -> Instructions:
 
 
 def _judge(state: State, seen: Observed) -> Instructions:
-    """Whether the attempt is to end, and how: by the nodes' ends, on request, for its silence, or for its time."""
+    """Whether the attempt is to end, and how: by the nodes' ends once they are known, on request, for its silence, or for its time."""
     if state.verdict is not None:
         return ()
     waits: Instructions = ()
-    verdict = _by_ends(state.terms, seen.ends)
+    verdict = _by_ends(state.terms, seen.ends) if seen.unread is None else None
     if verdict is not None and not verdict.certain:
         since = seen.moment if state.cause_since is None else state.cause_since
         if seen.moment - since <= CAUSE_PATIENCE:
@@ -294,6 +298,8 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         return Close(gone.moment, not is_free, status, reason)
 
     match ending:
+        case Ending.STOPPED if _was_done(ending, native, head):
+            return to(Status.SUCCEEDED, _DONE.format("stopped"))
         case Ending.STOPPED | Ending.FAILED | Ending.LOST | Ending.PREEMPTED | Ending.REQUEUE if (
             state.stop_reason is not None
         ):
@@ -301,9 +307,7 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         case Ending.SUCCEEDED:
             return to(Status.SUCCEEDED, verdict.reason)
         case Ending.PREEMPTED | Ending.LOST | Ending.FAILED | Ending.TIMEOUT if _was_done(ending, native, head):
-            return to(
-                Status.SUCCEEDED, f"done before it was {'preempted' if ending == Ending.PREEMPTED else 'stopped'}"
-            )
+            return to(Status.SUCCEEDED, _DONE.format("preempted" if ending == Ending.PREEMPTED else "stopped"))
         case Ending.PREEMPTED:
             return to(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
         case Ending.REQUEUE if is_free or is_left:
@@ -318,15 +322,19 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
 def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
     """Whether the main node had finished its work, which decides, also where its end was seen after another node's was.
 
-    A native one leaves work with 75. Others may leave it with 0, too, once they are asked to end.
+    A native one leaves work with 75. Others may leave it with 0, too, once they are asked to end. Where a user has asked for the end, only
+    a node counts that was surely not asked.
     """
     if head is None or head.exit_code != 0:
         return False
+    if ending == Ending.STOPPED:
+        return head.asked is False
     return not head.asked or ending == Ending.PREEMPTED or (native and ending != Ending.TIMEOUT)
 
 
 def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
-    return retries(terms.conditions, verdict.exit_code, head.reason if head else "", verdict.reason)
+    """The reason of a gang that was never launched is its container's, as of AWS's CannotStartContainerError."""
+    return retries(terms.conditions, verdict.exit_code, head.reason if head else verdict.reason, verdict.reason)
 
 
 def after(state: State, instruction: Instruction) -> State:

@@ -78,11 +78,13 @@ class Observed:
     moment: int
     """Steady time [ms]."""
     ends: Sequence[NodeEnd | None]
-    """By node index; None for a node that has not ended."""
+    """By node index; None for a node that has not ended, or whose end is not known yet."""
     silences: Sequence[Silence | None]
-    """By node index; None for a node that the bus hears, or never knew."""
+    """By node index; None for a node that the bus hears, or never knew, and for one that has ended."""
+    unread: str | None = None
+    """Why it is not known how nodes have ended; empty while that is being read, None where it is known."""
     waits: str = ""
-    """Why the main node does not run yet or can't be seen; empty once it runs or has ended."""
+    """Why the main node does not run yet or can't be seen; empty once it runs, or has ended and its end is known."""
     words: str = ""
     """What the engine says of a main node that runs."""
     stale: str = ""

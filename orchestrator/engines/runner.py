@@ -87,6 +87,7 @@ class Runner:
         self._capacity: Capacity | None = None
         self._told_at: int | None = None
         self._backoff = Backoff(log)
+        self._was_silent = False
         self._thread = machine.pool(f"engine {engine.name}", 1)
         self.first = self.ask_capacity()
         """Done once the engine has told its capacity for the first time, or has failed to."""
@@ -197,7 +198,14 @@ class Runner:
         return seen
 
     def look(self, handles: Iterable[Handle] | None = None) -> None:
-        """Ask for a newer status of these gangs, or of all that are observed; of none twice at a time."""
+        """Ask for a newer status of these gangs, or of all that are observed; of none twice at a time.
+
+        Reports, too, that the engine has begun or ceased to be silent: its gangs look different then.
+        """
+        if self._was_silent != (self.silence is not None):
+            self._was_silent = not self._was_silent
+            for gang in {*self._launches, *(handle.gang for handle in self._observed)}:
+                self._changed(gang)
         for handle in list(self._observed) if handles is None else handles:
             if handle not in self._looks and not self._backoff.waits(("look", handle)):
                 self._looks.add(handle)

@@ -2,7 +2,7 @@
 
 The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.models.AutomaticEvaluation`), which changes in
 the transaction that adds the job: a controller that is killed at any moment neither loses nor doubles an evaluation. A training never
-waits for one, and the reconcile loop neither: this has a thread of its own.
+waits for one, and the reconcile loop neither: this has threads for itself.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from orchestrator import machine
 from orchestrator.api import permissions
 from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.errors import ClientError
@@ -45,6 +47,10 @@ from shared_store.layout import Run
 
 LOOK = 2.0
 """Seconds between two looks at the checkpoints of running trainings: a listing of a directory each."""
+_THREADS = 4
+"""Looks at once, of which each may hang on the directory of its run."""
+_PATIENCE = 20.0
+"""Seconds for which a look is waited for: then the next one begins."""
 
 log = logging.getLogger("muster.evaluations")
 
@@ -73,6 +79,9 @@ class AutomaticEvaluations:
         self._known: dict[str, _Training | None] = {}
         """By job, of those that run; None of one without a section ``evaluation``."""
         self._backoff = Backoff(log)
+        self._pool = machine.pool("looks at checkpoints", _THREADS)
+        self._under_way: dict[str, Future[None]] = {}
+        """The last look at each subject."""
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="evaluations", daemon=True)
 
@@ -84,11 +93,12 @@ class AutomaticEvaluations:
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(timeout=10)
+        self._pool.close()
 
     def _loop(self) -> None:
-        self._isolated("checkpoints kept for nobody", self._let_go)
+        self._on_store("checkpoints kept for nobody", self._let_go)
         while not self._ending.wait(self._interval):
-            if self._reconciler.trouble is None:
+            if self._reconciler.trouble is None and self._reconciler.store_problem() is None:
                 self.look()
 
     def look(self) -> None:
@@ -98,7 +108,21 @@ class AutomaticEvaluations:
         active = self._reconciler.work_queue.active()
         self._known = {job: self._known[job] for job in active if job in self._known}
         for job in active:
-            self._isolated(f"job {job}", partial(self._look_at, job))
+            self._on_store(f"job {job}", partial(self._look_at, job))
+
+    def _on_store(self, subject: str, body: Callable[[], None]) -> None:
+        """Carry out ``body``, which may hang; while it does, the subject is passed over, so that nothing is done twice."""
+
+        def wait() -> None:
+            self._under_way = {each: call for each, call in self._under_way.items() if not call.done()}
+            if subject not in self._under_way:
+                call = self._under_way[subject] = self._pool.submit(body)
+                try:
+                    machine.result(call, _PATIENCE)
+                except TimeoutError:
+                    raise OSError(f"the store has not answered for {_PATIENCE:.0f} s") from None
+
+        self._isolated(subject, wait)
 
     def _isolated(self, subject: str, body: Callable[[], None]) -> None:
         if self._backoff.waits(subject):
@@ -131,7 +155,7 @@ class AutomaticEvaluations:
             rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open)).all()
             ended = [(row.run, row.checkpoint or "") for row in rows if not _is_open(session, row)]
         for name, checkpoint in ended:
-            self._isolated(f"run {name}", partial(self._close, name, checkpoint))
+            self._on_store(f"run {name}", partial(self._close, name, checkpoint))
 
     def _close(self, name: str, checkpoint: str) -> None:
         evaluation_is_over(self._reconciler.store.run(name), checkpoint)

@@ -19,13 +19,10 @@ from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
 
 
-def fit_of(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec, patience: float = 0.0) -> Fit:
-    """The answer of an idle queue to a job; a training whose automatic evaluations could never start has a problem, too.
-
-    ``patience``: seconds to wait for the engines' newest hosts.
-    """
-    found = fit_in_queue(session, reconciler.engine, queue, gang.shape, patience)
-    if found.problem or not (problem := _problem_of_evaluations(session, reconciler, queue, gang, patience)):
+def fit_of(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> Fit:
+    """The answer of an idle queue to a job; a training whose automatic evaluations could never start has a problem, too."""
+    found = fit_in_queue(session, reconciler.engine, queue, gang.shape)
+    if found.problem or not (problem := _problem_of_evaluations(session, reconciler, queue, gang)):
         return found
     return Fit(None, f"evaluation: {problem}")
 
@@ -46,9 +43,7 @@ def named_queue(session: Session, name: str) -> JobQueue:
     return queue
 
 
-def _problem_of_evaluations(
-    session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec, patience: float
-) -> str | None:
+def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> str | None:
     """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
     try:
         wanted = wanted_of(gang.spec)
@@ -58,6 +53,6 @@ def _problem_of_evaluations(
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
         shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
-        return fit_in_queue(session, reconciler.engine, named_queue(session, place["queue"]), shape, patience).problem
+        return fit_in_queue(session, reconciler.engine, named_queue(session, place["queue"]), shape).problem
     except (ClientError, SpecError) as error:
         return str(error)

@@ -139,7 +139,7 @@ def _row(reconciler: Reconciler, job: Job) -> tuple[dict[str, Any], _Training | 
         return {**row, "kind": "command", "nodes": 0, "statusReason": DAMAGED}, None
     training = spec.get("train")
     iterations = training.get("iterations") if isinstance(training, Mapping) else None
-    found = _Training(job, gang.main, iterations) if iterations and job.attempts else None
+    found = _Training(job, gang.main, iterations) if iterations and job.first_epoch is not None else None
     return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes)}, found
 
 

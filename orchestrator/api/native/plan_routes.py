@@ -51,10 +51,11 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         run = permitted_run(reconciler, source.run, Operation.READ_RUN)
         if source.key in ("evaluate", "race"):
             check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
+    reconciler.engine.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine
     with reconciler.database.session() as session:
         queue = named_queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_of(session, reconciler, queue, wanted, FRESH)
+        found = fit_of(session, reconciler, queue, wanted)
         if found.allocation is None:
             raise ClientError(
                 found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
@@ -107,10 +108,11 @@ def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     reconciler = reconciler_of(request)
     wanted = _gang_of(body)
     check_tracks(reconciler.store, wanted.spec)
+    reconciler.engine.capacity(patience=FRESH)
     with reconciler.database.session() as session:
         queue = named_queue(session, body.queue)
         permissions.check(Operation.FIT, JobsOf(queue.name))
-        return {"problem": fit_of(session, reconciler, queue, wanted, FRESH).problem}
+        return {"problem": fit_of(session, reconciler, queue, wanted).problem}
 
 
 def _gang_of(body: PlanRequest) -> GangSpec:

@@ -272,7 +272,7 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
             **node.shown(),
             "progress": reconciler.bus.progress(job.id, number, node.index),
             "running": attempt.stopped_at is None and node.exit_code is None,
-            "log": str(run.log(job.id, number, node.index)),
+            "log": str(run.log(job.id, number, node.index)) if attempt.epoch else None,
         }
         for node in attempt.nodes
     ]

@@ -48,7 +48,7 @@ from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.outcomes import read_outcome
 from shared_store.ports import first_port, free_port
 from shared_store.processes import await_marks, find_process, marked, unkillable
-from shared_store.shim import STUCK, group_of, shimmed
+from shared_store.shim import STUCK, exit_code_in, group_of, make_exit_file, shimmed
 
 log = logging.getLogger("muster.engines")
 
@@ -82,7 +82,7 @@ class LocalEngine:
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
         """Args:
-        home: ``$MUSTER_HOME``: the kernel cache and what supervisors say before they reach the store go below it.
+        home: ``$MUSTER_HOME``: the kernel cache and what supervisors leave outside the store go below it.
         cpus: CPU cores to hand out; those of the machine by default. More than it has is allowed (they are shared).
         gpus: Ids of the GPUs to hand out; those that the driver lists by default.
         """
@@ -131,7 +131,7 @@ class LocalEngine:
                     pid, group = 0, ""
                 else:
                     group = plan.request[index].group
-                    pid = self._start(plan.request[index], port, self._said(gang.name, index))
+                    pid = self._start(plan.request[index], port, gang.name, index)
                 process, address = find_process(pid), plan.nodes[index].contract.address
                 start = process.start if process else ""
                 nodes[index] = {"pid": pid, "start": start, "address": address, "group": group}
@@ -177,11 +177,12 @@ class LocalEngine:
         """Nothing of the gang is left: remove what was kept of its supervisors."""
         for index, node in enumerate(nodes):
             self._children.pop(int(str(node["pid"])), None)
-            said = self._said(gang, index)
+            errors = self._left(gang, index, "err")
             try:
-                if len(lines := said.read_text(errors="replace").strip().splitlines()) > 1:
-                    log.error("gang %s, node %d: its supervisor said:\n%s", gang, index, "\n".join(lines[-50:]))
-                said.unlink()
+                if len(lines := errors.read_text(errors="replace").strip().splitlines()) > 1:
+                    log.error("gang %s, node %d: its supervisor wrote:\n%s", gang, index, "\n".join(lines[-50:]))
+                errors.unlink()
+                self._left(gang, index, "exit").unlink()
             except OSError:
                 pass  # it was never started, or this was done before
 
@@ -202,13 +203,18 @@ class LocalEngine:
         index = node.contract.node_index
         container = gang.containers[index] if gang.containers else {}
         group = self._group(gang.name, index)
-        whole = shimmed(with_mounts(command, mounts_of(container, gang.store)), group, files=self._files)
+        exit_file = str(self._left(gang.name, index, "exit"))
+        whole = shimmed(
+            with_mounts(command, mounts_of(container, gang.store)), group, files=self._files, exit_file=exit_file
+        )
         return NodeProcess(whole, environment, group, gang.directory)
 
-    def _start(self, node: NodeProcess, port: int, said: Path) -> int:
-        """``port``: where the gang meets. ``said``: what the supervisor says before it reaches the store."""
-        said.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with open(said, "ab") as stderr:
+    def _start(self, node: NodeProcess, port: int, gang: str, index: int) -> int:
+        """``port``: where the gang meets."""
+        errors = self._left(gang, index, "err")
+        errors.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_exit_file(str(self._left(gang, index, "exit")))
+        with open(errors, "ab") as stderr:
             process = subprocess.Popen(
                 list(node.command),
                 env={**node.environment, "MASTER_PORT": str(port)},
@@ -229,14 +235,17 @@ class LocalEngine:
         shim = _processes(node).shim if code is None else None
         if shim is not None and shim.name != STUCK:
             return NodeStatus(NodePhase.RUNNING, address)
+        if code is None:  # an earlier controller was its parent
+            code = exit_code_in(str(self._left(gang, index, "exit")))
         try:
-            words = self._said(gang, index).read_text(errors="replace").strip().rpartition("\n")[2]
+            words = self._left(gang, index, "err").read_text(errors="replace").strip().rpartition("\n")[2]
         except FileNotFoundError:  # it said nothing, or another thread has just stopped the gang
             words = ""
         return ended(address, None if code is None else code if code >= 0 else 128 - code, words)
 
-    def _said(self, gang: str, index: int) -> Path:
-        return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.err"
+    def _left(self, gang: str, index: int, kind: str) -> Path:
+        """The file of a supervisor: ``err`` has its standard error, ``exit`` its exit code."""
+        return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.{kind}"
 
 
 def _user(given: str) -> str:

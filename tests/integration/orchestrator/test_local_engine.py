@@ -258,9 +258,11 @@ def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench
 
 def test_output_of_a_supervisor_before_it_reaches_the_store_is_reported(bench: LocalBench) -> None:
     raise_epoch(bench.run, 5)
-    [node] = bench.ended(bench.launch(bench.gang(nodes=1, epoch=4)))
+    handle = bench.launch(bench.gang(nodes=1, epoch=4))
+    [node] = bench.ended(handle)
     said = "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving"
     assert (node.exit_code, node.words) == (3, said)
+    assert bench.new_engine().observe(handle) == [node], "a later controller knows it, too"
 
 
 # -- stopping ---------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -10,8 +11,10 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
+from unittest import mock
 
 import pytest
+from sqlalchemy import update
 
 from orchestrator.control import attempts
 from orchestrator.control.attempts import Attempts
@@ -29,7 +32,7 @@ from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, Node
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
-from orchestrator.persistence.session import Database
+from orchestrator.persistence.session import Database, DatabaseError
 from shared_store.layout import Store
 from shared_store.outcomes import Outcome, write_outcome
 from tests.support.orchestrator.rows import job
@@ -301,3 +304,36 @@ def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, mo
     assert all(left[number].closed for number in (1, 2))
     for expected, state in found:
         assert state == expected
+
+
+def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_back(bench: Bench) -> None:
+    bench.submit("a", "b")
+    for name in ("a", "b"):
+        bench.wait(name, Status.RUNNING)
+    database = bench.reconciler.database
+    bench.reconciler._kept = 0.0
+    with mock.patch.object(database, "keep_lock", side_effect=DatabaseError("another controller has it")):
+        wait_for(lambda: bench.reconciler.trouble, 20, "that the lock is missed")
+        with database.engine.begin() as other:  # as the other controller does: this one is not told
+            other.execute(update(Job).where(Job.id == "a").values(stop_reason="enough"))
+            moment = {"stopped_at": 1, "ending": "stopped", "spent": True}
+            other.execute(update(Attempt).where(Attempt.job_id == "b").values(**moment))
+            other.execute(update(Job).where(Job.id == "b").values(status="FAILED", status_reason="ended there"))
+    assert bench.wait("a", Status.FAILED).status_reason == "enough"
+    assert bench.job("b").status_reason == "ended there"
+    wait_for(lambda: not bench.reconciler.bus.presence.expected(), 20, "that no gang is expected")
+
+
+def test_a_stop_does_not_wait_for_outcomes_that_can_not_be_read(bench: Bench) -> None:
+    bench.submit("a", node_properties=properties(1, 2, MUSTER_ON_CHILD_FAILURE="ignore"), kind="multinode")
+    bench.wait("a", Status.RUNNING)
+    runs, answered = bench.reconciler.attempts.runs, threading.Event()
+    outcomes = runs.outcomes
+    runs.outcomes = lambda *asked: (answered.wait(60), outcomes(*asked))[1]  # type: ignore[method-assign]
+    bench.engine.cluster.end("a/1/1", 1, 0)
+    with bench.database.session() as session:
+        session.get_one(Job, "a").stop_reason = "enough"
+    wait_for(lambda: not any(node.running for node in bench.engine.cluster.gangs["a/1/1"]), 30, "the stop")
+    assert bench.job("a").status == Status.RUNNING, "how it ended is not known yet"
+    answered.set()
+    assert bench.wait("a", Status.FAILED).status_reason == "enough"

@@ -15,7 +15,7 @@ import pytest
 from shared_store.cgroups import kill_group, members, own_group, remove_abandoned_groups, remove_group
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.processes import await_marks, end_all, find_process, marked
-from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
+from shared_store.shim import SCRATCH, STUCK, exit_code_in, group_of, make_exit_file, shimmed
 from tests.conftest import PATIENCE, wait_for
 from tests.support.processes import alive, await_end, frozen, processes_running, signal_all
 
@@ -71,6 +71,18 @@ def test_escaped_processes_are_gone_when_the_supervisor_has_ended(group: str, pi
     shim = start(ESCAPE.format(pids=pids) + end, group)
     assert shim.wait(20 * PATIENCE) == code
     assert len(read(pids)) == 2 and not any(alive(pid) for pid in read(pids))
+
+
+def test_the_exit_code_is_left_in_a_file_also_on_a_full_volume(tmp_path: Path) -> None:
+    path = str(tmp_path / "exit")
+    make_exit_file(path)
+    inode, size = os.stat(path).st_ino, os.stat(path).st_size
+    assert exit_code_in(path) is None
+    subprocess.run(shimmed(["sh", "-c", "exit 75"], exit_file=path))
+    assert exit_code_in(path) == 75
+    assert (os.stat(path).st_ino, os.stat(path).st_size) == (inode, size), "it is written in place"
+    assert subprocess.run(shimmed(["true"], exit_file=str(tmp_path / "forgotten"))).returncode == 0
+    assert exit_code_in(str(tmp_path / "forgotten")) is None
 
 
 def test_a_child_that_kills_its_parent_does_not_outlive_it(group: str, pids: Path) -> None:

@@ -16,8 +16,8 @@ from tests.support.simulation.store import NO_VOLUME
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
 
-_TOLD = 150.0
-"""Seconds within which a controller notices whether its engine answers: the longest pause between two looks, and some more."""
+_TOLD = 80.0
+"""Seconds within which a controller notices whether its engine and its volume answer: the longest pause between two tries, and some more."""
 _SEEN = 30.0
 """Seconds within which a gang whose engine answers is seen to run, whatever the bus and the store do."""
 _SLACK = 5.0

@@ -10,7 +10,7 @@ import pytest
 
 from orchestrator.control.observer import Observer
 from orchestrator.control.presence import Presence
-from orchestrator.control.run_store import Errands
+from orchestrator.control.run_store import Errands, StoreUnavailable
 from orchestrator.domain.attempt_events import Observed
 from orchestrator.engines.api import Cause, GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.toolkit.endings import ended
@@ -58,7 +58,7 @@ def test_an_outcome_that_was_not_there_before_the_node_ended_is_looked_for_again
     gang.pool.carry_out()  # it finds nothing
     gang.write(0, 0)
     running: GangStatus = [end, NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*running) is None
+    assert gang.look(*running).unread == ""
     gang.pool.carry_out()
     seen = gang.look(*running)
     assert isinstance(seen, Observed) and seen.ends[1] is None
@@ -73,16 +73,35 @@ def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_witho
     gang.write(0, 0)
     future.set_result(found)
     running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*running) is None
+    assert gang.look(*running).unread == ""
     gang.pool.carry_out()
     seen = gang.look(*running)
     assert isinstance(seen, Observed) and seen.ends[0] is not None and seen.ends[0].exit_code == 0
 
 
+def test_a_node_that_ends_while_outcomes_are_read_again_after_an_error_is_looked_for_by_itself() -> None:
+    gang = Gang()
+    one: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
+    assert gang.look(*one).unread == ""
+    _, failed = gang.pool.calls.pop()
+    failed.set_exception(StoreUnavailable("away"))
+    assert gang.look(*one).unread == "away"
+    gang.observer._errands._failing.hurry(("job", 1))
+    gang.look(*one)  # the call that is under way from now on reads node 0 alone
+    gang.write(1, 0)
+    both: GangStatus = [ended("", None), ended("", None)]
+    assert gang.look(*both).ends == [None, None]
+    gang.pool.carry_out()
+    gang.look(*both)
+    gang.pool.carry_out()
+    first, second = gang.look(*both).ends
+    assert (first.exit_code, second.exit_code) == (137, 0)
+
+
 def test_a_node_that_has_ended_without_an_outcome_was_killed() -> None:
     gang = Gang()
     running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*running) is None
+    assert gang.look(*running).unread == ""
     gang.pool.carry_out()
     seen = gang.look(*running)
     assert isinstance(seen, Observed) and seen.ends[0] is not None and seen.ends[0].exit_code == 137

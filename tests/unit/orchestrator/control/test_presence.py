@@ -174,6 +174,17 @@ def test_a_node_that_this_router_never_met_can_not_fall_silent() -> None:
     assert cluster.presence.silence(("job-9", 1, 1), AGO) is None and not cluster.presence.met(("job-9", 1, 1))
 
 
+def test_a_gang_that_never_comes_to_the_bus_keeps_a_silent_node_from_being_lost_for_a_while_only() -> None:
+    cluster = Cluster(1)
+    cluster.silence(0)
+    cluster.wait(1)
+    cluster.presence.expect("job-9", 1, 1)
+    cluster.wait(5 * L)
+    assert cluster.lost() == []
+    cluster.wait(L + 1)
+    assert cluster.lost() == [0]
+
+
 def test_nodes_of_no_open_attempt_are_not_noted() -> None:
     cluster = Cluster(1)
     for stranger in (("job-9", 1, 0), ("job-0", 2, 0), ("job-0", 1, 1), ("job-0", 1, -1)):

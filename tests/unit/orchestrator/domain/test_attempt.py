@@ -200,6 +200,24 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         seen(silences=(GONE_QUIET, None)),
         ends(replace(GONE, ending=Ending.LOST), 35.0, first=Explain(f"{RUNS}; the main node{QUIET_SO.reason[33:]}")),
     ),
+    "while it is not known how nodes ended, the store is named": (
+        RUNNING,
+        seen(unread="the store is away", stale="Slurm is away"),
+        [Explain("Slurm is away; the store is away")],
+    ),
+    "or nothing yet, and nothing follows from ends": (RUNNING, seen(end(1), None, unread=""), []),
+    "a request does not wait for the store": (asked(RUNNING), seen(unread=""), [Decide(STOPPED), Save(), Stop(35.0)]),
+    "nor does the clock": (
+        replace(TIMED, running_since=T - 50_001),
+        seen(unread=""),
+        [Decide(LATE), Save(), Stop(35.0)],
+    ),
+    "nor a lost node": (
+        RUNNING,
+        seen(silences=(None, GONE_QUIET), unread=""),
+        [Decide(FROZEN), Save(), Stop(35.0)],
+    ),
+    "nor an end that is decided": (ending(Ending.PREEMPTED), seen(unread="the store is away"), [Stop(35.0)]),
     "an engine that does not answer is named": (
         RUNNING,
         seen(stale="Slurm is away"),
@@ -270,6 +288,9 @@ def final(code: int, condition: dict[str, str]) -> State:
 
 
 REASON_3 = {"action": "EXIT", "onReason": "exit 3"}
+PERHAPS_ASKED = (replace(end(0), asked=None), None)
+NEVER_STARTED = ending(Ending.FAILED, of=LAUNCHING)
+WHY = {"action": "EXIT", "onReason": "wh*"}
 BOTH_LEFT, MAIN_FAILED = (end(75), end(75)), (end(1), None)
 FAILED_LAST = with_terms(ending(Ending.FAILED), spent=2)
 """In the third of three attempts."""
@@ -282,6 +303,9 @@ STOPPED_LATE = "done before it was stopped"
 CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
     "done before the stop": (asked(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
+    "done before its user stopped it": (asked(ending(STOP)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "stopped with 0": (asked(ending(STOP)), ASKED_LAST, SPENT, S.FAILED, STOPPED_SO),
+    "stopped with 0, perhaps": (asked(ending(STOP)), PERHAPS_ASKED, SPENT, S.FAILED, STOPPED_SO),
     "stopped": (asked(ending(STOP)), (), SPENT, S.FAILED, STOPPED_SO),
     "stopped, on AWS": (on_aws(asked(ending(STOP))), (), SPENT, S.FAILED, "enough"),
     "failed when it was asked to stop": (asked(ending(Ending.FAILED)), (), SPENT, S.FAILED, STOPPED_SO),
@@ -309,6 +333,14 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "failed the last time, on AWS": (on_aws(FAILED_LAST), MAIN_FAILED, SPENT, S.FAILED, "why"),
     "failed as no retry mends": (final(4, CODE_4), (end(4), None), SPENT, S.FAILED, LAST_SO),
     "failed for the reason that no retry mends": (final(3, REASON_3), (end(3), None), SPENT, S.FAILED, LAST_SO),
+    "not started": (NEVER_STARTED, (), SPENT, S.RUNNABLE, FAILED_SO),
+    "not started for a reason that no retry mends": (
+        with_terms(NEVER_STARTED, conditions=[WHY]),
+        (),
+        SPENT,
+        S.FAILED,
+        LAST_SO,
+    ),
     "fatal": (ending(Ending.FATAL), (), SPENT, S.FAILED, "why"),
     "over time": (ending(Ending.TIMEOUT), (), SPENT, S.FAILED, "why"),
 }
