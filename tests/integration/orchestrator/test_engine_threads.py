@@ -107,6 +107,8 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
     with engines(fake) as several:
         handle = launched(several, gang(tmp_path))
         wait_for(lambda: observed(several, handle), 10, "the first picture")
+        changed: list[str] = []
+        several.changed = changed.append
         fake.answers.clear()
         before = time.monotonic()
 
@@ -117,13 +119,16 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
 
         said = wait_for(says, 10, "that it does not answer")
         assert said.startswith("the fake engine has not answered since "), said
+        assert changed == [read_handle(handle).gang], "its job is looked at, since its reason is another one now"
         assert several.capacity(patience=60) == {"fake": fake.offered}, "what it told last"
         with pytest.raises(NotYet, match="has not answered since") as wait:
             several.launch("other/1/1", [HOST], lambda: several.plan(gang(tmp_path, "other")))
         assert wait.value.unknown, "it may have been started"
         assert time.monotonic() - before < 30
+        changed.clear()
         fake.answers.set()
         wait_for(lambda: not says(), 10, "that it answers again")
+        assert read_handle(handle).gang in changed
         launched(several, gang(tmp_path, "other"))
     assert [record.getMessage() for record in caplog.records] == [said, "the fake engine answers again"]
     assert fake.threads == {"engine fake"}, "the constructor's thread calls no engine"
