@@ -1,4 +1,4 @@
-"""What a service manager such as systemd is told: that the controller is ready, alive, and stopping (the protocol of sd_notify)."""
+"""Messages to a service manager such as systemd: the controller is ready, alive, or stopping (the protocol of sd_notify)."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class ServiceManager:
         """Seconds between two signs of life: half of what the manager allows; None where it expects none."""
 
     def tell(self, state: str) -> None:
-        """Send ``READY=1``, ``WATCHDOG=1`` or ``STOPPING=1``. A manager that is gone is no error."""
+        """Send ``READY=1``, ``WATCHDOG=1`` or ``STOPPING=1``. Nothing happens where the manager is gone."""
         if self._address:
             with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
                 sender.setblocking(False)
                 sender.sendto(state.encode(), self._address)
 
     def keep_alive(self, is_alive: Callable[[], bool], wait: Callable[[float], bool]) -> None:
-        """Send signs of life from a thread of its own while ``is_alive``.
+        """Send signs of life from another thread while ``is_alive``.
 
         ``wait``: waits so many seconds, and returns True where the controller ends.
         """

@@ -59,7 +59,7 @@ class MetricsWriter:
             self.write({"resumed_from": resumed_from})
 
     def write(self, record: Mapping[str, Any]) -> None:
-        """Append one record; ``iteration`` counts from 1. Non-finite values must be given as None.
+        """Append one record; ``iteration`` counts from 1. Non-finite values must be None.
 
         Raises OSError where the volume does not take it now: the record is kept, up to a limit, and goes with the next one.
         """

@@ -28,7 +28,7 @@ EngineOption = Annotated[
     list[str] | None,
     typer.Option(
         help="Engine that runs the nodes: local (the default: processes on this machine), docker (containers of the job's image), ray, "
-        "slurm or aws-batch. Repeatable: the first gets the queue default, each other a queue of its own name. An engine whose jobs in the "
+        "slurm or aws-batch. Repeatable: the first gets the queue default, each other one a queue that has its name. An engine whose jobs in the "
         "queue default are not over keeps it."
     ),
 ]

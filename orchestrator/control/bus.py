@@ -4,8 +4,8 @@ Every node may connect; access rules in the router let a node publish below node
 can neither send a command nor read a message. A node's message counts only with the proof of its attempt's credential, and
 commands carry that proof to the node (:mod:`shared_store.bus`).
 
-The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval, and its
-silence counts as :mod:`orchestrator.control.presence` says; a message that is lost costs nothing. With the bus off everything works from the
+The bus is never a truth. Where a node's token vanishes, the controller looks at the engine at once instead of at the next interval; what the
+silence proves is a matter of :mod:`orchestrator.control.presence`. A lost message costs nothing. With the bus off everything works from the
 store and the engine, slower.
 """
 

@@ -99,7 +99,7 @@ class Disk:
         ``purpose``: of the volume for this alone.
         """
         of = (volume for volume in self._volumes if purpose in (None, volume.name))
-        return next((said for volume in of if (said := self._silence(volume) or volume.absent or volume.short)), None)
+        return next((why for volume in of if (why := self._silence(volume) or volume.absent or volume.short)), None)
 
     def away(self, purpose: str) -> str | None:
         """Why the volume of this purpose can't be read: it has not answered for a while, or is not there; None where it can, as far as was seen."""

@@ -279,8 +279,10 @@ class Reconciler:
     def check_writable(self, *, adds: bool) -> None:
         """Whether a request may change the database, to which it ``adds`` something or not.
 
-        Raises StoreAbsent for an addition while the store is not there, DatabaseError while the database can't be used or is another
-        controller's, DatabaseFull where its volume has too little room for an addition.
+        Raises:
+            StoreAbsent: For an addition while the store is not there.
+            DatabaseError: While the database can't be used, or is another controller's.
+            DatabaseFull: For an addition while its volume has too little room.
         """
         if (trouble := self.trouble) is not None and (adds or not self._isolation.is_full):
             raise DatabaseError(trouble)

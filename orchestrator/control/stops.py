@@ -1,4 +1,4 @@
-"""Stops of gangs: each waits for its gang's grace time on a thread of its own; what the engine can't stop now is asked again."""
+"""Stops of gangs: each waits for its gang's grace time on a pool of threads; what the engine can't stop now is asked again."""
 
 from __future__ import annotations
 

@@ -86,8 +86,8 @@ class EngineSet:
         """
         deadline = machine.monotonic() + patience
         asked = [name for name in (self.engines if names is None else names) if name in self._runners]
-        told = {name: self._runners[name].capacity(max(0.0, deadline - machine.monotonic())) for name in asked}
-        return {name: capacity for name, capacity in told.items() if capacity is not None}
+        known = {name: self._runners[name].capacity(max(0.0, deadline - machine.monotonic())) for name in asked}
+        return {name: capacity for name, capacity in known.items() if capacity is not None}
 
     def unknown(self) -> Mapping[str, str]:
         """Why it is not known what an engine has, by the names of those that have not told it yet."""

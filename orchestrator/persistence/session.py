@@ -53,7 +53,7 @@ class Database:
     """Sessions on one database; ``committed``, where set, is called with the jobs that a commit has changed."""
 
     _own: tuple[int, Engine] | None = None
-    """A thread that has connections of its own, and the engine that makes them."""
+    """A thread that has connections for itself alone, and the engine that makes them."""
 
     def __init__(self, url: str) -> None:
         """Open ``url`` (``sqlite:///path``, ``postgresql+psycopg://…``) and bring its tables up to date.
@@ -116,7 +116,7 @@ class Database:
         return engine
 
     def reserve_connections(self) -> None:
-        """Give this thread connections of its own, which no other can take. A database in memory has only one."""
+        """Give this thread connections for itself, which no other can take. A database in memory has only one."""
         if (self._own is None or self._own[0] != threading.get_ident()) and not _is_in_memory(self.engine.url):
             self._own = threading.get_ident(), self._new_engine(self.engine.url)
 

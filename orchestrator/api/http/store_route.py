@@ -19,9 +19,9 @@ _calls: ContextVar[StoreCalls] = ContextVar("_calls")
 class StoreRoute(APIRoute):
     """A route of a function that uses the store: what only reads must end sooner than what changes or verifies something."""
 
-    def __init__(self, path: str, endpoint: Callable[..., Any], **given: Any) -> None:
-        reads = set(given.get("methods") or ["GET"]) <= {"GET", "HEAD"}
-        super().__init__(path, endpoint if iscoroutinefunction(endpoint) else _on_store(endpoint, reads), **given)
+    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        reads = set(options.get("methods") or ["GET"]) <= {"GET", "HEAD"}
+        super().__init__(path, endpoint if iscoroutinefunction(endpoint) else _on_store(endpoint, reads), **options)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handler = super().get_route_handler()
@@ -35,8 +35,8 @@ class StoreRoute(APIRoute):
 
 def _on_store(endpoint: Callable[..., Any], reads: bool) -> Callable[..., Coroutine[Any, Any, Any]]:
     @wraps(endpoint)
-    async def answer(**given: Any) -> Any:
-        works = not reads or bool(given.get("verify"))
-        return await _calls.get().answer(partial(endpoint, **given), works=works)
+    async def answer(**parameters: Any) -> Any:
+        works = not reads or bool(parameters.get("verify"))
+        return await _calls.get().answer(partial(endpoint, **parameters), works=works)
 
     return answer

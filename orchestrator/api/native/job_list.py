@@ -158,8 +158,9 @@ def _progress(reconciler: Reconciler, trainings: Sequence[_Training]) -> Mapping
             _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(list(runs)))).all()
             owners = {name: owner_of(session, run) for name, run in runs.items()}
         hidden = {name for name, owner in owners.items() if owner is None or not permissions.is_visible(owner)}
-    told = {each.job.id: _told(reconciler, each, read[each.job.id]) for each in trainings if each.job.run not in hidden}
-    return {job: progress for job, progress in told.items() if progress is not None}
+    shown = [each for each in trainings if each.job.run not in hidden]
+    known = {each.job.id: _told(reconciler, each, read[each.job.id]) for each in shown}
+    return {job: progress for job, progress in known.items() if progress is not None}
 
 
 def _read(

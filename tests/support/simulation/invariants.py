@@ -129,6 +129,7 @@ class Invariants:
             return
         began, self._is_checked = self._since, True
         self._check_waiting()
+        self._check_stops(began)
         rows = world.memory.execute(
             "SELECT jobs.name, jobs.status_reason, attempts.running_since FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
             " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NULL AND attempts.ending IS NULL"
@@ -144,6 +145,19 @@ class Invariants:
                 raise Violation(
                     f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_away or 'answers'}"
                 )
+
+    def _check_stops(self, began: float) -> None:
+        """A stop that was asked for before ``began`` is decided, whatever the store does, unless the engine or the database is away."""
+        world = self._world
+        if world.engine_away or world.database_down:
+            return
+        query = (
+            "SELECT jobs.name FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
+            " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NOT NULL AND attempts.ending IS NULL"
+        )
+        for (name,) in world.memory.execute(query).fetchall():
+            if (asked := world.job(name).stopped_at) is not None and asked < began:
+                raise Violation(f"{name} was asked to stop at {asked:.0f} s, and its end is not decided")
 
     def _check_waiting(self) -> None:
         """A job that waits says why, and that the volume is away if that is so, and only then."""

@@ -9,10 +9,11 @@ from typing import Any
 from unittest import mock
 
 from orchestrator.control import attempts, endings
+from orchestrator.control.observer import Observer
 from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, RunStore
 from orchestrator.domain import attempt as rules
-from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Launched, Silence
+from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Launched, Observed, Silence
 from orchestrator.domain.attempt_instructions import Explain, Instructions, Launch
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
@@ -87,6 +88,17 @@ def a_launched_gang_waits_for_its_look() -> Mutant:
     return mock.patch.object(attempts, "step", stepped)
 
 
+def a_stop_waits_for_outcomes() -> Mutant:
+    """Nothing is decided while it is not known how a node has ended."""
+    observe = Observer.observe
+
+    def observed(self: Observer, job: Any, attempt: Any) -> Observed | None:
+        seen = observe(self, job, attempt)
+        return None if seen is not None and seen.unread is not None else seen
+
+    return mock.patch.object(Observer, "observe", observed)
+
+
 def any_volume_is_the_store() -> Mutant:
     """T1: what is missing on another volume counts as missing."""
     init = RunStore.__init__
@@ -115,6 +127,7 @@ MUTANTS: Mapping[str, Callable[[], Mutant]] = {
     "B4": the_loop_reads_the_store,
     "B9": what_is_to_end_is_launched,
     "look": a_launched_gang_waits_for_its_look,
+    "stop": a_stop_waits_for_outcomes,
     "T1": any_volume_is_the_store,
     "T2": without_an_outcome_is_killed,
 }
