@@ -70,11 +70,15 @@ class Client:
         self._http = httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False)
 
     @classmethod
-    def connect(cls, url: str | None = None) -> Client:
+    def connect(cls, url: str | None = None, *, serving: bool = False) -> Client:
         """The controller at ``url``, else at ``$MUSTER_URL``, else that of ``$MUSTER_HOME``.
 
         Another home directory's controller is never taken in its place: names of jobs and runs are the same everywhere.
-        Raises Unreachable where none answers, ApiError where the token is refused.
+
+        Raises:
+            Unreachable: None answers.
+            NotServing: It answers that it can't serve now, and ``serving`` is set; without its store it can still list and stop jobs.
+            ApiError: The token is refused.
         """
         found = not (url or os.environ.get("MUSTER_URL"))
         url = url or os.environ.get("MUSTER_URL") or local_url()
@@ -85,7 +89,11 @@ class Client:
             )
         client = cls(url, os.environ.get("MUSTER_TOKEN"))
         client._found = found
-        client.get("/healthz")
+        try:
+            client.get("/healthz")
+        except NotServing:
+            if serving:
+                raise
         return client
 
     def batch(self, operation: str, **request: Any) -> dict[str, Any]:
@@ -180,7 +188,8 @@ class Client:
             except (httpx.ReadError, httpx.RemoteProtocolError):
                 if not headers:
                     raise
-                self.await_return(30)  # the answer was lost; with its key the same request submits nothing twice
+                # the answer was lost; with its key the same request submits nothing twice
+                self.await_return(30, serving=False)
                 answer = send()
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
@@ -203,21 +212,29 @@ class Client:
             f"no controller answers at {self.url} ({error or type(error).__name__}); start one with `muster serve`"
         )
 
-    def await_return(self, seconds: float = 120) -> None:
-        """Wait until the controller, or its successor on the same home directory, answers again. Raises Unreachable."""
-        deadline = time.monotonic() + seconds
-        said = False
+    def await_return(self, seconds: float = 120, *, serving: bool = True) -> None:
+        """Wait until the controller, or its successor on the same home directory, answers again. Raises Unreachable.
+
+        Args:
+            seconds: For so long one is waited for that does not answer.
+            serving: Wait, without end, until one that answers can serve again.
+        """
+        deadline, shown = time.monotonic() + seconds, ""
         while True:
             try:
-                successor = self.successor() if self.successor else Client.connect(None if self._found else self.url)
+                url = None if self._found else self.url
+                successor = self.successor() if self.successor else Client.connect(url, serving=serving)
                 break
+            except NotServing as error:
+                deadline, problem = time.monotonic() + seconds, f"{error}; waiting"
             except Unreachable:
                 if time.monotonic() > deadline:
                     raise
-                if not said:
-                    self.told(f"no controller answers at {self.url}; waiting up to {seconds:.0f} s for one")
-                    said = True
-                time.sleep(0.5)
+                problem = f"no controller answers at {self.url}; waiting up to {seconds:.0f} s for one"
+            if problem != shown:
+                self.told(problem)
+                shown = problem
+            time.sleep(0.5)
         self._http.close()
         self.url, self._http = successor.url, successor._http
 

@@ -10,7 +10,7 @@ import re
 import secrets
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from orchestrator.domain.errors import ServerError
 from shared_store.files import write_atomic
@@ -35,11 +35,22 @@ def muster_home() -> Path:
 
 def local_url() -> str | None:
     """URL at which the controller of this home directory listens; None where it does not run."""
+    found = _published()
+    return str(found["url"]) if found else None
+
+
+def is_temporary() -> bool:
+    """Whether the controller of this home directory goes away with the command that started it."""
+    return bool((_published() or {}).get("temporary"))
+
+
+def _published() -> dict[str, Any] | None:
+    """What the controller of this home directory tells of itself; None where it does not run."""
     try:
-        told = json.loads((muster_home() / "controller.json").read_text())
-        os.kill(int(told["pid"]), 0)
-        return str(told["url"])
-    except (OSError, ValueError, KeyError, TypeError):
+        found = json.loads((muster_home() / "controller.json").read_text())
+        os.kill(int(found["pid"]), 0)
+        return {"url": found["url"], "temporary": found.get("temporary")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
@@ -113,10 +124,10 @@ class HomeLock:
                 f"{home}: already served by {holder}; use that one, stop it, or set MUSTER_HOME to another directory"
             ) from None
 
-    def publish(self, url: str) -> None:
-        """Say where the controller listens, for commands on this machine."""
+    def publish(self, url: str, temporary: bool) -> None:
+        """Tell commands on this machine where the controller listens, and whether it goes away with the command that started it."""
         try:
-            self.path.write_text(json.dumps({"pid": os.getpid(), "url": url}))
+            self.path.write_text(json.dumps({"pid": os.getpid(), "url": url, "temporary": temporary}))
         except OSError as error:
             log.warning("%s can't be written (%s); commands need MUSTER_URL=%s", self.path, error.strerror, url)
 

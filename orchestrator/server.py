@@ -8,8 +8,8 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -111,8 +111,7 @@ class Server:
             nodes = _make_engines(engines, home, cpus, gpus)  # before anything is made in the home directory
             stack.callback(nodes.close)
             if store is None:
-                with suppress(OSError):  # said by open()
-                    (home / "store").mkdir(mode=0o700)
+                stack.enter_context(_default_store(home / "store"))
             self.store = Store(store or home / "store")
             self.store.check_writable()
             try:
@@ -177,15 +176,18 @@ class Server:
             target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True
         )
 
-    def start(self) -> None:
-        """Start the controller and the server, and tell commands on this machine where it is."""
+    def start(self, temporary: bool = False) -> None:
+        """Start the controller and the server, and tell commands on this machine where it is.
+
+        ``temporary``: it goes away with a command that started it; who follows a job then starts another one.
+        """
         self.bus.open()
         self.peers.start()
         self.reconciler.start()
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
-        self._lock.publish(self.url)
+        self._lock.publish(self.url, temporary)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
@@ -194,6 +196,22 @@ class Server:
         if self._thread.is_alive():
             self._thread.join(timeout=5)
         self._opened.close()
+
+
+@contextmanager
+def _default_store(path: Path) -> Iterator[None]:
+    """A context that begins with the directory; it is taken back where nothing came into it, since a volume may belong there."""
+    try:
+        path.mkdir(mode=0o700)
+        made = True
+    except OSError:  # it is there, or check_writable() names what is in the way
+        made = False
+    try:
+        yield
+    finally:
+        if made:
+            with suppress(OSError):
+                path.rmdir()
 
 
 def _database_url(text: str) -> str:

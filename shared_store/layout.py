@@ -172,7 +172,8 @@ class Store:
         if not present.is_dir():
             raise self._not_writable(os.strerror(errno.ENOTDIR))
         if not os.access(present, os.W_OK | os.X_OK):
-            raise self._not_writable(os.strerror(errno.EACCES))
+            is_read_only = os.statvfs(present).f_flag & os.ST_RDONLY
+            raise self._not_writable(os.strerror(errno.EROFS if is_read_only else errno.EACCES))
 
     def check_owner(self) -> None:
         """Raises StoreError where the owner of the store's directory can't write in directories that this user makes there."""

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
+from io import FileIO
 from itertools import islice, takewhile
 from pathlib import Path
 from types import TracebackType
@@ -49,10 +50,10 @@ class MetricsWriter:
     """Appends the metrics of one attempt; one writer per file, on the main node."""
 
     def __init__(self, run: Run, epoch: int, resumed_from: int) -> None:
-        """Open the file of ``epoch``; ``resumed_from`` is the number of finished iterations (0 for a new run)."""
-        run.metrics.mkdir(parents=True, exist_ok=True)
+        """Begin the file of ``epoch``; ``resumed_from`` is the number of finished iterations (0 for a new run)."""
         self.path = run.metrics / f"metrics-e{epoch}.jsonl"
-        self._file = open(self.path, "ab", buffering=0)  # noqa: SIM115 - closed by close()
+        self._file: FileIO | None = None
+        """None until the volume has the file."""
         self._left = bytearray()
         """What the volume has not taken yet."""
         with suppress(OSError):  # it goes with the first iteration's record
@@ -68,13 +69,19 @@ class MetricsWriter:
         self._flush()
 
     def _flush(self) -> None:
+        if self._file is None:
+            self.path.parent.mkdir(exist_ok=True)  # not its parents: where the run is not, the volume is another one
+            self._file = open(self.path, "ab", buffering=0)  # noqa: SIM115 - closed by close()
         while self._left:
             del self._left[: self._file.write(self._left)]
 
     def close(self) -> None:
         """Raises OSError where records are left that the volume does not take."""
-        with self._file:
+        try:
             self._flush()
+        finally:
+            if self._file is not None:
+                self._file.close()
 
     def __enter__(self) -> MetricsWriter:
         return self

@@ -165,12 +165,13 @@ def queue_names(session: Session) -> list[str]:
 
 
 def find_run(reconciler: Reconciler, name: str) -> Run:
-    """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run."""
+    """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run; StoreSilent."""
     try:
         run = reconciler.store.run(name)
     except StoreError as error:
         raise ClientError(str(error)) from None
     if run.description() is None:
+        reconciler.check_store()
         with reconciler.database.session() as session:
             query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
             job = session.scalars(query.limit(1)).first()

@@ -253,7 +253,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         for node in attempt["nodes"]:
             state = "running" if started else "not started yet"
             if not node["running"]:
-                state = f"exit {node.get('exitCode', '?')}: {one_line(node.get('reason', ''))}"
+                code = f"exit {node.get('exitCode', '?')}"
+                state = f"{code}: {one_line(node.get('reason', '')).removeprefix(f'{code}, ')}"
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")

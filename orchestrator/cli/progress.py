@@ -31,6 +31,7 @@ def follow(client: Client, job_id: str) -> int:
     if detail["kind"] != "train":
         return _follow_logs(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
+    client.told = display.tell
     seen, reason, has_run = 0, None, False
     with display:
         while True:
@@ -48,6 +49,7 @@ def follow(client: Client, job_id: str) -> int:
                     records, seen = page, page[-1]["iteration"]
             except Unreachable:
                 client.await_return()
+                time.sleep(_POLL)
                 continue
             # not iterations before a resume
             records = [each for each in records if each["time"] * 1000 >= detail["createdAt"]]
@@ -104,6 +106,7 @@ def best_told(run: str, best: Mapping[str, Any] | None) -> str:
 
 
 def _follow_logs(client: Client, job_id: str) -> int:
+    client.told = lambda line: echo(line, err=True)
     waits = Waits(client, job_id)
     for lines in client.log_batches(job_id, follow=True):
         if lines:
@@ -218,6 +221,10 @@ class _Display:
         self._first: tuple[float, int] | None = None
         self.started = time.monotonic()
 
+    def tell(self, text: str) -> None:
+        """Show why nothing happens."""
+        echo(text, err=True)
+
     def eta(self, record: dict[str, Any]) -> str:
         """Remaining time at the pace since the first displayed iteration (at first: of that iteration), as h:mm:ss."""
         now, iteration = time.monotonic(), record["iteration"]
@@ -254,6 +261,9 @@ class _Bar(_Display):
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
+
+    def tell(self, text: str) -> None:
+        self._progress.update(self._task, text=one_line(text))
 
     def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
         task = self._progress.tasks[0]

@@ -19,7 +19,7 @@ from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable
-from orchestrator.home import local_url, muster_home
+from orchestrator.home import ControllerRuns, is_temporary, local_url, muster_home
 from orchestrator.spec import file as specfile
 from orchestrator.spec.values import seconds_of
 
@@ -198,7 +198,7 @@ def _lost_after(text: str) -> float:
     seconds = seconds_of("--lost-after", text)
     if seconds is None or seconds < _SHORTEST_SILENCE:
         raise SpecError(
-            f"--lost-after {text}: expected at least {_SHORTEST_SILENCE:.0f}s; a busy machine is silent for some seconds"
+            f"--lost-after {text!r}: expected at least {_SHORTEST_SILENCE:.0f}s; a busy machine is silent for some seconds"
         )
     return seconds
 
@@ -217,7 +217,8 @@ def controller(store: str | None, cpus: float | None, engines: Sequence[str] = (
 
         def connect() -> Client:
             client = stack.enter_context(_controller(store, cpus, engines))
-            client.successor = connect
+            # a service comes back by itself, with its own options; none of this command's may take its place
+            client.successor = connect if is_temporary() else None
             return client
 
         yield connect
@@ -229,7 +230,7 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
     url = os.environ.get("MUSTER_URL") or local_url()
     if url:
         try:
-            with Client.connect(url) as client:
+            with Client.connect(serving=True) as client:
                 there = client.get("/api/capacity")["store"]
                 if store is not None and str(Path(store).expanduser().absolute()) != there:
                     raise ServerError(
@@ -244,8 +245,15 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
                 raise
     from orchestrator.server import Server
 
-    server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",))
-    server.start()
+    try:
+        server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",))
+    except ControllerRuns as error:
+        if url is None:
+            raise
+        raise Unreachable(
+            f"the controller at {url} does not answer: it may be frozen or busy; its jobs run on"
+        ) from error
+    server.start(temporary=True)
     try:
         with Client(server.url, server.access.own_token) as client:  # it may require a key that this command lacks
             yield client

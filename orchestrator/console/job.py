@@ -27,12 +27,13 @@ from orchestrator.console.routing import page_router
 from orchestrator.console.run_files import File, files_of
 from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.queries import short_id
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
 from shared_store.metrics import history_of, sampled
 
-router = page_router(stored=True)
+router, _stored = page_router(), page_router(stored=True)
 
 _recent = Recent()
 _RECORDS = 200
@@ -43,18 +44,21 @@ _CHILDREN = 100
 
 @router.get("/jobs/{reference}")
 def job(request: Request, reference: str) -> Response:
-    """The page; a name or the start of an id is redirected to it."""
+    """The page; a name or the start of an id is redirected to it. Without the store it has what the database knows."""
     reconciler = reconciler_of(request)
     detail = job_detail(request, reference)
     if detail["id"] != reference:
         return RedirectResponse(f"/jobs/{detail['id']}", 303)
     described = batch.call(reconciler, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
     array = described.get("arrayProperties", {})
-    before = before_it(reconciler, detail)
     spec = detail["spec"] or {}
     is_visible = detail["results"] is not None
-    files = _files(reconciler, detail["run"]) if is_visible else []
-    rows = _rows(reconciler, detail)
+    before, files, rows = None, list[File](), {"attempts": attempts_of(detail), "checkpoints": {}}
+    if detail["storeProblem"] is None:
+        try:
+            before, files, rows = reconciler.calls.call(partial(_read, reconciler, detail))
+        except StoreSilent as error:
+            detail["storeProblem"] = str(error)
     view = views.state(detail["id"])
     return render(
         request,
@@ -86,7 +90,7 @@ def job(request: Request, reference: str) -> Response:
     )
 
 
-@router.get("/jobs/{reference}/stream")
+@_stored.get("/jobs/{reference}/stream")
 def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     """The changes of the page and the new lines of its log, as events. The id of an event is the page's position in both."""
     reconciler = reconciler_of(request)
@@ -95,6 +99,14 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     iteration, places = _had(last_id(request))
     log = LiveLog(chosen, chosen.end() if places is None else places)
     return stream(request, _Feed(look, log, chosen.run, iteration).changes, stored=True)
+
+
+def _read(
+    reconciler: Reconciler, detail: Mapping[str, Any]
+) -> tuple[tuple[str, str, Mapping[str, Any]] | None, list[File], dict[str, Any]]:
+    """What the page has from the store: the other side of the comparison, the run's files, and rows."""
+    files = _files(reconciler, detail["run"]) if detail["results"] is not None else []
+    return before_it(reconciler, detail), files, _rows(reconciler, detail)
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:
@@ -190,3 +202,6 @@ def _container(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 _ATTEMPT = ("number", "epoch", "ending", "kind", "why", "started", "took", "since", "cost", "from", "span", "nodes")
 _CHECKPOINT = (*("iteration", "epoch", "label", "reward", "score", "evaluated", "size", "created", "marks", "problem"),)
+
+
+router.include_router(_stored)

@@ -38,9 +38,11 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
     attempts = detail["attempts"]
     started = next((each["startedAt"] for each in attempts if each["startedAt"]), detail["startedAt"])
     results = detail["results"] or {}
+    reason = (detail["statusReason"] or "") if status != Status.SUCCEEDED else ""
+    problem = detail["storeProblem"] or ""
     return {
         "status": status,
-        "reason": (detail["statusReason"] or "") if status != Status.SUCCEEDED else "",
+        "reason": reason if problem in reason else "; ".join(each for each in (reason, problem) if each),
         "open": "" if is_over else "yes",
         "run": "yes" if detail["results"] is not None else "",
         "saves": "yes" if status == Status.RUNNING and training else "",
@@ -106,7 +108,8 @@ def _where(nodes: Sequence[Mapping[str, Any]]) -> str:
         gpus = f", {counted(len(node['gpus']), 'GPU')}" if node["gpus"] else ""
         ended = ""
         if not node["running"]:
-            code, reason = node.get("exitCode"), node.get("reason") or ""
+            code = node.get("exitCode")
+            reason = (node.get("reason") or "").removeprefix(f"exit {code}, ")
             ended = f" (exit {'?' if code is None else code}{f': {reason}' if reason else ''})"
         told.append(f"node {node['index']} on {node['host']}{gpus}{ended}")
     if len(nodes) > _NODES:

@@ -60,7 +60,7 @@ class Admission:
         """Make a scheduling pass, where something changed or time has passed, and enough space is free."""
         shortage = self._disk.shortage()
         if self._short != (shortage is not None):
-            log.warning("%s", shortage or "the volumes have enough free space again")
+            log.warning("%s", shortage or "the volumes answer again, and have enough free space")
             self._short = shortage is not None
         if shortage is not None:
             return

@@ -47,7 +47,8 @@ def seen_end(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
     if node.cause is Cause.PREEMPTED and not is_native:
         code = _KILLED
     if node.cause is Cause.EXIT:
-        words = f"exit {code}, outcome not written{f' ({node.words})' if node.words else ''}"
+        why = node.words.partition("; trying again")[0]
+        words = f"exit {code}, outcome not written{f' ({why})' if why else ''}"
         return NodeEnd(code, words, moment, asked=None)
     words = node.words or "the supervisor died without an outcome"
     return NodeEnd(code, words, moment, lost=node.cause in _TAKEN)

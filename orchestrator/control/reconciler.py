@@ -26,7 +26,7 @@ from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import RunStore
 from orchestrator.control.snapshot import open_attempts
-from orchestrator.control.store_calls import StoreCalls
+from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.control.store_identity import StoreAbsent, StoreIdentity
 from orchestrator.control.usage import forget_before
 from orchestrator.control.work_queue import WorkQueue
@@ -81,6 +81,7 @@ class Reconciler:
         self.interval, self.retention = interval, retention
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
+        self._identity = identity
         self.disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
         self.calls = StoreCalls(store.path, self.store_problem)
         """The store, for requests."""
@@ -168,6 +169,11 @@ class Reconciler:
     def store_problem(self) -> str | None:
         """Why the store can't be read; None where it can, as far as was seen."""
         return self.disk.away("store")
+
+    def check_store(self) -> None:
+        """Raises StoreSilent where what is at the store's path now is not the store: what is missing there may be missing for that."""
+        if self._identity is not None and (problem := self._identity.problem()) is not None:
+            raise StoreSilent(problem)
 
     def problem(self) -> str | None:
         """Why the controller can't do its work now, as its loop has left it; waits for nothing."""

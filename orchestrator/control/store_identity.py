@@ -14,7 +14,8 @@ from shared_store.layout import Store, StoreError
 
 _NEWEST = 100
 """How many of the newest runs of a database are looked for in a store without an identity."""
-_REMEDY = "see whether its volume is mounted; --adopt-store takes what is there as the store of this controller"
+_MOUNTED = "see whether its volume is mounted"
+_REMEDY = f"{_MOUNTED}; --adopt-store takes what is there as the store of this controller"
 
 
 class StoreAbsent(Unavailable):
@@ -68,8 +69,11 @@ def recognise(session: Session, store: Store, adopt: bool) -> StoreIdentity:
         raise StoreError(f"store {store.path}: store.json can't be read ({error})") from error
     if not adopt:
         if known is not None and known.identity != present:
-            what = "another store is" if present else "there is no store"
-            raise StoreError(f"store {store.path}: {what} there, not the one of this controller; {_REMEDY}")
+            if present is None:
+                raise StoreError(
+                    f"store {store.path}: there is no store there; {_MOUNTED}; --adopt-store begins a new one"
+                )
+            raise StoreError(f"store {store.path}: another store is there, not the one of this controller; {_REMEDY}")
         if known is None and not _has_runs(session, store):
             raise StoreError(f"store {store.path}: none of the runs of this controller's jobs is there; {_REMEDY}")
     identity = store.open().identity()

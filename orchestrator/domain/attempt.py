@@ -235,13 +235,14 @@ def _end(state: State, seen: Observed) -> Instructions:
     """Once the end is decided: the gang is stopped, unless its children may end by themselves."""
     if (verdict := state.verdict) is None:
         return ()
-    explained = (Explain(f"{verdict.reason}; waits for {seen.stale}"),) if seen.stale else ()
+    waits = f"waits for {seen.stale}" if seen.stale else "its nodes are ending"
+    explained = Explain(f"{verdict.reason}; {waits}")
     if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
         since = seen.moment if state.done_since is None else state.done_since
         if seen.moment - since < FINISHING:
-            return *explained, AwaitChildren(since)
+            return explained, AwaitChildren(since)
     is_broken = verdict.ending in (Ending.FAILED, Ending.FATAL)
-    return *explained, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
+    return explained, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
 
 
 def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:

@@ -224,7 +224,9 @@ class Runner:
         try:
             return machine.result(looking, _LAST_LOOK)
         except TimeoutError:
-            raise Transient(self.silence or f"the {self.engine.name} engine has not reported how the gang ended") from None
+            raise Transient(
+                self.silence or f"the {self.engine.name} engine has not reported how the gang ended"
+            ) from None
 
     def forget(self, gang: str, handle: Handle | None) -> None:
         """The gang is over; ``handle``: None where it was never launched."""

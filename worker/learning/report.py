@@ -86,9 +86,16 @@ class Report:
         self._rated_at = resumed_from + WARMED if device == "cpu" else 0
         self._warned = False
         self._metrics = MetricsWriter(job.run, job.epoch, resumed_from)
-        self._events = SummaryWriter(
-            str(job.run.metrics), purge_step=resumed_from + 1, filename_suffix=f".e{job.epoch}", flush_secs=10
-        )
+        directory = job.run.metrics
+
+        def events() -> SummaryWriter:
+            directory.stat()  # it would be made where another volume is
+            return SummaryWriter(
+                str(directory), purge_step=resumed_from + 1, filename_suffix=f".e{job.epoch}", flush_secs=10
+            )
+
+        self._new_events = events
+        self._events: SummaryWriter | None = None
 
     def iteration(self, record: dict[str, Any]) -> None:
         """Print and store one iteration's ``record``."""
@@ -120,6 +127,8 @@ class Report:
         self._metrics.write({**record, "time": time.time()})
 
     def _write_events(self, record: Mapping[str, Any]) -> None:
+        if self._events is None:
+            self._events = self._new_events()
         for name, value in scalars(record).items():
             self._events.add_scalar(name, value, record["iteration"])
 
@@ -139,7 +148,8 @@ class Report:
         """Flush everything."""
         try:
             self._metrics.close()
-            self._events.close()
+            if self._events is not None:
+                self._events.close()
         except OSError as error:
             print(f"warning: metrics can't be written ({error})", flush=True)
 

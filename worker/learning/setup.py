@@ -156,6 +156,7 @@ def write_contract(job: Job, document: dict[str, Any]) -> None:
     """
     check_epoch(job.run, job.epoch)
     try:
+        job.run.path.stat()  # where the run is not, the volume is another one
         if read_json(job.run.contract) != document:
             write_json(job.run.contract, document)
     except (OSError, ValueError) as error:

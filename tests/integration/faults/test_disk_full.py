@@ -78,7 +78,7 @@ def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_
             copying.wait(10 * PATIENCE)
     said = (volume.parent / "stderr").read_text()
     assert "Traceback" not in said and len(said) < 4000, said
-    assert "MB free" in said and "the volumes have enough free space again" in said
+    assert "MB free" in said and "the volumes answer again, and have enough free space" in said
     assert not processes_of(server.home)
 
 

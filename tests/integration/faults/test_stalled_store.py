@@ -171,6 +171,9 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
             if there == "another store":
                 add_run(Store(path).open(), "foreign")
             said = f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            assert asked(server, "/api/runs/taught").status_code == 503, (
+                "what is missing is not taken for deleted meanwhile"
+            )
             # the look before may have found the path empty
             wait_for(lambda: said in (server.reconciler.disk.away("store") or ""), 60, "that it is seen")
             answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/tracks", "/runs/taught")]

@@ -50,7 +50,7 @@ def test_another_or_no_store_under_the_path_is_refused_until_it_is_adopted(home:
     mine = home.start()
     home.store.path.rename(tmp_path / "away")
     assert "there is no store" in (mine.problem() or "")
-    with pytest.raises(StoreError, match=r"there is no store there, not the one of this controller.*--adopt-store"):
+    with pytest.raises(StoreError, match=r"there is no store there; see whether.*--adopt-store"):
         home.start()
     home.store.path.mkdir()
     with pytest.raises(StoreError, match="there is no store there"):

@@ -104,7 +104,15 @@ ROOMLESS = "attempt 2 runs on 2 of 4 nodes: there is no room for more"
 
 def ends(verdict: Verdict, grace: float = 35.0, first: Instruction = SAYS_SO) -> list[Instruction]:
     """A look at a gang brings its end about."""
-    return [first, Decide(verdict), Save(), Stop(grace)]
+    return [first, *decided(verdict, grace)]
+
+
+def decided(verdict: Verdict, grace: float = 35.0) -> list[Instruction]:
+    return [Decide(verdict), Save(), ending_so(verdict.reason), Stop(grace)]
+
+
+def ending_so(reason: str = "why") -> Instruction:
+    return Explain(f"{reason}; its nodes are ending")
 
 
 TIMED = with_terms(RUNNING, timeout=50)
@@ -177,7 +185,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "nor when the job is to stop": (
         asked(RUNNING),
         seen(KILLED, None),
-        [SAYS_SO, AwaitCause(T), Decide(STOPPED), Save(), Stop(35.0)],
+        [SAYS_SO, AwaitCause(T), *decided(STOPPED)],
     ),
     "a request ends it": (asked(RUNNING), seen(), ends(STOPPED)),
     "also before it runs": (asked(STARTING), seen(waits="queued"), ends(STOPPED, first=Explain("queued"))),
@@ -206,18 +214,22 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         [Explain("Slurm is away; the store is away")],
     ),
     "or nothing yet, and nothing follows from ends": (RUNNING, seen(end(1), None, unread=""), []),
-    "a request does not wait for the store": (asked(RUNNING), seen(unread=""), [Decide(STOPPED), Save(), Stop(35.0)]),
+    "a request does not wait for the store": (asked(RUNNING), seen(unread=""), decided(STOPPED)),
     "nor does the clock": (
         replace(TIMED, running_since=T - 50_001),
         seen(unread=""),
-        [Decide(LATE), Save(), Stop(35.0)],
+        decided(LATE),
     ),
     "nor a lost node": (
         RUNNING,
         seen(silences=(None, GONE_QUIET), unread=""),
-        [Decide(FROZEN), Save(), Stop(35.0)],
+        decided(FROZEN),
     ),
-    "nor an end that is decided": (ending(Ending.PREEMPTED), seen(unread="the store is away"), [Stop(35.0)]),
+    "nor an end that is decided": (
+        ending(Ending.PREEMPTED),
+        seen(unread="the store is away"),
+        [ending_so(), Stop(35.0)],
+    ),
     "an engine that does not answer is named": (
         RUNNING,
         seen(stale="Slurm is away"),
@@ -232,25 +244,29 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "also before its launch": (LAUNCHING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     "not twice": (ending(Ending.FAILED), Preempted("for b"), []),
     # -- how it is ended
-    "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), [Stop(5.0)]),
-    "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), [Stop(35.0)]),
+    "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), [ending_so(), Stop(5.0)]),
+    "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), [ending_so(), Stop(35.0)]),
     "one that never ran is stopped, too": (
         ending(Ending.PREEMPTED, of=STARTING),
         seen(waits="queued"),
-        [Explain("queued"), Stop(35.0)],
+        [Explain("queued"), ending_so(), Stop(35.0)],
     ),
     "children of a main node that is done may end": (
         RUNNING,
         seen(end(0), None),
-        [SAYS_SO, Decide(DONE), Save(), AwaitChildren(T)],
+        [SAYS_SO, Decide(DONE), Save(), ending_so(DONE.reason), AwaitChildren(T)],
     ),
     "for a while": (
         replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING + 1),
         seen(end(0), None),
-        [AwaitChildren(T - FINISHING + 1)],
+        [ending_so(), AwaitChildren(T - FINISHING + 1)],
     ),
-    "and no longer": (replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING), seen(end(0), None), [Stop(35.0)]),
-    "on AWS not at all": (on_aws(ending(Ending.SUCCEEDED)), seen(end(0), None), [Stop(35.0)]),
+    "and no longer": (
+        replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING),
+        seen(end(0), None),
+        [ending_so(), Stop(35.0)],
+    ),
+    "on AWS not at all": (on_aws(ending(Ending.SUCCEEDED)), seen(end(0), None), [ending_so(), Stop(35.0)]),
     "an old picture is named": (
         ending(Ending.FAILED),
         seen(stale="Slurm to answer"),
