@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared_store import metrics
-from shared_store.layout import Run
+from shared_store.layout import Run, Store
 from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics, sampled
 
 
@@ -195,3 +195,14 @@ def test_a_sample_has_nothing_of_an_abandoned_past_and_ends_with_the_epoch_that_
     assert {epoch for _, epoch in found} == {1, 2}
     earlier = points(run, 60, 1)
     assert earlier[-1] == (3000, 1) and {epoch for _, epoch in earlier} == {1}
+
+
+def test_where_the_run_is_not_nothing_is_made_and_all_records_come_once_it_is_back(tmp_path: Path) -> None:
+    run = Store(tmp_path / "store").open().run("away")
+    with MetricsWriter(run, 1, 0) as writer:
+        with pytest.raises(OSError):
+            writer.write({"iteration": 1})
+        assert not run.path.exists()
+        run.path.mkdir()
+        writer.write({"iteration": 2})
+    assert [each["iteration"] for each in read_metrics(run)] == [1, 2]
