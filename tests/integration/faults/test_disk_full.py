@@ -136,6 +136,7 @@ def test_only_the_volume_that_is_short_is_named(tmp_path: Path) -> None:
 def test_metrics_wait_for_room_and_none_is_lost(tmp_path: Path) -> None:
     with small_volume(tmp_path / "volume", 1 << 20) as volume:
         run = Store(volume / "store").open().run("r")
+        run.path.mkdir()
         writer = MetricsWriter(run, 1, 0)
         writer.write({"iteration": 1})
         filler = fill(volume)

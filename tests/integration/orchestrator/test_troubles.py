@@ -164,7 +164,7 @@ def test_without_its_database_a_controller_accepts_nothing(
         health = wait_for(lambda: (h := httpx.get(f"{url}/healthz")).is_error and h, 10, "that the loop has noticed")
         assert (health.status_code, health.json()["message"]) == (503, said)
         with pytest.raises(ApiError, match=re.escape(said)):
-            Client.connect(url)
+            Client.connect(url, serving=True)
         for ask in (lambda: submit_gang(client, "pass"), lambda: detail(client, running)):
             with pytest.raises(ApiError) as refused:
                 ask()
