@@ -143,7 +143,7 @@ def _controller() -> Finding:
     if url is None:
         return Finding("controller", "absent", f"none of {muster_home()} runs; muster serve starts one")
     try:
-        with Client.connect(url) as client:
+        with Client.connect(url, serving=True) as client:
             engines = client.get("/api/capacity")["engines"]
     except (Unreachable, ApiError) as error:
         return Finding("controller", "bad", " ".join(str(error).split()))

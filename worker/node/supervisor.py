@@ -341,7 +341,7 @@ class Supervisor:
         else:
             code, reason, error = 0, "done", None
         name = first.signal_name if first else None
-        asked = first is not None and self._was_asked(first)
+        asked = self._was_asked(first) if first else any(rank.asked for rank in self.ranks)
         node, epoch = self.contract.node_index, self.contract.epoch
         return Outcome(node, epoch, code, name, reason, error, started, time.time(), asked)
 

@@ -165,6 +165,11 @@ def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node
     asked.process.terminate()
     assert (asked.wait(), asked.ended().asked) == (143, True)
     assert asked.ended().reason == "rank 0 was killed by SIGTERM"
+    well = node()
+    well.start("sh", "-c", "trap 'exit 0' TERM; echo ready; while :; do sleep 0.1; done")
+    well.wait_for_output("ready")
+    well.process.terminate()
+    assert (well.wait(), well.ended().asked) == (0, True)
     failed = node(attempt=2)
     assert (failed.shell("exit 3"), failed.ended().asked) == (3, False)
     gang = node(attempt=3, ranks_per_node=3)
