@@ -166,8 +166,8 @@ def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node
     assert (asked.wait(), asked.ended().asked) == (143, True)
     assert asked.ended().reason == "rank 0 was killed by SIGTERM"
     well = node(attempt=4)
-    well.start("sh", "-c", "trap 'exit 0' TERM; echo ready; while :; do sleep 0.1; done")
-    well.wait_for_output("ready")
+    well.start("sh", "-c", "trap 'exit 0' TERM; echo set; while :; do sleep 0.1; done")
+    well.wait_for_output("set")
     well.process.terminate()
     assert (well.wait(), well.ended().asked) == (0, True)
     failed = node(attempt=2)
