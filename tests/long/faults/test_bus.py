@@ -61,7 +61,7 @@ def test_a_killed_node_is_noticed_by_its_connection_long_before_its_lease_ends(b
     node = start_node(bus, "time.sleep(600)", lease=3_600_000)
     assert bus.presence.silence(("j", 1, 0), None) is None
     noticed = threading.Event()
-    bus.changed = noticed.set
+    bus.changed = lambda job: noticed.set()
     node.kill()
     assert noticed.wait(20 * PATIENCE)
     assert bus.presence.silence(("j", 1, 0), None) is not None
