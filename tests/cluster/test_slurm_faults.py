@@ -160,7 +160,9 @@ def test_a_frozen_slurmctld_is_named_by_the_gangs_that_run_and_by_those_that_are
             command, env={**os.environ, "MUSTER_HOME": str(served.home)}, stderr=subprocess.PIPE, text=True
         )
         assert stopping.stderr is not None
-        assert "stopped by the user; waits for Slurm: slurmctld " in stopping.stderr.readline()
+        assert "stopped by the user; " in stopping.stderr.readline()
+        waits = "stopped by the user; waits for Slurm: slurmctld "
+        wait_for(lambda: waits in served.detail(job)["statusReason"], 40, "that the stop says for what it waits")
         daemon.send_signal(signal.SIGCONT)
         assert stopping.wait(120 * PATIENCE) == 0 and served.detail(job)["status"] == "FAILED"
     finally:
