@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import raise_epoch
 from shared_store.layout import Run, Store
 from tests.conftest import PATIENCE
 from tests.support.waiting import wait_for
@@ -104,6 +105,7 @@ def train_slowly_from_the_third() -> int:
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_stop_in_a_long_iteration_loses_that_iteration_alone(tmp_path: Path, ranks: int) -> None:
     env = training(tmp_path, run="stopped", iterations=6, every=100, keep=2)
+    raise_epoch(Store(tmp_path).run("stopped"), 1)  # as the controller has, before it launches a gang
     body = "training.worker.test_slow_volumes_and_iterations:train_slowly_from_the_third"
     port = free_port()
     started = [start_rank(body, rank, ranks, port, {**env, "MUSTER_GRACE_SECONDS": "2"}) for rank in range(ranks)]
