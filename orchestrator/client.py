@@ -64,7 +64,7 @@ class Client:
         self._found = False
         self.successor: Callable[[], Client] | None = None
         """Finds or starts another controller when this one is gone; None: the client waits for this one."""
-        self.told: Callable[[str], object] = lambda line: None
+        self.notify: Callable[[str], object] = lambda line: None
         """Is called with what a person would like to know while nothing happens."""
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         self._http = httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False)
@@ -232,7 +232,7 @@ class Client:
                     raise
                 problem = f"no controller answers at {self.url}; waiting up to {seconds:.0f} s for one"
             if problem != shown:
-                self.told(problem)
+                self.notify(problem)
                 shown = problem
             time.sleep(0.5)
         self._http.close()

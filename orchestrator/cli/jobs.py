@@ -257,7 +257,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
                 state = f"{code}: {one_line(node.get('reason', '')).removeprefix(f'{code}, ')}"
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
-            console.print(f"      {node['log']}", markup=False, style="dim")
+            if node["log"]:  # not before the attempt has its run
+                console.print(f"      {node['log']}", markup=False, style="dim")
 
 
 def _source(detail: Mapping[str, Any]) -> str:

@@ -49,7 +49,7 @@ def logs(
     colour = sys.stdout.isatty()
     came = False
     with Client.connect() as client:
-        client.told = lambda line: echo(line, err=True)
+        client.notify = lambda line: echo(line, err=True)
         waits = Waits(client, job)
         for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
             if not lines:

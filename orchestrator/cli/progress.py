@@ -31,7 +31,7 @@ def follow(client: Client, job_id: str) -> int:
     if detail["kind"] != "train":
         return _follow_logs(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
-    client.told = display.tell
+    client.notify = display.tell
     seen, reason, has_run = 0, None, False
     with display:
         while True:
@@ -106,7 +106,7 @@ def best_told(run: str, best: Mapping[str, Any] | None) -> str:
 
 
 def _follow_logs(client: Client, job_id: str) -> int:
-    client.told = lambda line: echo(line, err=True)
+    client.notify = lambda line: echo(line, err=True)
     waits = Waits(client, job_id)
     for lines in client.log_batches(job_id, follow=True):
         if lines:

@@ -117,7 +117,7 @@ def serve(
         str,
         typer.Option(
             help="Time after which a node that alone is silent on the bus is lost, such as 5m, while its engine answers and says that "
-            "it runs. Nodes that fall silent together are waited for: the controller may be the one that is cut off."
+            "it runs. The controller waits for nodes that fall silent together, since it may itself be cut off."
         ),
     ] = "120s",
     rate_limit: Annotated[

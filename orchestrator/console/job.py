@@ -53,10 +53,10 @@ def job(request: Request, reference: str) -> Response:
     array = described.get("arrayProperties", {})
     spec = detail["spec"] or {}
     is_visible = detail["results"] is not None
-    before, files, rows = None, list[File](), {"attempts": attempts_of(detail), "checkpoints": {}}
+    before, files, checkpoints = None, list[File](), dict[str, Any]()
     if detail["storeProblem"] is None:
         try:
-            before, files, rows = reconciler.calls.call(partial(_read, reconciler, detail))
+            before, files, checkpoints = reconciler.calls.call(partial(_read, reconciler, detail))
         except StoreSilent as error:
             detail["storeProblem"] = str(error)
     view = views.state(detail["id"])
@@ -69,9 +69,9 @@ def job(request: Request, reference: str) -> Response:
         job=detail,
         short=short_id(detail["id"]),
         facts=facts_of(detail),
-        attempts=rows["attempts"],
+        attempts=attempts_of(detail),
         blank_attempt=dict.fromkeys(_ATTEMPT, ""),
-        checkpoints=rows["checkpoints"],
+        checkpoints=checkpoints,
         blank_checkpoint=dict.fromkeys(_CHECKPOINT, ""),
         definition=described["jobDefinition"].rpartition("/")[2],
         children=range(min(array["size"], _CHILDREN)) if "statusSummary" in array else (),
@@ -104,21 +104,21 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 def _read(
     reconciler: Reconciler, detail: Mapping[str, Any]
 ) -> tuple[tuple[str, str, Mapping[str, Any]] | None, list[File], dict[str, Any]]:
-    """What the page has from the store: the other side of the comparison, the run's files, and rows."""
+    """What the page has from the store: the other side of the comparison, the run's files, and its checkpoints."""
     files = _files(reconciler, detail["run"]) if detail["results"] is not None else []
-    return before_it(reconciler, detail), files, _rows(reconciler, detail)
+    return before_it(reconciler, detail), files, _checkpoints(reconciler, detail)
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:
     """The parts of the page that change; open pages of the same job share them."""
     detail = job_detail(request, job_id)
     facts = {**facts_of(detail), "view": views.state(job_id, is_seen=True).text}
-    return {"facts": facts, **_rows(reconciler_of(request), detail)}
+    checkpoints = _checkpoints(reconciler_of(request), detail)
+    return {"facts": facts, "attempts": attempts_of(detail), "checkpoints": checkpoints}
 
 
-def _rows(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:
-    found = checkpoints_of(reconciler, detail["run"]) if detail["results"] is not None else {}
-    return {"attempts": attempts_of(detail), "checkpoints": found}
+def _checkpoints(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:
+    return checkpoints_of(reconciler, detail["run"]) if detail["results"] is not None else {}
 
 
 @dataclass

@@ -56,7 +56,7 @@ class _Volume:
     path: Path
     short: str | None = None
     absent: str | None = None
-    asked: machine.Moment | None = None
+    began: machine.Moment | None = None
     """Start of the look under way."""
 
 
@@ -111,19 +111,19 @@ class Disk:
 
     @staticmethod
     def _silence(volume: _Volume) -> str | None:
-        asked = volume.asked
-        if asked is None or asked.passed < _PATIENCE:
+        began = volume.began
+        if began is None or began.passed < _PATIENCE:
             return None
         return (
-            f"the volume of the {volume.name} ({volume.path}) has not answered since {asked}: no new gang starts until it does; "
+            f"the volume of the {volume.name} ({volume.path}) has not answered since {began}: no new gang starts until it does; "
             "see whether its server can be reached"
         )
 
     def _watch(self, volume: _Volume) -> None:
         while not self._ended.wait(_INTERVAL):
-            volume.asked = machine.moment()
+            volume.began = machine.moment()
             volume.short = self._look(volume)
-            volume.asked = None
+            volume.began = None
 
     def _look(self, volume: _Volume) -> str | None:
         """How much too little space is free; notes whether another volume is in its place."""

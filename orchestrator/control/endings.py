@@ -9,7 +9,7 @@ from shared_store.outcomes import Outcome
 _TAKEN = (Cause.SIGNAL, Cause.HOST_LOST, Cause.PREEMPTED)
 """Causes from outside: who does not see the supervisor any more can't tell its end from that of its host."""
 _KILLED = 137
-"""Exit code of a node of which none is known."""
+"""Exit code of a node whose own exit code is not known."""
 
 
 def node_end(outcome: Outcome | None, node: NodeStatus, is_native: bool, moment: int) -> tuple[NodeEnd, int]:

@@ -48,7 +48,7 @@ from shared_store.layout import Run
 LOOK = 2.0
 """Seconds between two looks at the checkpoints of running trainings: a listing of a directory each."""
 _THREADS = 4
-"""Looks at once, of which each may hang on the directory of its run."""
+"""Number of looks at the same time; each may hang on the directory of its run."""
 _PATIENCE = 20.0
 """Seconds for which a look is waited for: then the next one begins."""
 
@@ -96,7 +96,7 @@ class AutomaticEvaluations:
         self._pool.close()
 
     def _loop(self) -> None:
-        self._on_store("checkpoints kept for nobody", self._let_go)
+        self._on_store("unclaimed checkpoints", self._let_go)
         while not self._ending.wait(self._interval):
             if self._reconciler.trouble is None and self._reconciler.store_problem() is None:
                 self.look()

@@ -25,7 +25,7 @@ from orchestrator.spec.model import validate
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Run, Store
 from shared_store.parent import WeightsCopy
-from tests.conftest import submit_gang
+from tests.conftest import call_muster, submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.faults.stalled import stalled
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail
@@ -282,7 +282,7 @@ def test_a_teacher_whose_publication_hangs_is_taken_back_when_the_store_answers_
 
 
 def test_who_follows_a_job_waits_while_the_store_is_slow_to_begin_its_run(
-    server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     answered, claim = Event(), RunStore.claim
     monkeypatch.setattr(RunStore, "claim", lambda *arguments: (answered.wait(60), claim(*arguments))[1])
@@ -298,6 +298,8 @@ def test_who_follows_a_job_waits_while_the_store_is_slow_to_begin_its_run(
         followed = threads.submit(follow, client, job)
         wait_for(shows_a_start, 30, "a start that is shown")
         assert [each["epoch"] for each in detail(client, job)["attempts"]] == [0] and not followed.done()
+        shown = call_muster("show", job, home=tmp_path / "home")
+        assert shown.returncode == 0 and "None" not in shown.stdout, "its log is not there yet"
         answered.set()
         await_status(client, job, "RUNNING")
         client.batch("TerminateJob", jobId=job, reason="enough")

@@ -172,7 +172,7 @@ def test_without_its_database_a_controller_accepts_nothing(
         wait_for(lambda: any(said in record.getMessage() for record in caplog.records), 30, "a line in the log")
         waited: list[str] = []
         follower = Client(url)
-        follower.told = waited.append
+        follower.notify = waited.append
         following = threading.Thread(target=lambda: list(follower.logs(running, follow=True)), daemon=True)
         following.start()
         wait_for(lambda: waited, 30, "a follower waits")
