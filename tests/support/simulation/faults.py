@@ -27,9 +27,15 @@ def draw_fault(seed: int, index: int) -> tuple[float, Fault, Random]:
 def _during(world: Simulation, seconds: float, name: str, of: object | None = None) -> None:
     """Set a flag for a while."""
     target = world if of is None else of
+
+    def turn(value: bool) -> None:
+        setattr(target, name, value)
+        if name not in ("bus_down", "crowded"):
+            world.changed = world.machine.time
+
     world.note(f"{name} for {seconds:.0f} s")
-    setattr(target, name, True)
-    world.machine.after(seconds, lambda: setattr(target, name, False))
+    turn(True)
+    world.machine.after(seconds, lambda: turn(False))
 
 
 def _seconds(rng: Random) -> float:

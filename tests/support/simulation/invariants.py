@@ -29,10 +29,10 @@ class Invariants:
 
     def __init__(self, world: Simulation) -> None:
         self._world = world
-        self._state: tuple[int, bool, bool, bool] | None = None
-        """The controller's process, and whether its engine, its database and its volume are away."""
+        self._state: tuple[int, float] | None = None
+        """The controller's process, and when its engine, its database or its volume began or ceased to fail."""
         self._since = 0.0
-        """Since when that is so [s]."""
+        """Since when that is so, as far as was looked [s]."""
         self._is_checked = False
         """What reasons say of the engine was checked since then."""
         self._requests: set[tuple[int, str]] = set()
@@ -121,12 +121,12 @@ class Invariants:
     def check_reachable(self, process: int) -> None:
         """Once all has been as it is for a while: a RUNNING gang says whether its engine is away; a new gang is seen; jobs say why they wait."""
         world = self._world
-        state = process, world.engine_away, world.database_down, world.volume.unusable
+        state = process, world.changed
         if state != self._state:
             self._state, self._since, self._is_checked, self._launched = state, world.machine.time, False, []
         self._check_seen()
-        if self._is_checked or world.machine.time - self._since < _TOLD:
-            return
+        if self._is_checked or world.database_down or world.machine.time - self._since < _TOLD:
+            return  # without the database no reason can be written
         began, self._is_checked = self._since, True
         self._check_waiting()
         self._check_stops(began)
@@ -147,9 +147,9 @@ class Invariants:
                 )
 
     def _check_stops(self, began: float) -> None:
-        """A stop that was asked for before ``began`` is decided, whatever the store does, unless the engine or the database is away."""
+        """A stop that was asked for before ``began`` is decided, whatever the store does, unless the engine is away."""
         world = self._world
-        if world.engine_away or world.database_down:
+        if world.engine_away:
             return
         query = (
             "SELECT jobs.name FROM jobs JOIN attempts ON attempts.job_id = jobs.id"

@@ -51,6 +51,8 @@ class Simulation:
         self.cluster = Cluster(self)
         self.invariants = Invariants(self)
         self.engine_down = self.engine_hangs = self.bus_down = self.database_down = False
+        self.changed = 0.0
+        """When the engine, the database or the volume began or ceased to fail the last time [s]."""
         self.bus_down_since = 0.0
         """Since when the bus is down, or was the last time [s]."""
         self.crowded = False
