@@ -74,7 +74,7 @@ class Runner:
         self.engine, self._changed = engine, changed
         self._lock = threading.Lock()
         self._launches: dict[str, Future[Handle]] = {}
-        """By gang: launches whose end has not been collected."""
+        """By gang: its launch, under way or done, until the gang is over."""
         self._refused: dict[str, NotYet] = {}
         """By gang: what its last launch has to wait for."""
         self._observed: dict[Handle, None] = {}
@@ -168,16 +168,18 @@ class Runner:
             launch.add_done_callback(lambda _: self._changed(gang))
         if not launch.done():
             raise Underway(self.silence or "")
-        del self._launches[gang]
         try:
-            return launch.result()
-        except NotYet as error:
-            self._refused[gang] = error
+            return launch.result()  # again and again: the caller may not be able to record it
+        except EngineError as error:
+            del self._launches[gang]
+            if isinstance(error, NotYet):
+                self._refused[gang] = error
             raise
 
     def launch_pause(self, gang: str) -> float:
         """Seconds until the launch of a gang may be tried again; infinity while it is under way."""
-        return inf if gang in self._launches else self._backoff.pause(("launch", gang))
+        launch = self._launches.get(gang)
+        return inf if launch is not None and not launch.done() else self._backoff.pause(("launch", gang))
 
     def observe(self, handle: Handle) -> GangStatus | None:
         """The newest status of a gang, of which :meth:`look` asks for newer ones from now on; None before the first.
@@ -231,6 +233,7 @@ class Runner:
     def forget(self, gang: str, handle: Handle | None) -> None:
         """The gang is over; ``handle``: None where it was never launched."""
         with self._lock:
+            self._launches.pop(gang, None)
             self._refused.pop(gang, None)
             if handle is not None:
                 self._observed.pop(handle, None)

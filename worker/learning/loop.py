@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
+from time import sleep
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import Checkpoint
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
 
 EVALUATED = 256
 """Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
+LONGEST_PAUSE = 30
+"""Seconds between two tries to save the last checkpoint, at most."""
 WARNINGS = 10
 """Resets of worlds are logged for at most this many iterations; later ones are only counted."""
 EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
@@ -374,12 +377,7 @@ class Loop:
         self.beacon.tell(done=True)  # no iteration comes any more: a slow volume is no stall
         if self.state.ordered_at != self.state.progress.iteration:
             self.state.save(self.reporter if self.gang.is_main else None)
-        self._tell_saved(self.state.finish())
-        name = self.gang.tell(self.state.saved_at) or ""
-        if not name.startswith(f"{self.state.progress.iteration:08d}-"):
-            raise TrainingError(
-                "training is done, but its last checkpoint could not be saved; free space in the store and start again"
-            )
+        name = self._last_saved()
         self._failures.tell(again=True)
         self.say(f"evaluating checkpoint {name}")
         worlds = self.held_out_worlds()
@@ -403,6 +401,24 @@ class Loop:
             self.say(f"reward plot: {plot}")
         if glance:
             self._show(glance)
+
+    def _last_saved(self) -> str:
+        """Save the last checkpoint until the store takes it; returns its name. Raises TrainingError where the gang is to exit before."""
+        pause = 1
+        while True:
+            self._tell_saved(self.state.finish())
+            name = self.gang.tell(self.state.saved_at) or ""
+            if name.startswith(f"{self.state.progress.iteration:08d}-"):
+                return name
+            self.say(f"training is done, and its last checkpoint is not saved yet; trying again in {pause} s")
+            for _ in range(pause):  # of a second: the gang has little time to exit
+                if self.gang.greatest(int(self.stop.requested)):
+                    raise TrainingError(
+                        "training is done, but its last checkpoint could not be saved; free space in the store and start again"
+                    )
+                sleep(1.0)
+            self.state.save(self.reporter if self.gang.is_main else None)
+            pause = min(2 * pause, LONGEST_PAUSE)
 
     def _glance(self, worlds: Task) -> Glance | None:
         """The observer of the evaluation, if the job asks for a picture."""

@@ -131,13 +131,16 @@ def _silence(world: Simulation, rng: Random, how: str) -> None:
     seconds = _seconds(rng)
     world.note(f"{node} is {how} for {seconds:.0f} s")
     setattr(node, how, True)
-    node.silent_since = world.machine.time
+    is_alone = world.bus_down and world.heard <= 1  # then the router has not heard it for as long as the bus is down
+    node.silent_since = world.bus_down_since if is_alone else world.machine.time
     world.notice(node, _LEASE)
 
     def back() -> None:
         setattr(node, how, False)
-        node.was_silent, node.silent_since = max(node.was_silent, seconds), None
-        world.notice(node, rng.uniform(0.2, 5.0))
+        node.was_silent = max(node.was_silent, seconds)
+        heard = rng.uniform(0.2, 5.0)
+        world.notice(node, heard)
+        world.machine.after(heard, lambda: setattr(node, "silent_since", None))
 
     world.machine.after(seconds, back)
 

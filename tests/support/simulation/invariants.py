@@ -77,8 +77,9 @@ class Invariants:
         if any(seconds > LOST_AFTER - _SLACK for seconds in silences):
             return
         ending, reason = self._attempt(gang.job, gang.attempt)
-        urgent = any(each.urgent and each.acknowledged and not each.final for each in self._world.jobs)
-        if ending != "preempted" or job.urgent or not urgent:
+        by = self._world.job(reason.split()[3]) if ending == "preempted" and reason else None
+        known = {row[0] for row in self._world.memory.execute("SELECT id FROM jobs")}  # some are not acknowledged yet
+        if by is None or job.urgent or not by.urgent or by.id not in known:
             raise Violation(f"{gang.name} is ended without a cause: {ending}, {reason}")
 
     def look(self) -> None:

@@ -26,7 +26,7 @@ from worker.distributed import Placement
 from worker.errors import TrainingError, UserError
 from worker.learning import algorithms
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.job import configure
+from worker.learning.job import StopRequest, configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
 
@@ -166,7 +166,7 @@ def test_evaluation_leaves_the_worlds_as_they_were(tmp_path: Path) -> None:
 
 
 def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = Store(tmp_path).run("run")
     run.checkpoints.mkdir(parents=True)
@@ -175,14 +175,22 @@ def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
     output = capsys.readouterr().out
     assert "warning: iteration 2 could not be saved (File exists: " in output and "training goes on" in output
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
+    ended = training(tmp_path, iterations=4, epoch=2)
+    stop = StopRequest()
+    monkeypatch.setattr("worker.learning.loop.sleep", lambda _: setattr(stop, "requested", True))
     with pytest.raises(TrainingError, match="its last checkpoint could not be saved"):
-        train_with_obstacle(training(tmp_path, iterations=4, epoch=2), obstacles[1])
+        train_with_obstacle(ended, obstacles[1], stop)
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
+    obstacles[1].unlink()
+    monkeypatch.setattr("worker.learning.loop.sleep", lambda _: obstacles[1].unlink(missing_ok=True))
+    train_with_obstacle(ended, obstacles[1])
+    assert "its last checkpoint is not saved yet; trying again in 1 s" in capsys.readouterr().out
+    assert [c.iteration for c in list_checkpoints(run)] == [1, 3, 4]
 
 
-def train_with_obstacle(env: dict[str, str], obstacle: Path) -> None:
+def train_with_obstacle(env: dict[str, str], obstacle: Path, stop: StopRequest | None = None) -> None:
     """Train with a file where a checkpoint's hidden directory is to be (put there after the sweep at the start)."""
-    started = runner(env)
+    started = runner(env, stop=stop)
     obstacle.write_bytes(b"")
     started.train()
 
