@@ -334,11 +334,32 @@ def test_a_slurm_that_went_away_can_t_tell_its_hosts_and_its_last_answer_is_not_
     wait_for(lambda: not problem() and engine.capacity().machines[0].name == "slurm/n2", 10, "the recovery")
 
 
+def test_a_launch_whose_handle_could_not_be_recorded_is_not_asked_for_again() -> None:
+    engine = FakeEngine()
+    asked, gang = Runner(engine, lambda _: None), make_gang("job", "/store", 2, "fake/host", ["true"])
+
+    def launch() -> Handle | None:
+        try:
+            return asked.launch(gang.name, lambda: engine.plan(gang))
+        except NotYet:
+            return None
+
+    try:
+        handle = wait_for(launch, 10, "the launch")
+        del engine.cluster.gangs[gang.name]  # an engine that has forgotten it would start it anew
+        assert launch() == handle and len(engine.cluster.launched) == 1
+        assert asked.launch_pause(gang.name) == 0
+        asked.forget(gang.name, handle)
+        assert wait_for(launch, 10, "another launch") == handle and len(engine.cluster.launched) == 2
+    finally:
+        asked.close()
+
+
 def test_an_engine_s_health_says_when_it_answered_last_why_it_fails_and_that_it_hangs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     engine = FakeEngine()
-    asked = Runner(engine, lambda: None)
+    asked = Runner(engine, lambda _: None)
     try:
         asked.capacity(patience=10)
         told = asked.health.told_at
