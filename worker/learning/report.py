@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import statistics
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -63,6 +65,12 @@ class Stopwatch:
         return [before.elapsed_time(after) / 1000.0 for before, after in pairs]
 
 
+def _thread_failed(hook: Callable[[threading.ExceptHookArgs], object], failure: threading.ExceptHookArgs) -> None:
+    """TensorBoard raises a failure of its thread again where the next event is added: without this, a traceback, too, is logged."""
+    if not type(failure.thread).__module__.startswith("tensorboard."):
+        hook(failure)
+
+
 LONG_HOURS = 6.0
 """Estimated duration of a training without a GPU above which a warning is logged."""
 WARMED = 2
@@ -88,12 +96,11 @@ class Report:
         self._metrics = MetricsWriter(job.run, job.epoch, resumed_from)
         directory = job.run.metrics
 
-        def events() -> SummaryWriter:
+        def events(first: int) -> SummaryWriter:
             directory.stat()  # it would be made where another volume is
-            return SummaryWriter(
-                str(directory), purge_step=resumed_from + 1, filename_suffix=f".e{job.epoch}", flush_secs=10
-            )
+            return SummaryWriter(str(directory), purge_step=first, filename_suffix=f".e{job.epoch}", flush_secs=10)
 
+        threading.excepthook = partial(_thread_failed, threading.excepthook)
         self._new_events = events
         self._events: SummaryWriter | None = None
 
@@ -115,22 +122,28 @@ class Report:
             key: value if not isinstance(value, float) or math.isfinite(value) else None
             for key, value in record.items()
         }
+        failures = list[OSError]()
         for write in (self._write_record, self._write_events):
             try:
                 write(finite)
             except OSError as error:
-                if not self._warned:
-                    print(f"warning: metrics can't be written ({error}); training goes on, and tries again", flush=True)
-                self._warned = True
+                failures.append(error)
+        if failures and not self._warned:
+            print(f"warning: metrics can't be written ({failures[0]}); training goes on, and tries again", flush=True)
+        self._warned = bool(failures)
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         self._metrics.write({**record, "time": time.time()})
 
     def _write_events(self, record: Mapping[str, Any]) -> None:
         if self._events is None:
-            self._events = self._new_events()
-        for name, value in scalars(record).items():
-            self._events.add_scalar(name, value, record["iteration"])
+            self._events = self._new_events(record["iteration"])
+        try:
+            for name, value in scalars(record).items():
+                self._events.add_scalar(name, value, record["iteration"])
+        except OSError:
+            self._events = None  # the writer's thread has ended: another file is begun once the volume takes one
+            raise
 
     def _long(self, record: dict[str, float | int | None]) -> str:
         """A warning about a training that takes very long without a GPU; empty for others."""

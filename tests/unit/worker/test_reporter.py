@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from orchestrator.cli.progress import shown_metrics
 from shared_store.epoch import StaleEpoch, check_epoch, raise_epoch
@@ -177,6 +179,37 @@ def test_a_training_of_many_hours_without_a_gpu_is_warned_about_once_with_a_reme
 ) -> None:
     lines = said(run, capsys, seconds, device, resumed)
     assert len(lines) == bool(warning) and warning in "".join(lines) and (warning != DAYS or lines == [DAYS])
+
+
+def test_metrics_and_tensorboard_go_on_after_a_volume_was_away(run: Run, capfd: pytest.CaptureFixture[str]) -> None:
+    report = Report(SimpleNamespace(job=SimpleNamespace(run=run, epoch=1, section={}), iterations=99), 0, "cuda:0")
+    iterations = count(1)
+
+    def iterate() -> int:
+        figures = {"reward": 1.5, "episode_length": None, "steps_per_second": 1.0, "iteration_seconds": 1.0}
+        report.iteration({"iteration": (iteration := next(iterations)), **figures})
+        return iteration
+
+    def has_failed() -> bool:
+        iterate()
+        return report._events is None
+
+    def steps() -> set[int]:
+        events = EventAccumulator(str(run.metrics)).Reload()
+        return {event.step for event in events.Scalars("episode/reward")} if events.Tags()["scalars"] else set()
+
+    iterate()
+    wait_for(lambda: steps() == {1}, 10, "the first event")
+    aside = run.path.rename(run.path.with_name("aside"))
+    wait_for(has_failed, 10, "the failure")
+    assert not run.path.exists()
+    aside.rename(run.path)
+    last = iterate()
+    report.close()
+    output, errors = capfd.readouterr()
+    assert output.count("warning: metrics can't be written (") == 1 and "Traceback" not in errors
+    assert [record["iteration"] for record in read_metrics(run)] == list(range(1, last + 1))
+    assert {1, last} <= steps()
 
 
 def test_metrics_shown_by_a_task_are_in_the_line_the_record_and_the_plot(
