@@ -18,6 +18,10 @@ LONGEST_ANSWER = 500_000
 LARGEST_PROGRESS = 65536
 """Bytes of JSON; the controller drops a larger report."""
 
+LEASE_MILLISECONDS = 2000
+"""After how long without a sign the router counts a session as gone (the session's setting counts, not the router's). The controller's own
+session has the same: a cut network must take it away together with the nodes."""
+
 Node = tuple[str, int, int]
 """Job, attempt and index of a node."""
 

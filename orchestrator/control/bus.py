@@ -23,7 +23,16 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.control.presence import Presence
-from shared_store.bus import LARGEST_MESSAGE, LARGEST_PROGRESS, Credential, Node, node_of, prefix, presence_key
+from shared_store.bus import (
+    LARGEST_MESSAGE,
+    LARGEST_PROGRESS,
+    LEASE_MILLISECONDS,
+    Credential,
+    Node,
+    node_of,
+    prefix,
+    presence_key,
+)
 from shared_store.files import DamagedFile, json_object, read_json, write_atomic, write_json
 
 log = logging.getLogger("muster.bus")
@@ -177,6 +186,7 @@ class Bus:
             "mode": "client",
             "connect/endpoints": [f"tcp/127.0.0.1:{port}"],
             "scouting/multicast/enabled": False,
+            "transport/link/tx/lease": LEASE_MILLISECONDS,
             "transport/auth/usrpwd/user": "muster",
             "transport/auth/usrpwd/password": credential.password,
         }

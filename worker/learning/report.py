@@ -65,12 +65,6 @@ class Stopwatch:
         return [before.elapsed_time(after) / 1000.0 for before, after in pairs]
 
 
-def _thread_failed(hook: Callable[[threading.ExceptHookArgs], object], failure: threading.ExceptHookArgs) -> None:
-    """TensorBoard raises a failure of its thread again where the next event is added: without this, a traceback, too, is logged."""
-    if not type(failure.thread).__module__.startswith("tensorboard."):
-        hook(failure)
-
-
 LONG_HOURS = 6.0
 """Estimated duration of a training without a GPU above which a warning is logged."""
 WARMED = 2
@@ -239,3 +233,9 @@ def straggler(seconds: list[float]) -> dict[str, Any]:
     figures = {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
     by_rank = [float(f"{each:.4g}") for each in seconds]
     return {**figures, **({"rank_collect_seconds": by_rank} if len(seconds) <= _MOST_RANKS else {})}
+
+
+def _thread_failed(hook: Callable[[threading.ExceptHookArgs], object], failure: threading.ExceptHookArgs) -> None:
+    """TensorBoard raises a failure of its thread again where the next event is added: its traceback says nothing more."""
+    if not type(failure.thread).__module__.startswith("tensorboard."):
+        hook(failure)

@@ -12,15 +12,13 @@ import queue
 import time
 from typing import TYPE_CHECKING, Any
 
-from shared_store.bus import LARGEST_PROGRESS, LONGEST_ANSWER, Credential, prefix, presence_key
+from shared_store.bus import LARGEST_PROGRESS, LEASE_MILLISECONDS, LONGEST_ANSWER, Credential, prefix, presence_key
 from shared_store.contract import NodeContract
 from shared_store.files import json_object
 
 if TYPE_CHECKING:
     import zenoh
 
-LEASE_MILLISECONDS = 2000
-"""After how long without a sign the router counts the node as gone (its own setting counts, not the router's)."""
 _RETRY_SECONDS = 2.0
 _PROGRESS_SECONDS = 1.0
 

@@ -8,20 +8,23 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from orchestrator.control.bus import Bus, BusError
-from shared_store.bus import LONGEST_ANSWER
+from shared_store.bus import LEASE_MILLISECONDS, LONGEST_ANSWER
 from shared_store.contract import NodeContract
 from tests.conftest import PATIENCE, REPOSITORY, Serving, wait_for
+from tests.support.faults.outages import partition
 from tests.support.processes import gang_members, processes_of
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
 from tests.support.worker.node import node_contract
 from worker.node import bus as node_bus
-from worker.node.bus import LEASE_MILLISECONDS, NodeBus
+from worker.node.bus import NodeBus
 
 NODE = """
 import os, sys, time
@@ -74,6 +77,20 @@ def test_a_frozen_node_is_noticed_by_its_lease_and_welcomed_back(bus: Bus) -> No
     wait_for(lambda: bus.presence.silence(("j", 1, 0), None) is not None, 6, "the loss of the frozen node")
     node.send_signal(signal.SIGCONT)
     wait_for(lambda: bus.presence.silence(("j", 1, 0), None) is None, 10, "its return")
+    node.kill()
+    node.wait()
+
+
+def test_a_cut_network_takes_the_controller_s_own_session_away_with_its_only_node(bus: Bus, tmp_path: Path) -> None:
+    node, home = start_node(bus, "time.sleep(600)"), SimpleNamespace(path=tmp_path)
+    bus.presence.lost_after = 4.0  # less than from the node's silence to Zenoh's own lease of 10 s
+    with partition(home):
+        wait_for(lambda: bus.presence.is_silent(("j", 1, 0)), 6, "the silence of the node")
+        for _ in range(80):
+            silence = bus.presence.silence(("j", 1, 0), 0.0)
+            assert silence is not None and not silence.is_lost
+            time.sleep(0.1)
+    wait_for(lambda: not bus.presence.is_silent(("j", 1, 0)), 20, "the node's return")
     node.kill()
     node.wait()
 
