@@ -122,6 +122,8 @@ class Report:
                 write(finite)
             except OSError as error:
                 failures.append(error)
+                if self._events is None:
+                    break  # on a full volume each iteration would begin another, empty file
         if failures and not self._warned:
             print(f"warning: metrics can't be written ({failures[0]}); training goes on, and tries again", flush=True)
         self._warned = bool(failures)
