@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
-from time import sleep
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import Checkpoint
-from shared_store.files import write_atomic
 from shared_store.outcomes import EX_TEMPFAIL
 from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.errors import TrainingError
-from worker.evaluation.evaluation import best_words, evaluate
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
+from worker.learning.completion import complete
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
@@ -27,7 +24,7 @@ from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup
 from worker.learning.leaving import patience_of
-from worker.learning.randomness import held_out_seed, seed_generators
+from worker.learning.randomness import seed_generators
 from worker.learning.report import Report, Stopwatch, figures_of, shown_of, straggler
 from worker.learning.reporter import Fence, Gate, Reporter
 from worker.learning.setup import (
@@ -43,19 +40,13 @@ from worker.learning.setup import (
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
-from worker.tasks.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.config import value_at
 from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
-    from worker.telemetry.picture import Glance
 
 
-EVALUATED = 256
-"""Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
-LONGEST_PAUSE = 30
-"""Seconds between two tries to save the last checkpoint, at most."""
 WARNINGS = 10
 """Resets of worlds are logged for at most this many iterations; later ones are only counted."""
 EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
@@ -105,7 +96,7 @@ class Loop:
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._exchange = Exchange(gang, self.task)
         self.reporter, self.fence, self.beacon = Reporter(self.gate), Fence(job.run, job.epoch), Beacon()
-        self._failures = Failures(self.task, lambda line: self.reporter.do(_print, line))
+        self.failures = Failures(self.task, lambda line: self.reporter.do(_print, line))
         self.state.saver.start()
         end_startup()
 
@@ -150,7 +141,7 @@ class Loop:
                 if self._handle(signals):
                     self.say(f"asked to stop: left after iteration {progress.iteration} of {self.training.iterations}")
                     return EX_TEMPFAIL
-            self._finish()
+            complete(self)
             return 0
         finally:
             if report:
@@ -198,9 +189,9 @@ class Loop:
             self._order_is_due = self._collecting.can_be_captured and state.is_copied and not is_last
             if not self._order_is_due:
                 self._order(wait=is_last)
-        self._tell_saved(state.saver.poll())
+        self.tell_saved(state.saver.poll())
         if stopping:
-            self._tell_saved(state.finish())
+            self.tell_saved(state.finish())
         return stopping
 
     def _order(self, *, wait: bool = False) -> None:
@@ -222,7 +213,8 @@ class Loop:
             + "".join(f"; {line}" for line in self.state.set_anew)
         )
 
-    def _tell_saved(self, lines: list[str]) -> None:
+    def tell_saved(self, lines: list[str]) -> None:
+        """Log the results of saves."""
         for line in filter(None, lines):
             self.reporter.do(_print, line)
             self.beacon.tell(said=line)
@@ -265,7 +257,7 @@ class Loop:
 
     def _failure(self, what: str, hint: str) -> TrainingError:
         """Build the error that ends training. Every rank must call it."""
-        self._tell_saved(self.state.finish())
+        self.tell_saved(self.state.finish())
         last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
 
@@ -281,9 +273,9 @@ class Loop:
             if self._warnings <= WARNINGS:
                 said += "; from now on only counted" if self._warnings == WARNINGS else ""
                 self.say(f"warning: iteration {iteration}: {said}")
-                self._failures.tell()
+                self.failures.tell()
             return
-        self._failures.tell()
+        self.failures.tell()
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
         if found[self.gang.rank]:
@@ -371,82 +363,6 @@ class Loop:
             **(figures := figures_of(known, finished, lengths, self.task.final_metrics)),
             **shown_of(figures, self.task.shown_metrics),
         }
-
-    def _finish(self) -> None:
-        """Wait for the last save, evaluate the policy, plot the curve, print the paths."""
-        self.beacon.tell(done=True)  # no iteration comes any more: a slow volume is no stall
-        if self.state.ordered_at != self.state.progress.iteration:
-            self.state.save(self.reporter if self.gang.is_main else None)
-        name = self._last_saved()
-        self._failures.tell(again=True)
-        self.say(f"evaluating checkpoint {name}")
-        worlds = self.held_out_worlds()
-        glance = self._glance(worlds)
-        result = evaluate(worlds, self.algorithm.policy(), self.gang, checkpoint=name)
-        self.say(str(result))
-        if not self.gang.is_main:
-            return
-        try:
-            result.write(self.job.run, iteration=self.state.progress.iteration, config={})
-            from worker.plot import plot_reward
-
-            plot: Path | None = plot_reward(self.job.run)
-        except (OSError, ValueError) as error:
-            self.say(f"warning: the evaluation or the plot could not be written ({error})")
-            plot = None
-        self.say(f"last checkpoint: {self.job.run.checkpoints / name}")
-        if best := best_words(self.job.run):
-            self.say(best)
-        if plot:
-            self.say(f"reward plot: {plot}")
-        if glance:
-            self._show(glance)
-
-    def _last_saved(self) -> str:
-        """Save the last checkpoint until the store takes it; returns its name. Raises TrainingError where the gang is to exit before."""
-        pause = 1
-        while True:
-            self._tell_saved(self.state.finish())
-            name = self.gang.tell(self.state.saved_at) or ""
-            if name.startswith(f"{self.state.progress.iteration:08d}-"):
-                return name
-            self.say(f"training is done, and its last checkpoint is not saved yet; trying again in {pause} s")
-            for _ in range(pause):  # of a second: the gang has little time to exit
-                if self.gang.greatest(int(self.stop.requested)):
-                    raise TrainingError(
-                        "training is done, but its last checkpoint could not be saved; free space in the store and start again"
-                    )
-                sleep(1.0)
-            self.state.save(self.reporter if self.gang.is_main else None)
-            pause = min(2 * pause, LONGEST_PAUSE)
-
-    def _glance(self, worlds: Task) -> Glance | None:
-        """The observer of the evaluation, if the job asks for a picture."""
-        if not self.gang.is_main or os.environ.get("MUSTER_PICTURE") == "0":
-            return None
-        from worker.telemetry.picture import Glance
-
-        return Glance(worlds)
-
-    def _show(self, glance: Glance) -> None:
-        """Write the picture. An error here does not fail the training."""
-        path = self.job.run.metrics / "policy.png"
-        try:
-            write_atomic(path, glance.picture(self.config))
-            self.say(f"picture of the policy: {path}")
-        except Exception as error:
-            self.say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
-
-    def held_out_worlds(self) -> Task:
-        """The worlds of the evaluation: those of training, or, if worlds are drawn at random, others with another seed."""
-        worlds, began = self.task, max(0, self.state.progress.iteration - 1)
-        if self.config.randomize.draws_worlds:
-            total = min(self.share.total, EVALUATED * self.gang.size)
-            share = Share.of(self.gang.rank, self.gang.size, total)
-            worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.training.seed))
-        told = began, self.state.progress.reward, self.state.progress.episode_length
-        begin_evaluation(worlds, *told, adaptive_steps(self.task))
-        return worlds
 
     def say(self, text: str) -> None:
         """Log ``text`` on the main rank; does not wait."""

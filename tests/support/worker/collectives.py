@@ -186,9 +186,10 @@ TESTS = {
         "a_training_is_the_same_on_all_ranks_to_its_end": {
             "distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
             "evaluation/evaluation.py": "evaluate",
+            "learning/completion.py": "complete",
             "learning/exchange.py": "Exchange.gather",
             "learning/leaving.py": "train",
-            "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._build Loop._finish Loop._iterate Loop.train",
+            "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._build Loop._iterate Loop.train",
             "learning/ppo/fused.py": "PPO.__init__ PPO._learn PPO.learn",
             "learning/setup.py": "build_algorithm build_task load_kernels",
             "learning/state.py": "TrainingState.finish",
@@ -205,7 +206,8 @@ TESTS = {
         "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/adoption.py": "adopt"},
         "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/teacher.py": "_learnt give_teacher"},
         "worlds_that_do_not_fit_are_refused_by_all_ranks": {"learning/memory.py": "_taken measure within_memory"},
-        "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {"learning/loop.py": "Loop.held_out_worlds"},
+        "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {"learning/completion.py": "held_out_worlds"},
+        "a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop": {"learning/completion.py": "_save"},
         "a_loss_that_is_not_finite_ends_all_ranks_after_their_saves": {"learning/loop.py": "Loop._failure"},
         "too_many_resets_on_one_rank_end_all_after_it_has_written_why": {"learning/loop.py": "Loop._judge_resets"},
         "plain_ppo_learns_on_two_ranks_what_it_learns_on_one": {

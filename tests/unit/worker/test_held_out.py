@@ -15,6 +15,7 @@ from tests.support.worker.loop import alone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
 from worker.evaluation.evaluation import evaluate
+from worker.learning.completion import held_out_worlds
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.state import Progress
@@ -98,18 +99,18 @@ def test_a_policy_is_evaluated_on_physics_that_training_did_not_see(tmp_path: Pa
     trained = cartpole(tmp_path / "a", **settings)
     assert trained.train() == 0
     before = trained.task.state_dict()
-    others = trained.held_out_worlds()
+    others = held_out_worlds(trained)
     assert others.world_count == 16
     assert not (others.randomizer.factors[:, 0][:, None] == trained.task.randomizer.factors[:, 0]).any()
     found = evaluate(others, trained.algorithm.policy(), trained.gang, checkpoint="x")
     assert all(torch.equal(tensor, before[name]) for name, tensor in trained.task.state_dict().items())
     again = cartpole(tmp_path / "a", epoch=2, **settings)
     assert again.resumed is not None
-    worlds = again.held_out_worlds()
+    worlds = held_out_worlds(again)
     assert torch.equal(worlds.randomizer.factors, others.randomizer.factors)
     assert evaluate(worlds, again.algorithm.policy(), again.gang, checkpoint="x").mean_return == found.mean_return
 
 
 def test_where_worlds_are_alike_those_of_training_are_evaluated_from_new_starts(tmp_path: Path) -> None:
     trained = cartpole(tmp_path, config={"randomize": {"observation_noise": 0.01}})
-    assert trained.held_out_worlds() is trained.task
+    assert held_out_worlds(trained) is trained.task
