@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 import pwd
 import struct
+from functools import cache
 from pathlib import Path
 
 from starlette.concurrency import run_in_threadpool
@@ -71,8 +72,9 @@ def _forms(address: Address) -> list[str]:
     return ["".join(f"{word:08X}" for word in form) + f":{address[1]:04X}" for form in words]
 
 
+@cache
 def user_name(uid: int) -> str:
-    """The name of a user, or the number of one without a name."""
+    """The name of a user, or the number of one without a name. Looked up once: a directory server may be slow."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:

@@ -296,10 +296,10 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
 
 async def _stored(calls: StoreCalls, follower: LogFollower) -> AsyncIterator[str]:
     """All that is there, many lines at a time: each piece costs a hand-over between threads."""
-    batches = follower.batches()
+    pieces = map(_json_lines, follower.batches())  # on the thread: many may begin at once
     try:
-        while (lines := await asyncio.wait_for(looked(lambda: next(batches, None), calls), _PATIENCE)) is not None:
-            yield _json_lines(lines)
+        while (lines := await asyncio.wait_for(looked(lambda: next(pieces, None), calls), _PATIENCE)) is not None:
+            yield lines
     except TimeoutError:
         yield _trouble(OSError(f"the store has not answered for {_PATIENCE:.0f} s"))
     except (OSError, ValueError, StoreSilent) as error:
