@@ -17,7 +17,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test check coverage unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
+.PHONY: run race test check coverage unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-health bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -104,6 +104,9 @@ bench-scheduling: $(READY)
 
 bench-logs: $(READY)
 	$(BIN)/python -m benchmarks.log_follow | tee benchmarks/log_follow.md
+
+bench-health: $(READY)
+	$(BIN)/python -m benchmarks.health | tee benchmarks/health.md
 
 bench-engines: $(READY)
 	$(BIN)/python -m pytest -q -s -p tests.support.engines.fixtures benchmarks/engines.py
