@@ -21,6 +21,9 @@ from tests.support.simulation.mutants import MUTANTS
 from tests.support.simulation.run import FAULTS, JOBS
 from tests.support.simulation.shrink import command, shrink, violation
 
+_SEEDS = 50
+"""Seeds of one process: it would grow."""
+
 
 def _numbers(text: str) -> list[int]:
     return [int(each) for each in text.split(",") if each]
@@ -34,7 +37,7 @@ def _try(mutant: str | None, seed: int) -> tuple[int, str | None]:
 def _many(first: int, last: int, mutant: str | None) -> int:
     """Seeds on all cores; returns how many failed. With a mutant: until the first that does."""
     began, failed, done = time.monotonic(), 0, 0
-    with get_context("fork").Pool(os.cpu_count()) as pool:
+    with get_context("fork").Pool(os.cpu_count(), maxtasksperchild=_SEEDS) as pool:
         for seed, found in pool.imap_unordered(partial(_try, mutant), range(first, last)):
             done += 1
             if found is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import StaticPool, create_engine
+from sqlalchemy import Dialect, Engine, StaticPool, create_engine, make_url
 from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import ensure_compute_environments
@@ -63,6 +63,12 @@ def _template() -> sqlite3.Connection:
     return memory
 
 
+@cache
+def _dialect() -> Dialect:
+    """Shared by all processes: what it has compiled serves the next one."""
+    return create_engine("sqlite://", json_deserializer=_read_document).dialect
+
+
 def new_memory() -> Memory:
     """An empty database."""
     memory = sqlite3.connect(":memory:", check_same_thread=False, factory=Memory)
@@ -78,9 +84,8 @@ class SimulatedDatabase(Database):
         self.committed = self.changed = self.ended = None
         self._lock = self._file_lock = self._damage = self._file = self._identity = None
         memory.rollback()  # what a process that was killed has not committed
-        self.engine = create_engine(
-            "sqlite://", creator=lambda: memory, poolclass=StaticPool, json_deserializer=_read_document
-        )
+        creator: Callable[[], Any] = lambda: memory
+        self.engine = Engine(StaticPool(creator, dialect=_dialect()), _dialect(), make_url("sqlite://"))
 
     def reserve_connections(self) -> None:
         self._reserved = True
