@@ -84,8 +84,11 @@ class SimulatedDatabase(Database):
         self.committed = self.changed = self.ended = None
         self._lock = self._file_lock = self._damage = self._file = self._identity = None
         memory.rollback()  # what a process that was killed has not committed
-        creator: Callable[[], Any] = lambda: memory
-        self.engine = Engine(StaticPool(creator, dialect=_dialect()), _dialect(), make_url("sqlite://"))
+
+        def connection() -> Any:
+            return memory
+
+        self.engine = Engine(StaticPool(connection, dialect=_dialect()), _dialect(), make_url("sqlite://"))
 
     def reserve_connections(self) -> None:
         self._reserved = True
