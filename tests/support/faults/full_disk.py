@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.domain.errors import ApiError
+from orchestrator.domain.errors import ApiError, NotServing
 from tests.conftest import submit_gang
 from tests.support.faults.home import Home
 from tests.support.orchestrator.jobs import await_status, detail
@@ -99,7 +99,7 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
                     client.batch("TerminateJob", jobId=steady, reason="the disk was full")
                 for job in taken:
                     await_status(client, job, *OVER)
-                await_status(client, submit_gang(client, "print('again')", name="last"), "SUCCEEDED")
+                await_status(client, wait_for(lambda: _taken_on(client), 60, "that there is room again"), "SUCCEEDED")
                 done["jobs"] += len(taken) + 1
             if (said := home.errors.stat().st_size) > MOST_LOG:
                 wrong.append(f"the controllers wrote {said} bytes of errors")
@@ -113,6 +113,14 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
             if wrong:
                 shutil.copy(home.errors, directory / "controllers.err")
     return done, wrong
+
+
+def _taken_on(client: Client) -> str | None:
+    """A job; None where the controller has not seen yet that there is room."""
+    try:
+        return submit_gang(client, "print('again')", name="last")
+    except NotServing:
+        return None
 
 
 def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
