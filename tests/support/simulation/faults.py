@@ -80,8 +80,14 @@ def _break_bus(world: Simulation, seconds: float) -> None:
         for node in world.cluster.running:
             world.notice(node, world.rng.uniform(0.5, _LEASE))
 
+    def end() -> None:
+        if world.heard <= 1:  # it may have been lost meanwhile: nobody could tell who was cut off
+            for node in world.cluster.running:
+                node.was_silent = max(node.was_silent, world.machine.time - world.bus_down_since)
+
     if not world.bus_down:
         world.bus_down_since = world.machine.time
+    world.machine.after(seconds, end)
     _during(world, seconds, "bus_down")
     notice()
     world.machine.after(seconds + 0.1, notice)
