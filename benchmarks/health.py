@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import socket
 import subprocess
 import tempfile
@@ -26,6 +25,7 @@ import httpx
 from benchmarks.log_follow import MUSTER, finish, submit
 from orchestrator.client import Client
 from shared_store.layout import Store
+from tests.support.console.visitor import Visitor
 from tests.support.faults.stalled import stalled
 
 READS, FOLLOWERS, CHECKS = 16, 120, 12
@@ -64,12 +64,11 @@ def read(url: str, job: str) -> None:
 
 
 class Checks:
-    """Clients of the wizard, each of which checks the same YAML as soon as it has the answer to its check before."""
+    """Clients that check one YAML repeatedly, as the submission wizard does."""
 
     def __init__(self, url: str, comparisons: int) -> None:
-        self._client = httpx.Client(base_url=url, timeout=120, headers={"Accept": "application/json"})
-        page = self._client.get("/", headers={"Accept": "text/html"}).text
-        (token,) = re.findall(r'name="form-token" content="(\w+)"', page)
+        self._visitor = Visitor(url)
+        token = self._visitor.page("/").form_token
         code = ("def reward_function(params):", "    return 1.0", "x = 1" + "<1" * comparisons)
         text = "".join(f"        {line}\n" for line in code)
         head = "name: a\ntrain:\n  task: Racer\n  config:\n    reward_function:\n      file: r.py\n      text: |\n"
@@ -81,7 +80,7 @@ class Checks:
 
     def _check(self) -> None:
         while not self._over.is_set():
-            self.statuses[self._client.post("/submit/check", data=self._form).status_code] += 1
+            self.statuses[self._visitor.http.post("/submit/check", data=self._form).status_code] += 1
 
     def close(self) -> None:
         self._over.set()

@@ -32,7 +32,7 @@ def complete(loop: Loop) -> None:
 
     Raises TrainingError where the gang is asked to exit before the store takes the checkpoint.
     """
-    loop.beacon.tell(done=True)  # no iteration comes any more: a slow volume is no stall
+    loop.beacon.tell(done=True)  # training is over: a slow volume must not look like a stalled iteration
     name = _save(loop)
     loop.failures.tell(again=True)
     loop.say(f"evaluating checkpoint {name}")
@@ -112,4 +112,4 @@ def _show(loop: Loop, glance: Glance, path: Path) -> None:
         write_atomic(path, glance.picture(loop.config))
         loop.say(f"picture of the policy: {path}")
     except Exception as error:
-        loop.say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
+        loop.say(f"warning: the picture of the policy could not be made ({type(error).__name__}: {error})")

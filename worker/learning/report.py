@@ -125,7 +125,7 @@ class Report:
                 if self._events is None:
                     break  # on a full volume each iteration would begin another, empty file
         if failures and not self._warned:
-            print(f"warning: metrics can't be written ({failures[0]}); training goes on, and tries again", flush=True)
+            print(f"warning: metrics can't be written ({failures[0]}); training continues and retries", flush=True)
         self._warned = bool(failures)
 
     def _write_record(self, record: Mapping[str, Any]) -> None:

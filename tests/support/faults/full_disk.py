@@ -99,7 +99,9 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
                     client.batch("TerminateJob", jobId=steady, reason="the disk was full")
                 for job in taken:
                     await_status(client, job, *OVER)
-                await_status(client, wait_for(lambda: _taken_on(client), 60, "that there is room again"), "SUCCEEDED")
+                await_status(
+                    client, wait_for(lambda: _taken_on(client), 60, "the controller to accept jobs again"), "SUCCEEDED"
+                )
                 done["jobs"] += len(taken) + 1
             if (said := home.errors.stat().st_size) > MOST_LOG:
                 wrong.append(f"the controllers wrote {said} bytes of errors")
@@ -116,7 +118,7 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
 
 
 def _taken_on(client: Client) -> str | None:
-    """A job; None where the controller has not seen yet that there is room."""
+    """The id of a new job; None while the controller still refuses jobs for lack of space."""
     try:
         return submit_gang(client, "print('again')", name="last")
     except NotServing:

@@ -81,7 +81,7 @@ def _break_bus(world: Simulation, seconds: float) -> None:
             world.notice(node, world.rng.uniform(0.5, _LEASE))
 
     def end() -> None:
-        if world.heard <= 1:  # it may have been lost meanwhile: nobody could tell who was cut off
+        if world.heard <= 1:  # the controller may have declared the node lost: it could not tell which side was cut off
             for node in world.cluster.running:
                 node.was_silent = max(node.was_silent, world.machine.time - world.bus_down_since)
 
