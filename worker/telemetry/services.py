@@ -190,18 +190,24 @@ class MLflow:
             identity = same[0].info.run_id if same else self._create(fresh)
         self.identity = identity
         self._client.update_run(identity, status="RUNNING")
+        self._describe()
         steps = self._client.get_metric_history(identity, "train/env_steps")
         return max((each.step for each in steps), default=0)
 
     def _create(self, name: str) -> str:
         tags = {**self._given.get("tags", {}), "muster.run": name}
-        run: str = self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id
-        parameters = [
-            self._entities.Param(key, str(value)[:_LONGEST]) for key, value in flattened(self._tracked.config)
+        return str(self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id)
+
+    def _describe(self) -> None:
+        """Send the parameters that the run lacks: all of a new one, the rest where a kill came between."""
+        has = self._client.get_run(self.identity).data.params
+        lacking = [
+            self._entities.Param(key, str(value)[:_LONGEST])
+            for key, value in flattened(self._tracked.config)
+            if key not in has
         ]
-        for part in _parts(parameters, _PARAMETERS):
-            self._client.log_batch(run, params=part)
-        return run
+        for part in _parts(lacking, _PARAMETERS):
+            self._client.log_batch(self.identity, params=part)
 
     @property
     def place(self) -> str:

@@ -6,13 +6,14 @@ W&B offline, whose files are read again; MLflow on a database file, and over HTT
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from shared_store.metrics import read_metrics
 from tests.conftest import PATIENCE, wait_for
 from tests.support.worker.ranks import ROOT, free_port, placement
 from tests.support.worker.wandb_files import history, records
+from worker.telemetry.services import MLflow, Tracked
 
 TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 40, "seed": 5, "config": {"episode_seconds": 0.5}}
 
@@ -159,6 +161,35 @@ def test_over_http_a_training_that_was_killed_and_goes_on_is_one_run_of_mlflow_s
         assert [(each.step, each.value) for each in told] == [(each["iteration"], each[key]) for each in expected]
     assert {each.path for each in client.list_artifacts(there.info.run_id)} == {"reward.png", "00000040-e2.json"}
     assert len(list((run.path.parent.parent.parent / "artifacts").rglob("reward.png"))) == 1, "sent through the server"
+
+
+def test_a_kill_while_mlflow_s_run_is_made_costs_it_no_parameter(tmp_path: Path) -> None:
+    pytest.importorskip("mlflow", reason="pip install 'muster[mlflow]', or make services")
+    config = {"train": {"task": "Cartpole", **{f"setting{number}": number for number in range(150)}}}  # two requests
+    tracked = Tracked("taught", "Cartpole", config, tmp_path)
+
+    class Killed(BaseException):
+        pass
+
+    for requests in (0, 1, 2, 2):  # that are answered before the kill
+        service = MLflow(tracked, {"uri": f"sqlite:///{tmp_path}/mlflow.db"})
+        service.prepare()
+        client, answered = service._client, 0
+        send = client.log_batch
+
+        def log_batch(*args: Any, requests: int = requests, send: Callable[..., None] = send, **kinds: Any) -> None:
+            nonlocal answered
+            if answered == requests:
+                raise Killed
+            answered += 1
+            send(*args, **kinds)
+
+        client.log_batch = log_batch
+        with contextlib.suppress(Killed):
+            service.open(None, "taught")
+    assert answered == 0, "a run that has its parameters gets none"
+    [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
+    assert there.data.params == {f"train.{name}": str(value) for name, value in config["train"].items()}
 
 
 def test_without_a_key_a_training_ends_before_it_begins_with_one_line_and_no_prompt(run: Run) -> None:
