@@ -11,6 +11,7 @@ store and the engine, slower.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import json
 import logging
@@ -18,7 +19,7 @@ import os
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,9 @@ _ACCESS = {
 """Access rules for messages between the router and a node. Zenoh reads rules and users once, when the router starts, so that they can't name
 attempts; the proofs do that. The controller's own session is inside the router: no rule applies to it."""
 
+_THREADS = "(rx: (worker_threads: 32))"
+"""Threads of the router that receive, as ``ZENOH_RUNTIME`` has it. A node that vanishes without a word holds one of them for 10 s
+(eclipse-zenoh/zenoh#2718): with the default of two, a host that dies with many nodes makes the router deaf for 5 s a node."""
 
 _ITSELF: Node = ("controller", 0, 0)
 """The controller's own session, as a node that no job has."""
@@ -163,7 +167,8 @@ class Bus:
             config.insert_json5(key, json.dumps(value))
         direct = zenoh.handlers.Callback  # they run on the network's thread, and only note what came
         try:
-            self._session = zenoh.open(config)
+            with _receiving_threads():
+                self._session = zenoh.open(config)
             self._declared = [
                 self._session.liveliness().declare_subscriber(
                     "muster/*/*/*/alive/*", direct(self._presence, indirect=False), history=True
@@ -274,10 +279,24 @@ class Bus:
             proof.decode(errors="replace"), "progress", key, text
         ):
             return
+        self.presence.sent(node)
         progress = _message(payload)
         with self._lock:
             if progress and self.presence.expects(node):
                 self._progress[node] = progress
+
+
+@contextlib.contextmanager
+def _receiving_threads() -> Iterator[None]:
+    """Zenoh reads the variable when the process opens its first session. Nothing that this process starts inherits it."""
+    if "ZENOH_RUNTIME" in os.environ:  # an operator knows better
+        yield
+        return
+    os.environ["ZENOH_RUNTIME"] = _THREADS
+    try:
+        yield
+    finally:
+        del os.environ["ZENOH_RUNTIME"]
 
 
 def _message(payload: bytes) -> dict[str, Any]:

@@ -24,6 +24,9 @@ UNREACHABLE = 5
 """Times ``lost_after`` for which a node may be unreachable of which its engine can't tell whether it runs."""
 _FRESH = 10.0
 """Seconds for which an engine's answer counts, or a quarter of ``lost_after`` where that is more."""
+_QUIET = 5.0
+"""Seconds without a sign of any other node after which nobody counts as heard, or a quarter of ``lost_after`` where that is more. The router
+removes nodes that a cut network takes away one after the other: those that it has not removed yet prove nothing by their tokens."""
 _BURST = 10.0
 """Seconds within which the nodes fall silent that the controller's own network takes away."""
 _FEWEST = 3
@@ -60,6 +63,8 @@ class Presence:
         self._unmet: dict[tuple[str, int], float] = {}
         """Attempts of which no node has come or ended yet, and since when they are expected."""
         self._nodes: dict[Node, _Heard] = {}
+        self._sign_at = 0.0
+        """When a node came or sent something the last time."""
         self._silent = 0
         """How many of them are silent."""
         self._hears_itself = False
@@ -98,6 +103,15 @@ class Presence:
         with self._lock:
             if self._expects(node):
                 self._set(node, _Heard())
+                self._sign_at = self._monotonic()
+
+    def sent(self, node: Node) -> None:
+        """A node has sent something: it is there, and the router hears it."""
+        with self._lock:
+            heard = self._nodes.get(node)
+            if heard is not None and heard.gone is None:
+                self._note_deafness()
+                self._sign_at = self._monotonic()
 
     def left(self, node: Node) -> None:
         """A node's connection is gone."""
@@ -186,7 +200,8 @@ class Presence:
         nodes = len(self._nodes)
         if nodes >= _FEWEST and 2 * (burst := self._silent_together()) > nodes:
             return f"{burst} of {nodes} nodes fell silent within {_BURST:.0f} s, so the controller seems to be cut off"
-        if nodes > 1 and nodes == self._silent:
+        quiet = self._monotonic() - self._sign_at
+        if nodes > 1 and (nodes == self._silent or quiet > max(_QUIET, self.lost_after / 4)):
             return f"none of {nodes} nodes is heard, so the controller may be cut off"
         if nodes == 1 and not self._hears_itself:
             return "the bus does not hear the controller either"

@@ -59,20 +59,20 @@ class NodeBus:
         self._next_try = self._next_progress = 0.0
 
     def tend(self, progress: dict[str, Any] | None) -> None:
-        """Open the session where there is none yet, and publish ``progress`` once a second."""
+        """Open the session where there is none yet, and publish ``progress`` once a second: an empty one, too, is a sign of life."""
         now = time.monotonic()
         if self.contract.bus is None:
             return
         if self._session is None and now >= self._next_try:
             self._next_try = now + _RETRY_SECONDS
             self._open()
-        if self._session is not None and progress and now >= self._next_progress:
+        if self._session is not None and now >= self._next_progress:
             self._next_progress = now + _PROGRESS_SECONDS
             import zenoh
 
             # DROP: a reader that is slow must cost a message, not our time
             drop = zenoh.CongestionControl.DROP
-            key, text = f"{self._prefix}/progress", json.dumps(progress)
+            key, text = f"{self._prefix}/progress", json.dumps(progress or {})
             if len(text) <= LARGEST_PROGRESS:
                 proof = self._credential.prove("progress", key, text)
                 self._session.put(key, text, attachment=proof, congestion_control=drop)

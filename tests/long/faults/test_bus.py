@@ -95,6 +95,30 @@ def test_a_cut_network_takes_the_controller_s_own_session_away_with_its_only_nod
     node.wait()
 
 
+def test_a_cut_network_of_a_dozen_gangs_is_noticed_at_once_and_ends_none(tmp_path: Path) -> None:
+    """By default Zenoh removes sessions that vanish two at a time, 10 s each: meanwhile the last ones would count as heard."""
+    end = tmp_path / "end"
+    script = f"import os, time\nwhile not os.path.exists({str(end)!r}): time.sleep(0.1)"
+    server = Serving(tmp_path / "home", "--cpus", "16", "--lost-after", "10s")
+    try:
+        jobs = [server.gang(script) for _ in range(12)]
+        for job in jobs:
+            wait_for(lambda job=job: server.muster("stacks", job).returncode == 0, 60, "the node on the bus")
+        with partition(SimpleNamespace(path=server.home)):
+            wait_for(lambda: all("12 of 12 nodes fell silent within 10 s" in _reason(server, job) for job in jobs), 40)
+            time.sleep(15.0)  # longer than lost_after
+        wait_for(lambda: not any("unreachable" in _reason(server, job) for job in jobs), 60, "their return")
+        end.touch()
+        ended = [server.wait(job) for job in jobs]
+        assert [(each["status"], len(each["attempts"])) for each in ended] == [("SUCCEEDED", 1)] * 12
+    finally:
+        server.close()
+
+
+def _reason(server: Serving, job: str) -> str:
+    return str(server.detail(job)["statusReason"])
+
+
 def test_a_node_whose_main_thread_fails_ends_at_once_with_its_own_exit_code(bus: Bus) -> None:
     node = start_node(bus, "time.sleep(0.5); raise SystemExit(7)")
     assert node.wait(5 * PATIENCE) == 7, "an open session must not keep a failed process alive"

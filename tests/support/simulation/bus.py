@@ -34,6 +34,13 @@ class SimulatedBus:
     def token(self, job: str, attempt: int) -> str:
         return "token"
 
+    def listen(self) -> None:
+        """One of the nodes that are heard sends something, as each does once a second."""
+        for node in self._world.cluster.running:
+            if self._world.hears(node) and self.presence.met(node.key) and not self.presence.is_silent(node.key):
+                self.presence.sent(node.key)
+                return
+
     def notice(self, node: SimulatedNode) -> None:
         """A node's connection may have come or gone."""
         here = self._world.hears(node)

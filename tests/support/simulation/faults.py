@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _LEASE = 4.0
 """Seconds until the bus notices that a node is silent."""
+_PACE = 5.0
+"""Seconds for each further node of a cut network where the router removes them one after the other, as Zenoh may."""
 
 Fault = Callable[["Simulation", Random], None]
 
@@ -59,7 +61,7 @@ def partition(world: Simulation, rng: Random) -> None:
     """The controller alone is cut off: from its engine, and from all nodes."""
     seconds = _seconds(rng)
     _during(world, seconds, "engine_down")
-    _break_bus(world, seconds)
+    _break_bus(world, rng, seconds)
 
 
 def engine_outage(world: Simulation, rng: Random) -> None:
@@ -72,13 +74,15 @@ def hang_engine(world: Simulation, rng: Random) -> None:
 
 
 def bus_outage(world: Simulation, rng: Random) -> None:
-    _break_bus(world, _seconds(rng))
+    _break_bus(world, rng, _seconds(rng))
 
 
-def _break_bus(world: Simulation, seconds: float) -> None:
-    def notice() -> None:
-        for node in world.cluster.running:
-            world.notice(node, world.rng.uniform(0.5, _LEASE))
+def _break_bus(world: Simulation, rng: Random, seconds: float) -> None:
+    pace = rng.choice((0.0, _PACE))
+
+    def notice(pace: float = 0.0) -> None:
+        for position, node in enumerate(world.cluster.running):
+            world.notice(node, world.rng.uniform(0.5, _LEASE) + position * pace)
 
     def end() -> None:
         if world.heard <= 1:  # the controller may have declared the node lost: it could not tell which side was cut off
@@ -89,7 +93,7 @@ def _break_bus(world: Simulation, seconds: float) -> None:
         world.bus_down_since = world.machine.time
     world.machine.after(seconds, end)
     _during(world, seconds, "bus_down")
-    notice()
+    notice(pace)
     world.machine.after(seconds + 0.1, notice)
 
 

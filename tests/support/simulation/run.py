@@ -144,8 +144,9 @@ class Simulation:
 
     def _tick(self, process: int, due: float) -> None:
         reconciler = self._reconciler
-        if process != self.machine.process or due != self._next_tick or reconciler is None:
+        if process != self.machine.process or due != self._next_tick or reconciler is None or self._bus is None:
             return
+        self._bus.listen()
         reconciler._wake.clear()
         self.in_loop = True
         try:

@@ -29,10 +29,13 @@ class Cluster:
         for index in indices:
             self.presence.left(self.nodes[index])
 
-    def wait(self, seconds: float, *, answers: bool = True, runs: bool = True) -> None:
-        """Let time pass, with a look at every node each second, as the controller has."""
+    def wait(self, seconds: float, *, answers: bool = True, runs: bool = True, cut: bool = False) -> None:
+        """Let time pass, with a look at every node each second, as the controller has. ``cut``: nothing comes from any node."""
         for _ in range(int(seconds)):
             self.time += 1.0
+            for node in self.nodes:
+                if not cut:
+                    self.presence.sent(node)
             self.lost(answers=answers, runs=runs)
 
     def lost(self, *, answers: bool = True, runs: bool = True) -> list[int]:
@@ -135,6 +138,33 @@ def test_ten_minutes_of_outage_end_nothing_though_the_nodes_come_back_one_by_one
     assert cluster.lost() == []
     cluster.wait(L)
     assert cluster.lost() == [7], "the one that did not come back counts from when the others were heard again"
+
+
+def test_a_router_that_removes_the_nodes_of_a_cut_network_one_by_one_ends_none() -> None:
+    cluster = Cluster(60)
+    for index in range(60):
+        cluster.silence(index)
+        cluster.wait(5, cut=True)
+        assert cluster.lost() == []
+    assert cluster.presence.cut_off == "none of 60 nodes is heard, so the controller may be cut off"
+    cluster.presence.came(cluster.nodes[7])
+    cluster.wait(L)
+    assert cluster.lost() == []
+    cluster.wait(1)
+    assert cluster.lost() == [index for index in range(60) if index != 7]
+
+
+def test_what_a_silent_node_sent_before_is_no_sign_of_the_others() -> None:
+    cluster = Cluster(2)
+    cluster.silence(0)
+    for _ in range(3 * int(L)):
+        cluster.presence.sent(cluster.nodes[0])
+        cluster.wait(1, cut=True)
+    assert cluster.lost() == []
+    cluster.wait(L + 1)
+    assert cluster.lost() == []
+    cluster.wait(1)
+    assert cluster.lost() == [0], "from when the other was heard again"
 
 
 def test_nodes_that_fall_silent_one_after_the_other_are_lost_each() -> None:
