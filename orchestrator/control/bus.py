@@ -204,7 +204,10 @@ class Bus:
         """Stop the router; nodes look for the next one."""
         for session in (self._loopback, self._session):
             if session is not None:
-                session.close()
+                with contextlib.suppress(
+                    Exception
+                ):  # ZError: a session whose node does not answer holds it for too long; it is given up
+                    session.close()
         self._loopback = self._session = None
 
     def expect(self, job: str, attempt: int, nodes: int) -> None:

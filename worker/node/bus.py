@@ -6,6 +6,7 @@ there. Nothing in here waits: a router that is away is tried again, and what is 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -80,7 +81,10 @@ class NodeBus:
     def close(self) -> None:
         """Leave the bus; the token is withdrawn."""
         if self._session is not None:
-            self._session.close()
+            with contextlib.suppress(
+                Exception
+            ):  # ZError: the router does not answer; the outcome is written, and the token goes anyway
+                self._session.close()
             self._session = None
 
     def _open(self) -> None:
