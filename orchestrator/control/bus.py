@@ -83,7 +83,7 @@ _ACCESS = {
 attempts; the proofs do that. The controller's own session is inside the router: no rule applies to it."""
 
 _THREADS = "(rx: (worker_threads: 32))"
-"""Threads of the router that receive, as ``ZENOH_RUNTIME`` has it. A node that vanishes without a word holds one of them for 10 s
+"""The router's receiving threads, in the syntax of ``ZENOH_RUNTIME``. A node that vanishes silently blocks one of them for 10 s
 (eclipse-zenoh/zenoh#2718): with the default of two, a host that dies with many nodes makes the router deaf for 5 s a node."""
 
 _ITSELF: Node = ("controller", 0, 0)
@@ -204,9 +204,9 @@ class Bus:
         """Stop the router; nodes look for the next one."""
         for session in (self._loopback, self._session):
             if session is not None:
-                with contextlib.suppress(
-                    Exception
-                ):  # ZError: a session whose node does not answer holds it for too long; it is given up
+                import zenoh
+
+                with contextlib.suppress(zenoh.ZError):  # a node does not answer, and Zenoh gave up waiting for it
                     session.close()
         self._loopback = self._session = None
 

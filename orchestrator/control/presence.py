@@ -25,8 +25,8 @@ UNREACHABLE = 5
 _FRESH = 10.0
 """Seconds for which an engine's answer counts, or a quarter of ``lost_after`` where that is more."""
 _QUIET = 5.0
-"""Seconds without a sign of any other node after which nobody counts as heard, or a quarter of ``lost_after`` where that is more. The router
-removes nodes that a cut network takes away one after the other: those that it has not removed yet prove nothing by their tokens."""
+"""If no node sends anything for this long, no node counts as heard [s]. A quarter of ``lost_after`` applies where that is more. When a
+network is cut, the router removes the nodes one after the other: the token of a node that it has not removed yet proves nothing."""
 _BURST = 10.0
 """Seconds within which the nodes fall silent that the controller's own network takes away."""
 _FEWEST = 3

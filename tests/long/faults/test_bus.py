@@ -105,7 +105,11 @@ def test_a_cut_network_of_a_dozen_gangs_is_noticed_at_once_and_ends_none(tmp_pat
         for job in jobs:
             wait_for(lambda job=job: server.muster("stacks", job).returncode == 0, 60, "the node on the bus")
         with partition(SimpleNamespace(path=server.home)):
-            wait_for(lambda: all("12 of 12 nodes fell silent within 10 s" in _reason(server, job) for job in jobs), 40)
+            wait_for(
+                lambda: all("12 of 12 nodes fell silent within 10 s" in _reason(server, job) for job in jobs),
+                40,
+                "the cut",
+            )
             time.sleep(15.0)  # longer than lost_after
         wait_for(lambda: not any("unreachable" in _reason(server, job) for job in jobs), 60, "their return")
         end.touch()
