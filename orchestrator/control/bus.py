@@ -19,7 +19,7 @@ import os
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -210,9 +210,9 @@ class Bus:
                     session.close()
         self._loopback = self._session = None
 
-    def expect(self, job: str, attempt: int, nodes: int) -> None:
-        """Listen to the attempt's nodes from now on, until :meth:`forget`."""
-        self.presence.expect(job, attempt, nodes)
+    def expect(self, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
+        """Listen to the attempt's nodes from now on, until :meth:`forget`; ``met``: those that an earlier controller met."""
+        self.presence.expect(job, attempt, nodes, met)
 
     def token(self, job: str, attempt: int) -> str | None:
         """``MUSTER_BUS_TOKEN`` of the attempt's nodes; None with the bus off."""

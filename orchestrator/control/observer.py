@@ -65,7 +65,7 @@ class Observer:
 
     def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
         """The silence of a node, by what its engine and the store say of it; None for one that has ended."""
-        if not status.running:
+        if not status.running or self._bus.endpoint is None:
             return None
         assert attempt.handle is not None
         checked, asked = self._of(attempt).checked, self._engine.asked(attempt.handle)

@@ -9,7 +9,7 @@ says that it runs.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -31,6 +31,8 @@ _BURST = 10.0
 """Seconds within which the nodes fall silent that the controller's own network takes away."""
 _FEWEST = 3
 """Nodes below which their silence together says nothing about the controller's network."""
+_MISSING = "it has not come to this controller, which took over its job then"
+"""Why a node is unreachable that only an earlier controller met."""
 
 
 @dataclass
@@ -63,6 +65,8 @@ class Presence:
         self._unmet: dict[tuple[str, int], float] = {}
         """Attempts of which no node has come or ended yet, and since when they are expected."""
         self._nodes: dict[Node, _Heard] = {}
+        self._missing: dict[Node, tuple[float, str]] = {}
+        """Nodes that an earlier controller met, and this router has not: since when they are expected, and the same for people."""
         self._sign_at = 0.0
         """When a node came or sent something the last time."""
         self._silent = 0
@@ -75,11 +79,12 @@ class Presence:
         self._burst: int | None = None
         """How many nodes fell silent together; None where that is to be counted anew."""
 
-    def expect(self, job: str, attempt: int, nodes: int) -> None:
-        """Note an attempt's nodes from now on, until :meth:`forget`."""
+    def expect(self, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
+        """Note an attempt's nodes from now on, until :meth:`forget`; ``met``: those that an earlier controller met."""
         with self._lock:
             if (job, attempt) not in self._expected:
                 self._unmet[job, attempt] = self._monotonic()
+                self._missing |= {(job, attempt, index): self._moment() for index in met}
             self._expected[job, attempt] = nodes
 
     def expected(self) -> set[tuple[str, int]]:
@@ -115,10 +120,10 @@ class Presence:
 
     def left(self, node: Node) -> None:
         """A node's connection is gone."""
-        now, since = self._monotonic(), datetime.fromtimestamp(self._wall(), UTC)
+        now, since = self._moment()
         with self._lock:
             if self._expects(node):
-                self._set(node, _Heard(now, f"{since:%H:%M:%S} UTC", now, now))
+                self._set(node, _Heard(now, since, now, now))
 
     def ended(self, node: Node) -> None:
         """A node has ended, so that its silence means nothing."""
@@ -137,10 +142,10 @@ class Presence:
             return node in self._nodes
 
     def is_silent(self, node: Node) -> bool:
-        """Whether the node was connected, and is not heard now."""
+        """Whether the node was connected, to this router or an earlier one, and is not heard now."""
         with self._lock:
             heard = self._nodes.get(node)
-            return heard is not None and heard.gone is not None
+            return node in self._missing or (heard is not None and heard.gone is not None)
 
     @property
     def cut_off(self) -> str | None:
@@ -151,7 +156,9 @@ class Presence:
         return why if since is not None and self._monotonic() - since > UNHEARD else None
 
     def silence(self, node: Node, asked: float | None, runs: bool = True) -> Silence | None:
-        """The silence of a node that was connected to this router; None where it is heard, or never was.
+        """The silence of a node that was connected; None where it is heard, or never was.
+
+        One that was connected to an earlier router only is not lost, however long it is missing: it may look for that one.
 
         Args:
             node: The node.
@@ -159,10 +166,12 @@ class Presence:
             runs: Whether it answered that the node runs; otherwise it can't tell.
         """
         with self._lock:
+            now = self._monotonic()
+            if (missing := self._missing.get(node)) is not None:
+                return Silence(now - missing[0], missing[1], False, _MISSING)
             heard = self._nodes.get(node)
             if heard is None or heard.gone is None:
                 return None
-            now = self._monotonic()
             deaf = self._note_deafness()
             if asked is None or asked > min(now - heard.gone, max(_FRESH, self.lost_after / 4)):
                 heard.answered = heard.confirmed = now
@@ -172,6 +181,10 @@ class Presence:
             is_lost = alone > self.lost_after or (not runs and now - heard.answered > UNREACHABLE * self.lost_after)
             return Silence(now - heard.gone, heard.since, is_lost, deaf or "")
 
+    def _moment(self) -> tuple[float, str]:
+        """Now, in seconds of the monotonic clock and for people."""
+        return self._monotonic(), f"{datetime.fromtimestamp(self._wall(), UTC):%H:%M:%S} UTC"
+
     def _expects(self, node: Node) -> bool:
         return 0 <= node[2] < self._expected.get(node[:2], 0)
 
@@ -179,6 +192,7 @@ class Presence:
         """Note what is known of a node; None: nothing."""
         self._note_deafness()
         self._unmet.pop(node[:2], None)
+        self._missing.pop(node, None)
         before = self._nodes.pop(node, None)
         if heard is not None:
             self._nodes[node] = heard

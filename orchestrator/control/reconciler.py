@@ -254,7 +254,8 @@ class Reconciler:
         for closed in self.bus.presence.expected() - {(job.id, attempt.number) for job, attempt in found}:
             self.bus.forget(*closed)
         for job, attempt in found:
-            self.bus.expect(job.id, attempt.number, len(attempt.nodes))
+            met = [node.index for node in attempt.nodes if node.met]
+            self.bus.expect(job.id, attempt.number, len(attempt.nodes), met)
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:

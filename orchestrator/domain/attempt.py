@@ -203,11 +203,12 @@ def _observed(state: State, seen: Observed) -> Instructions:
 
 def _tell(state: State, seen: Observed) -> Instructions:
     """The reason that the job's user sees."""
+    unheard = _unheard(state.terms, seen)
     if seen.unread is not None:
-        reason = "; ".join(each for each in (seen.waits, seen.stale, seen.unread) if each)
+        reason = "; ".join(each for each in (seen.waits, unheard, seen.stale, seen.unread) if each)
         return (Explain(reason),) if reason and state.verdict is None else ()
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
-    runs = "; ".join(each for each in (runs, _unheard(state.terms, seen), seen.stale) if each)
+    runs = "; ".join(each for each in (runs, unheard, seen.stale) if each)
     if seen.waits:
         return (Explain(seen.waits),)
     if not state.started:

@@ -245,6 +245,22 @@ def test_training_does_not_notice_a_controller_that_is_killed_and_comes_back(ser
     assert server.muster("stop", job["id"]).returncode == 0
 
 
+def test_after_a_restart_a_node_that_does_not_come_is_named_until_it_does(server: Serving) -> None:
+    job = server.gang("import time; time.sleep(600)")
+    server.wait(job, "RUNNING")
+    wait_for(lambda: server.detail(job)["attempts"][0]["nodes"][0].get("met"), 30, "the node on the bus")
+    [supervisor] = gang_members(server.home, "supervisor", 0)
+    supervisor.strike(signal.SIGSTOP)
+    server.kill()
+    server.start()
+    missing = r"attempt 1 runs on 1 node; the main node has been unreachable since [0-9:]{8} UTC \(it has not come to this controller"
+    wait_for(lambda: re.match(missing, server.detail(job)["statusReason"]), 60, "the missing node")
+    supervisor.strike(signal.SIGCONT)
+    wait_for(lambda: server.detail(job)["statusReason"] == "attempt 1 runs on 1 node", 60, "the node")
+    assert len(server.detail(job)["attempts"]) == 1
+    assert server.muster("stop", job).returncode == 0
+
+
 def test_a_training_that_still_starts_has_nothing_to_save(server: Serving) -> None:
     starts = {"MUSTER_STALL_TIMEOUT": "300", "MUSTER_ON_CHILD_FAILURE": "restart"}  # as a training has them
     job = server.gang("import time; time.sleep(600)", env=starts)

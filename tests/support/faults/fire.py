@@ -84,7 +84,8 @@ class Fire:
         self.found = self.result.verdict.violations
         self._restart_at: float | None = None
         self._thaw_controller_at: float | None = None
-        self._frozen: list[tuple[Process, float, float, bool]] = []
+        self._frozen: list[tuple[Process, float, float, bool, int]] = []
+        """With the time of the blow and that of its end [s], whether the gang trained, and how often the controller had been started."""
         self._killed: set[Process] = set()
         self._next_look = 0.0
         self._over = False
@@ -166,7 +167,7 @@ class Fire:
         inside = commit is not None and (self.run.checkpoints / commit).exists()
         if blow.freeze:
             now = time.monotonic()
-            self._frozen.append((process, now, now + (blow.pause or 1e9), trains))
+            self._frozen.append((process, now, now + (blow.pause or 1e9), trains, self.home.starts))
         self._note(blow, f"{process} at iteration {reached(self.run, epoch)} of epoch {epoch}", inside)
         return True
 
@@ -256,10 +257,10 @@ class Fire:
 
     def _thaw(self, now: float) -> None:
         for each in list(self._frozen):
-            process, since, until, trained = each
+            process, since, until, trained, starts = each
             if process not in gang_members(self.home.path):
                 self._frozen.remove(each)
-            elif now >= until:
+            elif now >= until or self._is_named(process, starts):
                 process.strike(signal.SIGCONT)
                 self._frozen.remove(each)
             elif now - since > _NOTICE_SECONDS:
@@ -267,6 +268,12 @@ class Fire:
                 self.found.append(f"nobody noticed in {_NOTICE_SECONDS:g} s that {process} was frozen {when}")
                 process.strike(signal.SIGCONT)
                 self._frozen.remove(each)
+
+    def _is_named(self, process: Process, starts: int) -> bool:
+        """Whether the job says that the supervisor is unreachable: all that a controller can do that was started after the blow."""
+        if process.role != "supervisor" or self.home.starts == starts or not self._jobs:
+            return False
+        return "has not come to this controller" in (self._jobs[-1]["status_reason"] or "")
 
     def _look(self, now: float) -> None:
         jobs = self._jobs = self.home.jobs(self.run.name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from orchestrator.control.presence import Presence
@@ -21,8 +21,8 @@ class SimulatedBus:
         self.changed: Callable[[str], None] = lambda _: None
         self._world = world
 
-    def expect(self, job: str, attempt: int, nodes: int) -> None:
-        self.presence.expect(job, attempt, nodes)
+    def expect(self, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
+        self.presence.expect(job, attempt, nodes, met)
         for gang in self._world.cluster.gangs.values():
             if (gang.job, gang.attempt) == (job, attempt):
                 for node in gang.nodes:

@@ -120,7 +120,8 @@ class Invariants:
             raise Violation(f"{job.name} is FAILED ({reason}) after {spent} of {job.attempts} attempts")
 
     def check_reachable(self, process: int) -> None:
-        """Once all has been as it is for a while: a RUNNING gang says whether its engine is away; a new gang is seen; jobs say why they wait."""
+        """Once all has been as it is for a while: a RUNNING gang says whether its engine is away and whether a node is unreachable; a new gang
+        is seen; jobs say why they wait."""
         world = self._world
         state = process, world.changed
         if state != self._state:
@@ -132,10 +133,12 @@ class Invariants:
         self._check_waiting()
         self._check_stops(began)
         rows = world.memory.execute(
-            "SELECT jobs.name, jobs.status_reason, attempts.running_since FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
+            "SELECT jobs.name, jobs.status_reason, attempts.running_since, nodes.node_index FROM jobs"
+            " JOIN attempts ON attempts.job_id = jobs.id"
+            " LEFT JOIN nodes ON nodes.job_id = jobs.id AND nodes.attempt = attempts.number AND nodes.met"
             " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NULL AND attempts.ending IS NULL"
         ).fetchall()
-        for name, reason, running in rows:
+        for name, reason, running, met in rows:
             job = world.job(name)
             seen = [gang for gang in world.cluster.gangs.values() if gang.run == name and gang.launched < began - _TOLD]
             if running is None or not seen or job.stop_asked:
@@ -146,6 +149,9 @@ class Invariants:
                 raise Violation(
                     f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_away or 'answers'}"
                 )
+            silent = [node for gang in seen for node in gang.nodes if node.index == met and not world.hears(node)]
+            if silent and silent[0].alive and not world.engine_away and "unreachable" not in reason:
+                raise Violation(f"{name} is RUNNING ({reason}), and the bus does not hear {silent[0]}")
 
     def _check_stops(self, began: float) -> None:
         """A stop that was asked for before ``began`` is decided, whatever the store does, unless the engine is away."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
@@ -40,10 +40,20 @@ def those_whom_another_router_met_are_silent() -> Mutant:
     """B2: after a start or a move, nodes that do not come count as silent since the start."""
     expect = Presence.expect
 
-    def expected(self: Presence, job: str, attempt: int, nodes: int) -> None:
+    def expected(self: Presence, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
         expect(self, job, attempt, nodes)
         for index in range(nodes):
             self.left((job, attempt, index))
+
+    return mock.patch.object(Presence, "expect", expected)
+
+
+def those_whom_another_router_met_are_not_missed() -> Mutant:
+    """After a start or a move, nobody says that a node does not come."""
+    expect = Presence.expect
+
+    def expected(self: Presence, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
+        expect(self, job, attempt, nodes)
 
     return mock.patch.object(Presence, "expect", expected)
 
@@ -127,6 +137,7 @@ MUTANTS: Mapping[str, Callable[[], Mutant]] = {
     "B4": the_loop_reads_the_store,
     "B9": what_is_to_end_is_launched,
     "look": a_launched_gang_waits_for_its_look,
+    "missing": those_whom_another_router_met_are_not_missed,
     "stop": a_stop_waits_for_outcomes,
     "T1": any_volume_is_the_store,
     "T2": without_an_outcome_is_killed,

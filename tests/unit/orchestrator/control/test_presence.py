@@ -204,6 +204,33 @@ def test_a_node_that_this_router_never_met_can_not_fall_silent() -> None:
     assert cluster.presence.silence(("job-9", 1, 1), AGO) is None and not cluster.presence.met(("job-9", 1, 1))
 
 
+def test_a_node_that_only_an_earlier_controller_met_is_unreachable_until_it_comes_and_never_lost() -> None:
+    cluster, early, late, ended = Cluster(3), ("job-9", 1, 0), ("job-9", 1, 1), ("job-9", 1, 2)
+    cluster.presence.expect("job-9", 1, 4, met=[0, 1, 2])
+    cluster.presence.came(early)
+    cluster.presence.ended(ended)
+    cluster.wait(100 * L)
+    cluster.presence.expect("job-9", 1, 4, met=[0, 1, 2])  # as after an outage of the database
+    silence = cluster.presence.silence(late, AGO)
+    assert silence is not None and (silence.seconds, silence.since, silence.is_lost) == (100 * L, "00:16:40 UTC", False)
+    assert "has not come to this controller" in silence.cause and cluster.presence.is_silent(late)
+    assert not cluster.presence.met(late) and cluster.presence.cut_off is None
+    for node in (early, ended, ("job-9", 1, 3)):
+        assert cluster.presence.silence(node, AGO) is None and not cluster.presence.is_silent(node)
+    cluster.presence.came(late)
+    assert cluster.presence.silence(late, AGO) is None and not cluster.presence.is_silent(late)
+    cluster.presence.left(late)
+    cluster.wait(L + 1)
+    assert (again := cluster.presence.silence(late, AGO)) is not None and again.is_lost
+
+
+def test_what_an_earlier_controller_met_is_forgotten_with_its_attempt() -> None:
+    cluster = Cluster(1)
+    cluster.presence.expect("job-9", 1, 1, met=[0])
+    cluster.presence.forget("job-9", 1)
+    assert cluster.presence.silence(("job-9", 1, 0), AGO) is None
+
+
 def test_a_gang_that_never_comes_to_the_bus_keeps_a_silent_node_from_being_lost_for_a_while_only() -> None:
     cluster = Cluster(1)
     cluster.silence(0)
