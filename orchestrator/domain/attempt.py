@@ -206,7 +206,7 @@ def _tell(state: State, seen: Observed) -> Instructions:
     unheard = _unheard(state.terms, seen)
     if seen.unread is not None:
         reason = "; ".join(each for each in (seen.waits, unheard, seen.stale, seen.unread) if each)
-        return (Explain(reason),) if reason and state.verdict is None else ()
+        return (Explain(reason),) if reason != unheard and state.verdict is None else ()
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
     runs = "; ".join(each for each in (runs, unheard, seen.stale) if each)
     if seen.waits:

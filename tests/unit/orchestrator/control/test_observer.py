@@ -33,7 +33,7 @@ class Gang:
             engine,  # type: ignore[arg-type]
             SimpleNamespace(outcomes=self._outcomes),  # type: ignore[arg-type]
             errands,
-            SimpleNamespace(presence=Presence()),  # type: ignore[arg-type]
+            SimpleNamespace(presence=Presence(), endpoint="tcp/127.0.0.1:7447"),  # type: ignore[arg-type]
             SimpleNamespace(now=lambda: 0),  # type: ignore[arg-type]
         )
         self.job = job("job")
