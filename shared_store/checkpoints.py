@@ -259,6 +259,8 @@ class CheckpointWriter:
     ) -> Checkpoint:
         """Publish the checkpoint: manifest, fsync, fence, rename, ``LATEST``, retention. Main rank only, after all files.
 
+        A writer that was killed after the rename, or whose volume failed then, has published it already: that one stands.
+
         Args:
             facts: Further entries of the manifest (world size, worlds, reward, versions); JSON values.
             keep: Number of the newest checkpoints to keep; None keeps all. The best by ``score`` is always kept.
@@ -266,7 +268,6 @@ class CheckpointWriter:
 
         Raises:
             StaleEpoch: A newer attempt owns the run; nothing was published.
-            FileExistsError: A checkpoint of this name is already committed.
             OSError: The volume is full or gone; the last checkpoint remains valid.
         """
         for notes in self.path.glob(".*"):
@@ -285,10 +286,9 @@ class CheckpointWriter:
         }
         write_json(self.path / "manifest.json", {**facts, **manifest})
         target = self.run.checkpoints / self.name
-        if target.exists():
-            raise FileExistsError(f"checkpoint {self.name} exists already in {self.run.checkpoints}")
         check_epoch(self.run, self.epoch)
-        os.rename(self.path, target)
+        if not target.exists():
+            os.rename(self.path, target)
         sync_directory(self.run.checkpoints)
         # The checkpoint is committed. A failure from here on costs a hint or space, and an attempt that was frozen in the rename
         # must not prune its successor's checkpoints.

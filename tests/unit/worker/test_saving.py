@@ -115,6 +115,8 @@ def test_a_writer_that_dies_is_reported_and_replaced(run: Run) -> None:
     alone = Saver(run, 1, 0, 1, keep=None)
     alone.save(2, content(2), {})
     assert alone.wait() == ["checkpoint 00000002-e1"]
+    alone.save(2, content(2), {})  # once more, as for a writer that died after the commit and before its answer
+    assert alone.wait() == ["checkpoint 00000002-e1"] and alone.failures == 0
     alone.close()
 
 
