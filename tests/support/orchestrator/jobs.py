@@ -58,5 +58,5 @@ def refusal(server: Serving, *arguments: str, code: int = 2) -> str:
     before = there()
     done = server.muster(*arguments)
     assert done.returncode == code and len(done.stderr.splitlines()) == 1, (done.returncode, done.stdout, done.stderr)
-    assert there() == before
+    wait_for(lambda: there() == before, 10, "nothing that is left")  # a copy is deleted after the answer
     return done.stderr
