@@ -229,7 +229,9 @@ def test_a_submitted_job_keeps_its_teachers_weights_for_good(full: Serving, stor
     shutil.rmtree(store.run("mentor").path)
     assert held(run, "mentor") == [b"weights 2"]
     assert "run mentor does not exist" in refusal(full, "submit", student(tmp_path, "mentor@4"))
-    wait_for(lambda: {path.name for path in (store.path / "runs").glob(".*.clone")} == hidden, 10, "no copy that is left")
+    wait_for(
+        lambda: {path.name for path in (store.path / "runs").glob(".*.clone")} == hidden, 10, "no copy that is left"
+    )
 
 
 def test_a_teacher_with_damaged_weights_is_refused_at_submission(full: Serving, store: Store, tmp_path: Path) -> None:
