@@ -149,9 +149,10 @@ class Invariants:
                 raise Violation(
                     f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_away or 'answers'}"
                 )
-            silent = [node for gang in seen for node in gang.nodes if node.index == met and not world.hears(node)]
-            if silent and silent[0].alive and not world.engine_away and "unreachable" not in reason:
-                raise Violation(f"{name} is RUNNING ({reason}), and the bus does not hear {silent[0]}")
+            known = [node for gang in seen for node in gang.nodes if node.index == met and node.alive]
+            missing = [node for node in known if not (world.hears(node) or world.met(node))]
+            if missing and not world.engine_away and "unreachable" not in reason:
+                raise Violation(f"{name} is RUNNING ({reason}), and its controller has not met {missing[0]}")
 
     def _check_stops(self, began: float) -> None:
         """A stop that was asked for before ``began`` is decided, whatever the store does, unless the engine is away."""

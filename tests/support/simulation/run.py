@@ -211,6 +211,10 @@ class Simulation:
         """Whether the controller's router hears the node."""
         return node.acts and not self.bus_down and node.gang.router == self.router
 
+    def met(self, node: SimulatedNode) -> bool:
+        """Whether the controller of now has met the node."""
+        return self._bus is not None and self._bus.presence.met(node.key)
+
     def notice(self, node: SimulatedNode, after: float) -> None:
         """After so many seconds the bus has noticed how a node is."""
         self.machine.after(after, lambda: self._bus.notice(node) if self._bus is not None else None)

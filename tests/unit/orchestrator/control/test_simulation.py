@@ -20,7 +20,7 @@ FOUND_AT = {
     "B4": (0, "the loop waits for a call"),
     "B9": (2, "is to be launched, although it is preempted"),
     "look": (1, "runs, and its job is STARTING"),
-    "missing": (0, "and the bus does not hear"),
+    "missing": (0, "and its controller has not met"),
     "stop": (18, "and its engine is away"),
     "T1": (3, "the store does not have its run"),
     "T2": (9, "is FAILED (main node: exit 0, outcome not written"),
