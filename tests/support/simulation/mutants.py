@@ -48,8 +48,8 @@ def those_whom_another_router_met_are_silent() -> Mutant:
     return mock.patch.object(Presence, "expect", expected)
 
 
-def those_whom_another_router_met_are_not_missed() -> Mutant:
-    """After a start or a move, nobody says that a node does not come."""
+def nodes_that_do_not_reconnect_are_not_reported() -> Mutant:
+    """After a start or a move, the controller does not report nodes that do not reconnect."""
     expect = Presence.expect
 
     def expected(self: Presence, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
@@ -137,7 +137,7 @@ MUTANTS: Mapping[str, Callable[[], Mutant]] = {
     "B4": the_loop_reads_the_store,
     "B9": what_is_to_end_is_launched,
     "look": a_launched_gang_waits_for_its_look,
-    "missing": those_whom_another_router_met_are_not_missed,
+    "missing": nodes_that_do_not_reconnect_are_not_reported,
     "stop": a_stop_waits_for_outcomes,
     "T1": any_volume_is_the_store,
     "T2": without_an_outcome_is_killed,
