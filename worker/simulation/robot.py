@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import newton
 import warp as wp
@@ -15,11 +13,11 @@ from newton.solvers import SolverMuJoCo
 
 from worker.simulation import actuators as actuation
 from worker.simulation import collisions as contacts
-from worker.simulation import robot_files
+from worker.simulation import robot_reading
 from worker.simulation.actuators import Actuator, Number
 from worker.simulation.collisions import Collision
 from worker.simulation.patterns import resolve
-from worker.simulation.robot_view import RobotView, actuator_value
+from worker.simulation.robot_view import RobotView
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
@@ -49,6 +47,8 @@ class Robot:
         passive: Whether it may have no actuators at all, like a door.
         visuals: Whether visual-only geoms are read, which cameras and pictures need (from URDF they always are).
         file_options: Whether solver options of an MJCF or USD file apply where the task sets none; the last robot added wins.
+        accept: Differences between the robot and its file that would be refused, as patterns of ``"ELEMENT: FIELD"``, such as
+            ``"joint root: stiffness"``; ``muster robot`` prints them so.
     """
 
     file: str | Path
@@ -67,6 +67,7 @@ class Robot:
     passive: bool = field(default=False, kw_only=True)
     visuals: bool = field(default=True, kw_only=True)
     file_options: bool = field(default=True, kw_only=True)
+    accept: Sequence[str] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         check_word(self.name)
@@ -85,14 +86,7 @@ class Robot:
                 drive one joint, or nothing would move the robot's joints.
         """
         check_name(builder, self.name)
-        file = robot_files.read(self.file)
-        own = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(own)
-        self._import(file, own)
-        if not own.body_count:
-            raise ValueError(f"{self.name}: {self._shown()} has no body that could be a robot's")
-        _name_hinges(own, file.hinges)
-        _take_controls(own)
+        own = self.read().builder
         view = RobotView(own, "")
         self._set_joints(own, view)
         if self.actuators:
@@ -105,35 +99,17 @@ class Robot:
         self._place(own, view)
         builder.add_builder(own, label_prefix=self.name)
 
-    def _shown(self) -> str:
-        text = str(self.file)
-        return "its XML" if text.lstrip().startswith("<") else text
+    def read(self) -> robot_reading.Reading:
+        """Read the file alone, without what the other arguments change of the robot.
 
-    def _import(self, file: robot_files.RobotFile, own: newton.ModelBuilder) -> None:
-        floating = None if self.fixed is None else not self.fixed
-        ignored = [fnmatch.translate(pattern) for pattern in self.ignore]
+        Raises:
+            ValueError: See :meth:`add_to`.
+        """
+        source = robot_reading.Source(self.file, self.fixed, self.ignore, self.visuals, self.file_options, self.accept)
         try:
-            if file.format == "mjcf":
-                own.add_mjcf(
-                    file.source,
-                    floating=floating,
-                    ctrl_direct=True,
-                    ignore_names=ignored,
-                    parse_visuals=self.visuals,
-                    parse_mujoco_options=self.file_options,
-                )
-            elif file.format == "urdf":
-                own.add_urdf(file.source, floating=floating)
-            else:
-                own.add_usd(
-                    file.source,
-                    floating=floating,
-                    ignore_paths=[f".*/{pattern}" for pattern in ignored],
-                    load_visual_shapes=self.visuals,
-                    parse_mujoco_options=self.file_options,
-                )
-        except (ValueError, KeyError, RuntimeError) as error:
-            raise ValueError(f"{self.name}: {self._shown()} can't be read: {' '.join(str(error).split())}") from error
+            return robot_reading.read(source)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from error
 
     def _set_joints(self, own: newton.ModelBuilder, view: RobotView) -> None:
         for values, starts, argument in (
@@ -156,7 +132,7 @@ class Robot:
     def _check_driven(self, own: newton.ModelBuilder, view: RobotView) -> None:
         if view.joint_names and not self.passive and not own.custom_attributes["mujoco:actuator_trnid"].values:
             raise ValueError(
-                f"{self.name}: {self._shown()} has no actuators that a task could control; declare them, such as "
+                f"{self.name}: {robot_reading.shown(self.file)} has no actuators that a task could control; declare them, such as "
                 "actuators=(PositionActuator('*', stiffness=20.0, damping=0.5),), or say passive=True "
                 f"(joints: {', '.join(view.joint_names)})"
             )
@@ -191,30 +167,3 @@ def check_name(builder: newton.ModelBuilder, name: str) -> None:
     check_word(name)
     if any(label.startswith(f"{name}/") for label in builder.body_label):
         raise ValueError(f"two things in the world are called {name!r}; give one of them another name")
-
-
-def _name_hinges(own: newton.ModelBuilder, hinges: Mapping[str, Sequence[str]]) -> None:
-    labels: Any = own.custom_attributes["mujoco:joint_dof_label"]
-    labels.values = labels.values or {}
-    for joint, label in enumerate(own.joint_label):
-        for index, name in enumerate(hinges.get(label.rpartition("/")[2], ())):
-            labels.values[own.joint_qd_start[joint] + index] = f"{label.rpartition('/')[0]}/{name}"
-
-
-def _take_controls(own: newton.ModelBuilder) -> None:
-    """Let every actuator of the file follow the controls, and none Newton's joint targets, which a task does not write."""
-    for dof in range(own.joint_dof_count):
-        own.joint_target_mode[dof] = int(newton.JointTargetMode.NONE)
-        own.joint_target_ke[dof] = own.joint_target_kd[dof] = 0.0
-    rows: Any = own.custom_attributes["mujoco:actuator_trnid"].values
-    labels: Any = own.custom_attributes["mujoco:joint_dof_label"].values or {}
-    sources: Any = own.custom_attributes["mujoco:ctrl_source"].values
-    dofs = {label: dof for dof, label in labels.items()}
-    for actuator, target in enumerate(rows or ()):
-        sources[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
-        label = actuator_value(own, "actuator_target_label", actuator)
-        if int(target[0]) < 0 and label in dofs:  # a USD file's: the label would not say of which of two equal robots
-            rows[actuator] = wp.vec2i(dofs[label], 0)
-    actuation.register(own)
-    for name, (_, default) in actuation.MOTOR_ATTRIBUTES.items():
-        own.custom_attributes[f"muster:{name}"].values = [default] * len(rows or ())

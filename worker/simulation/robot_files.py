@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import re
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -60,11 +63,12 @@ def read(file: str | Path) -> RobotFile:
     shown = "the robot's XML" if source == text and source.lstrip().startswith("<") else text
     hinges: dict[str, list[str]] = {}
     if kind == "mjcf":
-        spec = _parse_mjcf(source, shown)
+        spec = parse_mjcf(source, shown)
         _check_mjcf_assets(spec, shown)
         hinges = _hinges(spec)
     elif kind == "urdf":
-        _check_urdf_meshes(source, shown)
+        for mesh in urdf_root(source, shown).iter("mesh"):  # Newton would only warn and continue without them
+            urdf_mesh(source, mesh.get("filename", ""), shown)
     return RobotFile(source, kind, hinges)
 
 
@@ -133,12 +137,30 @@ def _root(text: str, shown: str) -> ElementTree.Element:
         raise ValueError(f"{shown}: is not XML: {error}") from error
 
 
-def _parse_mjcf(source: str, shown: str) -> Any:
+def parse_mjcf(source: str, shown: str) -> Any:
+    """Parse an MJCF file, or the text of an MJCF or URDF file, as ``mujoco.MjSpec``.
+
+    Raises:
+        ValueError: MuJoCo can't parse it.
+    """
     parse = mujoco.MjSpec.from_string if source.lstrip().startswith("<") else mujoco.MjSpec.from_file
     try:
-        return parse(source)
+        with quiet():
+            return parse(source)
     except ValueError as error:
         raise ValueError(f"{shown}: {' '.join(str(error).split())}") from error
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep MuJoCo's parser and compiler from printing: what they warn of is checked here."""
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 def _check_mjcf_assets(spec: Any, shown: str) -> None:
@@ -150,29 +172,40 @@ def _check_mjcf_assets(spec: Any, shown: str) -> None:
             _refuse_mesh(shown, name, Path(spec.modelfiledir) / folder)
 
 
-def _check_urdf_meshes(source: str, shown: str) -> None:
-    """Refuse missing meshes: Newton would only warn and continue without them."""
-    is_text = source.lstrip().startswith("<")
-    root = _root(source if is_text else _text_of(Path(source), shown), shown)
-    folder = Path(source).resolve().parent if not is_text else Path()
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        if is_text:
+def urdf_root(source: str, shown: str) -> ElementTree.Element:
+    """The ``<robot>`` of a URDF file or text."""
+    return _root(source if source.lstrip().startswith("<") else _text_of(Path(source), shown), shown)
+
+
+def urdf_mesh(source: str, name: str, shown: str) -> Path:
+    """Find a mesh that a URDF file names.
+
+    Args:
+        source: Path or text of the file.
+        name: As in the file: relative to it, ``file://…`` or ``package://NAME/…``.
+        shown: The file's name, for errors.
+
+    Raises:
+        ValueError: It is missing, or it can't be found.
+    """
+    if source.lstrip().startswith("<"):
+        raise ValueError(
+            f"{shown}: its mesh {name} can only be found relative to a URDF file; give the path of that file"
+        )
+    folder = Path(source).resolve().parent
+    scheme, is_uri, inside = name.partition("://")
+    place = folder / name.removeprefix("file://")
+    if scheme == "package" and is_uri:
+        package = inside.partition("/")[0]
+        above = next((base for base in (folder, *folder.parents) if base.name == package), None)
+        if above is None:
             raise ValueError(
-                f"{shown}: its mesh {name} can only be found relative to a URDF file; give the path of that file"
+                f"{shown}: its mesh {name} is of the package {package}, but no folder above the file has that name"
             )
-        scheme, is_uri, inside = name.partition("://")
-        place = folder / name.removeprefix("file://")
-        if scheme == "package" and is_uri:
-            package = inside.partition("/")[0]
-            above = next((base for base in (folder, *folder.parents) if base.name == package), None)
-            if above is None:
-                raise ValueError(
-                    f"{shown}: its mesh {name} is of the package {package}, but no folder above the file has that name"
-                )
-            place = above.parent / inside
-        if not place.is_file():
-            _refuse_mesh(shown, name, place.parent)
+        place = above.parent / inside
+    if not place.is_file():
+        _refuse_mesh(shown, name, place.parent)
+    return place
 
 
 def _refuse_mesh(shown: str, name: str, folder: Path) -> None:

@@ -1,0 +1,219 @@
+"""Reads a robot's file with Newton's importer, judged by MuJoCo's compiler.
+
+Newton reads the file as it is. Where the robot that it builds differs from MuJoCo's compiled model of the same file, the robot is
+built from the compiled model instead; what differs even then is refused by name.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import newton
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from worker.simulation import actuators as actuation
+from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference
+from worker.simulation.robot_files import RobotFile
+from worker.simulation.robot_judge import Comparison, Difference
+from worker.simulation.robot_view import actuator_value
+
+RAW_SOLREF = 1
+"""Newton's mode of a joint whose limit's ``solref`` is passed to MuJoCo unchanged."""
+SOLREF_DEFAULT = (0.02, 1.0)
+"""MuJoCo's default ``solref``: time constant [s] and damping ratio."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What decides how a robot's file is read.
+
+    Attributes:
+        file: See :class:`worker.simulation.robot.Robot`, as for the others.
+        fixed: Whether the root is fixed to the world; None: as in the file.
+        ignore: Patterns of geoms and sites to leave out.
+        visuals: Whether geoms that are only seen are read.
+        options: Whether the file's solver options are read.
+        accept: Patterns of differences from the file that are accepted.
+    """
+
+    file: str | Path
+    fixed: bool | None = None
+    ignore: Sequence[str] = ()
+    visuals: bool = True
+    options: bool = True
+    accept: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A robot as its file says.
+
+    Attributes:
+        builder: Holds the robot alone, with the actuators of its file, whose inputs are the controls.
+        reference: MuJoCo's compiled model, ``mujoco.MjModel``; None for a USD file.
+        corrected: What Newton's importer had read otherwise, and is right now.
+        notes: What else a user should know of it, one sentence each.
+    """
+
+    builder: newton.ModelBuilder
+    reference: Any = None
+    corrected: tuple[Difference, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def shown(file: str | Path) -> str:
+    """A file's name, for errors."""
+    text = str(file)
+    return "its XML" if text.lstrip().startswith("<") else text
+
+
+def read(source: Source) -> Reading:
+    """Read a robot's file.
+
+    Raises:
+        ValueError: The file or a mesh is missing or can't be read, MuJoCo refuses it, or the robot would be another one here.
+    """
+    file = robot_files.read(source.file)
+    if file.format == "usd":
+        return Reading(_imported(source, file, floating=None if source.fixed is None else not source.fixed))
+    reference = robot_reference.compile_file(
+        file, fixed=source.fixed, ignored=_ignored(source), shown=shown(source.file)
+    )
+    model = reference.model
+    direct: newton.ModelBuilder | None = None
+    try:
+        direct = _imported(source, file, floating=None if source.fixed is None else not source.fixed)
+        found = _compared(source, direct, model)
+        if not found.differences:
+            return Reading(direct, model, (), reference.notes)
+        corrected = found.differences
+        if file.format == "urdf":
+            _stiffen_limits(direct)
+        remaining = _amended(source, direct, model, found)
+    except (ValueError, KeyError, RuntimeError, IndexError) as error:
+        corrected = remaining = (Difference("file", "reading by Newton's importer", f"refused ({_line(error)})", "possible"),)
+    if not remaining:
+        return Reading(direct, model, corrected, reference.notes)
+    rewritten = RobotFile(robot_mjcf.write(model, _stacks(model)), "mjcf", {})
+    builder = _imported(source, rewritten, floating=None)
+    remaining = _amended(source, builder, model, _compared(source, builder, model))
+    if remaining:
+        more = f", and {len(remaining) - 1} more" if len(remaining) > 1 else ""
+        raise ValueError(
+            f"{shown(source.file)} would be another robot here: {remaining[0]}{more}; change the file, or look at all of them "
+            f"with: muster robot {shown(source.file)} --compare"
+        )
+    return Reading(builder, model, corrected, reference.notes)
+
+
+def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
+    return robot_judge.compare(model, builder, options=source.options, accept=source.accept)
+
+
+def _amended(source: Source, builder: newton.ModelBuilder, model: Any, found: Comparison) -> tuple[Difference, ...]:
+    """Correct what the importers don't read or can't say, and compare once more.
+
+    They read whether there is gravity, but not which, round moments of inertia, and never let two bodies touch that a joint connects;
+    in MuJoCo a body that is fixed to the world touches those that hang from it.
+    """
+    if not found.differences:
+        return ()
+    if source.options:
+        builder.gravity = wp.vec3(*robot_judge.gravity(model))
+    for body, index in found.bodies.items():
+        builder.body_mass[index] = float(model.body_mass[body])
+        builder.body_com[index] = wp.vec3(*model.body_ipos[body])
+        builder.body_inertia[index] = wp.mat33(*robot_judge.inertia(model, body).ravel())
+    builder.shape_collision_filter_pairs = [
+        pair for pair in builder.shape_collision_filter_pairs if tuple(pair) not in found.filtered
+    ]
+    return _compared(source, builder, model).differences
+
+
+def _ignored(source: Source) -> list[str]:
+    return [fnmatch.translate(pattern) for pattern in source.ignore]
+
+
+def _imported(source: Source, file: RobotFile, *, floating: bool | None) -> newton.ModelBuilder:
+    """The robot as Newton's importer builds it."""
+    builder = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(builder)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what the importer leaves out or changes is found by comparison
+            if file.format == "mjcf":
+                builder.add_mjcf(
+                    file.source,
+                    floating=floating,
+                    ctrl_direct=True,
+                    ignore_names=_ignored(source),
+                    parse_visuals=source.visuals,
+                    parse_mujoco_options=source.options,
+                )
+            elif file.format == "urdf":
+                builder.add_urdf(file.source, floating=floating)
+            else:
+                builder.add_usd(
+                    file.source,
+                    floating=floating,
+                    ignore_paths=[f".*/{pattern}" for pattern in _ignored(source)],
+                    load_visual_shapes=source.visuals,
+                    parse_mujoco_options=source.options,
+                )
+    except (ValueError, KeyError, RuntimeError) as error:
+        raise ValueError(f"{shown(source.file)} can't be read: {_line(error)}") from error
+    if not builder.body_count:
+        raise ValueError(f"{shown(source.file)} has no body that could be a robot's")
+    _name_hinges(builder, file.hinges)
+    _take_controls(builder)
+    return builder
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _stacks(model: Any) -> list[int]:
+    """Bodies of several joints: as separate joints each keeps its own place, its order and its part in a tendon."""
+    return [body for body in range(model.nbody) if model.body_jntnum[body] > 1]
+
+
+def _stiffen_limits(builder: newton.ModelBuilder) -> None:
+    """Limits of URDF joints as stiff as MuJoCo's: Newton's own are springs that hardly damp."""
+    modes: Any = builder.custom_attributes["mujoco:solreflimit_mode"]
+    solrefs: Any = builder.custom_attributes["mujoco:solreflimit"]
+    modes.values = dict.fromkeys(range(builder.joint_dof_count), RAW_SOLREF)
+    solrefs.values = dict.fromkeys(range(builder.joint_dof_count), wp.vec2(*SOLREF_DEFAULT))
+
+
+def _name_hinges(own: newton.ModelBuilder, hinges: Mapping[str, Sequence[str]]) -> None:
+    labels: Any = own.custom_attributes["mujoco:joint_dof_label"]
+    labels.values = labels.values or {}
+    for joint, label in enumerate(own.joint_label):
+        for index, name in enumerate(hinges.get(label.rpartition("/")[2], ())):
+            labels.values[own.joint_qd_start[joint] + index] = f"{label.rpartition('/')[0]}/{name}"
+
+
+def _take_controls(own: newton.ModelBuilder) -> None:
+    """Let every actuator of the file follow the controls, and none Newton's joint targets, which a task does not write."""
+    for dof in range(own.joint_dof_count):
+        own.joint_target_mode[dof] = int(newton.JointTargetMode.NONE)
+        own.joint_target_ke[dof] = own.joint_target_kd[dof] = 0.0
+    rows: Any = own.custom_attributes["mujoco:actuator_trnid"].values
+    labels: Any = own.custom_attributes["mujoco:joint_dof_label"].values or {}
+    sources: Any = own.custom_attributes["mujoco:ctrl_source"].values
+    dofs = {label: dof for dof, label in labels.items()}
+    for actuator, target in enumerate(rows or ()):
+        sources[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
+        label = actuator_value(own, "actuator_target_label", actuator)
+        if int(target[0]) < 0 and label in dofs:  # a USD file's: the label would not say of which of two equal robots
+            rows[actuator] = wp.vec2i(dofs[label], 0)
+    actuation.register(own)
+    for name, (_, default) in actuation.MOTOR_ATTRIBUTES.items():
+        own.custom_attributes[f"muster:{name}"].values = [default] * len(rows or ())

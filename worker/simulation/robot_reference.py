@@ -1,0 +1,183 @@
+"""A robot's file as MuJoCo's own compiler reads it: what the robot must be."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from shared_store.wording import nearest
+from worker.simulation import robot_files
+from worker.simulation.robot_files import RobotFile
+from worker.simulation.robot_mjcf import name_of
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The compiled model of a robot's file.
+
+    Attributes:
+        model: ``mujoco.MjModel``.
+        notes: What MuJoCo had to correct, one sentence each.
+    """
+
+    model: Any
+    notes: tuple[str, ...] = ()
+
+
+def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str], shown: str) -> Reference:
+    """Compile an MJCF or URDF file.
+
+    Args:
+        file: The file.
+        fixed: Whether its root is fixed to the world; None: as in the file.
+        ignored: Regular expressions of the names of geoms and sites to leave out.
+        shown: The file's name, for errors.
+
+    Raises:
+        ValueError: MuJoCo refuses the file; the message names the element.
+    """
+    notes: list[str] = []
+    spec = _urdf_spec(file, shown, notes) if file.format == "urdf" else robot_files.parse_mjcf(file.source, shown)
+    for sensor in spec.sensors:
+        spec.delete(sensor)  # MuJoCo's sensors are not used here, and some files name places that do not exist
+    for element in (*spec.geoms, *spec.sites):
+        if any(re.match(pattern, element.name) for pattern in ignored):
+            spec.delete(element)
+    if fixed is not None:
+        for body in spec.worldbody.bodies:
+            for joint in body.joints:
+                spec.delete(joint)
+            if not fixed:
+                body.add_freejoint()
+    model = _compiled(spec, shown, notes)
+    _check_numbers(model, shown)
+    return Reference(model, tuple(notes))
+
+
+def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
+    """Compile, and where only inertias are impossible, once more with MuJoCo's own correction, which is noted."""
+    with robot_files.quiet():
+        try:
+            return spec.compile()
+        except ValueError as error:
+            if "balanceinertia" not in str(error):
+                raise ValueError(_refusal(spec, error, shown)) from error
+        spec.compiler.balanceinertia = True
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise ValueError(_refusal(spec, error, shown)) from error
+    for body in spec.bodies:
+        moments = _moments(body)
+        if body.explicitinertial and 2.0 * max(moments) > sum(moments) * (1.0 + 1e-9):
+            given = " ".join(f"{moment:.4g}" for moment in moments)
+            corrected = " ".join(f"{moment:.4g}" for moment in model.body_inertia[model.body(body.name).id])
+            notes.append(
+                f"body {body.name}: no body has the principal moments of inertia {given}, since one is greater than the sum of the "
+                f"others; they are {corrected} here (MuJoCo's balanceinertia)"
+            )
+    return model
+
+
+def _moments(body: Any) -> list[float]:
+    if np.isnan(body.fullinertia).any():
+        return [float(moment) for moment in body.inertia]
+    xx, yy, zz, xy, xz, yz = body.fullinertia
+    return [float(moment) for moment in np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])]
+
+
+_REMEDIES = (
+    ("mjMINVAL", "give that body an <inertial> of a mass greater than 0, or a geom that has one; or fix it to its parent"),
+    ("negative", "give a value of 0 or more"),
+)
+"""What to do, by a part of MuJoCo's message."""
+
+
+def _refusal(spec: Any, error: Exception, shown: str) -> str:
+    text = re.sub(r"\s+", " ", str(error)).strip().removeprefix("Error: ")
+    unknown = re.search(r"unknown transmission target '([^']*)'", text)
+    if unknown:
+        names = [element.name for element in (*spec.joints, *spec.tendons, *spec.sites, *spec.bodies) if element.name]
+        return f"{shown}: {text}; {nearest(unknown.group(1), names)}"
+    remedy = next((f"; {words}" for part, words in _REMEDIES if part in text), "")
+    return f"{shown}: MuJoCo refuses it: {text}{remedy}"
+
+
+_KINDS = {"body": "body", "jnt": "joint", "dof": "dof", "geom": "geom", "site": "site", "tendon": "tendon", "eq": "equality", "actuator": "actuator"}
+
+
+def _check_numbers(model: Any, shown: str) -> None:
+    """Refuse numbers that are not finite: MuJoCo only warns, and every step would reset every world."""
+    for field in dir(model):
+        kind, _, value = field.partition("_")
+        if kind not in _KINDS or not value:
+            continue
+        array = getattr(model, field)
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "f" or np.isfinite(array).all():
+            continue
+        index = int(np.argwhere(~np.isfinite(array))[0][0])
+        element = int(model.dof_jntid[index]) if kind == "dof" else index
+        name = name_of(model, getattr(mujoco.mjtObj, f"mjOBJ_{_KINDS[kind].upper()}") if kind != "dof" else mujoco.mjtObj.mjOBJ_JOINT, element)
+        shown_kind = "joint" if kind == "dof" else _KINDS[kind]
+        raise ValueError(f"{shown}: {shown_kind} {name}: {value} is not a finite number; give it one")
+
+
+URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+
+
+def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> Any:
+    """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals."""
+    root = robot_files.urdf_root(file.source, shown)
+    for joint in root.iter("joint"):
+        _check_urdf_joint(joint, shown, notes)
+    for link in root.iter("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+        for collision in link.findall("collision"):
+            mesh = collision.find("geometry/mesh")
+            if mesh is None:
+                continue
+            place = robot_files.urdf_mesh(file.source, mesh.get("filename", ""), shown)
+            if place.suffix.lower() in (".stl", ".obj", ".msh"):
+                mesh.set("filename", str(place))
+            else:
+                link.remove(collision)
+                notes.append(
+                    f"link {link.get('name')}: MuJoCo's compiler can't read {place.name}, so the shape of this collision geom "
+                    "is not compared"
+                )
+    extension = root.find("mujoco")
+    extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
+    compiler = extension.find("compiler")
+    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
+    compiler.attrib.update(strippath="false", fusestatic="false", discardvisual="true")
+    spec = robot_files.parse_mjcf(ElementTree.tostring(root, encoding="unicode"), shown)
+    _add_mimics(spec, root)
+    return spec
+
+
+def _check_urdf_joint(joint: ElementTree.Element, shown: str, notes: list[str]) -> None:
+    name, kind = joint.get("name"), joint.get("type")
+    if kind is None:
+        return  # a joint of a <transmission>
+    if kind not in URDF_JOINTS:
+        raise ValueError(f"{shown}: joint {name} is of type {kind!r}; URDF has {', '.join(URDF_JOINTS)}")
+    if kind in ("revolute", "prismatic") and joint.find("limit") is None:
+        notes.append(f"joint {name}: a {kind} joint of URDF needs a <limit>; without it the joint turns without end")
+
+
+def _add_mimics(spec: Any, root: ElementTree.Element) -> None:
+    """MuJoCo's reader of URDF knows no <mimic>: one joint follows another linearly."""
+    for joint in root.iter("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            data = [float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0)), *[0.0] * 9]
+            spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=joint.get("name"), name2=mimic.get("joint"), data=data
+            )
