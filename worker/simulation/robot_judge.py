@@ -14,7 +14,8 @@ import newton
 import numpy as np
 from newton.solvers import SolverMuJoCo
 
-from worker.simulation.robot_mjcf import CARRIER, name_of
+from worker.simulation import carriers
+from worker.simulation.robot_mjcf import name_of
 from worker.simulation.robot_view import dof_names
 
 RELATIVE = 1e-6
@@ -57,12 +58,12 @@ class Comparison:
 
     Attributes:
         differences: Empty where the robot is what its file says.
-        filtered: Pairs of the builder's shapes that can't touch, though the file lets them.
+        notes: What contacts have otherwise, which Newton can't hold, one sentence each.
         bodies: Index of each body of the file among the builder's bodies.
     """
 
     differences: tuple[Difference, ...]
-    filtered: frozenset[tuple[int, int]]
+    notes: tuple[str, ...]
     bodies: dict[int, int]
 
 
@@ -84,37 +85,58 @@ def compare(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of values that are compared here
-        judge = _Judge(reference, builder, options)
+        judge = Judge(reference, builder, options)
         found = [*judge.of_fields()]
         counting = [each for each in found if not _is_accepted(each, accept)]
         if not found:
             counting = [*judge.of_accelerations()]
-    return Comparison(tuple(counting), frozenset(judge.filtered), judge.body_indices())
+    return Comparison(tuple(counting), judge.notes(), judge.body_indices())
 
 
 def _is_accepted(difference: Difference, accept: Sequence[str]) -> bool:
     return any(fnmatchcase(f"{difference.element}: {difference.field}", pattern) for pattern in accept)
 
 
-class _Judge:
+class Judge:
+    """Both models of one robot: the file's, and the one that its builder becomes.
+
+    Attributes:
+        there: The file's compiled model, ``mujoco.MjModel``.
+        here: The built robot's, ``mujoco.MjModel``.
+    """
+
     def __init__(self, reference: Any, builder: newton.ModelBuilder, options: bool) -> None:
         self.there, self.builder, self.options = reference, builder, options
-        model = _finalized(builder)
+        model = finalized(builder)
         solver = SolverMuJoCo(
             model, use_mujoco_cpu=True, separate_worlds=False, kinematic_switchable_roots=False, disable_sensors=True
         )
+        carriers.unload(model, solver)
         self.here = solver.mj_model
         self.bodies = _index(solver.mjc_body_to_newton)
         self.dofs = _index(solver.mjc_jnt_to_newton_dof)
         self.shapes = _index(solver.mjc_geom_to_newton_shape)
-        self.filtered: set[tuple[int, int]] = set()
+        self.without_margin: list[str] = []
+        self.apart: list[str] = []
+
+    def notes(self) -> tuple[str, ...]:
+        """What is told apart from the differences: a robot moves as its file says without it."""
+        notes = []
+        if self.without_margin:
+            notes.append(
+                f"contacts begin where geoms touch, not at the margin of the file (geoms {_some(self.without_margin)}): MuJoCo-Warp "
+                "has no margins between boxes"
+            )
+        if self.apart:
+            notes.append(f"what a joint or an equality connects does not touch each other, not even a base that is fixed to the world ({_some(self.apart)})")
+        return tuple(notes)
 
     def body_indices(self) -> dict[int, int]:
         return {there: self.bodies[here] for there, here in self._pair_bodies().items() if there}
 
     def of_fields(self) -> Iterator[Difference]:
         bodies = self._pair_bodies()
-        joints = self._pair_joints()
+        joints = self.pair_joints()
         geoms = self._pair_geoms(bodies)
         yield from self._counts(bodies, joints)
         yield from self._of_bodies(bodies)
@@ -132,11 +154,11 @@ class _Judge:
     def _pair_bodies(self) -> Pairs:
         names = {}
         for index, body in enumerate(self.bodies):
-            if body >= 0 and CARRIER not in _short(self.builder.body_label[body]):
+            if body >= 0 and not carriers.is_carrier(self.builder.body_label[body]):
                 names[index] = plain(_short(self.builder.body_label[body]))
         return {0: 0} | _pair(_names(self.there, "body", range(1, self.there.nbody)), names)
 
-    def _pair_joints(self) -> Pairs:
+    def pair_joints(self) -> Pairs:
         names = {index: plain(self._joint_name(dof)) for index, dof in enumerate(self.dofs)}
         return _pair(_names(self.there, "joint", range(self.there.njnt)), names)
 
@@ -163,6 +185,14 @@ class _Judge:
             pairs |= _pair(mine, built)
         return pairs
 
+    def _by_name(self, kind: str) -> Pairs:
+        """Elements by their names, whether the file gives them or not, and the others in their order."""
+        count = {"tendon": "ntendon", "equality": "neq"}[kind]
+        there, here = ({index: plain(_short(name_of(model, _kind(kind), index))) for index in range(getattr(model, count))} for model in (self.there, self.here))
+        pairs = _pair(there, here)
+        rest = ([index for index in each if index not in taken] for each, taken in ((there, pairs), (here, set(pairs.values()))))
+        return pairs | dict(zip(*rest, strict=False))
+
     # -- differences
 
     def _counts(self, bodies: Pairs, joints: Pairs) -> Iterator[Difference]:
@@ -186,7 +216,7 @@ class _Judge:
             if parent != int(self.here.body_parentid[root]):
                 yield Difference(element, "parent", self._body_here(int(self.here.body_parentid[root])), name_of(self.there, _kind("body"), int(self.there.body_parentid[there])))
             yield from self._fields(element, "body", there, here, "mass gravcomp")
-            scale = float(np.abs(self.there.body_inertia[there]).max())
+            scale = max(1e-15, float(np.abs(self.there.body_inertia[there]).max()))
             yield from _unequal(element, "inertia", inertia(self.here, here), inertia(self.there, there), scale)
             if self.there.body_mass[there]:
                 yield from _unequal(element, "centre of mass", self.here.body_ipos[here], self.there.body_ipos[there], _length(self.there))
@@ -228,26 +258,44 @@ class _Judge:
             if there.geom_type[old] != here.geom_type[new]:
                 yield Difference(element, "type", _word(mujoco.mjtGeom, here.geom_type[new]), _word(mujoco.mjtGeom, there.geom_type[old]))
                 continue
-            yield from self._fields(element, "geom", old, new, "condim friction solref solimp solmix priority margin gap fluid")
+            yield from self._fields(element, "geom", old, new, "condim friction solref solimp solmix priority gap fluid")
+            if there.geom_margin[old] and not here.geom_margin[new]:
+                self.without_margin.append(name_of(there, _kind("geom"), old))
+            else:
+                yield from self._fields(element, "geom", old, new, "margin")
             yield from _unequal(element, "shape and place", _extent(here, new), _extent(there, old), _length(there))
 
     def _of_contacts(self, geoms: Pairs) -> Iterator[Difference]:
         old, new = list(geoms), list(geoms.values())
         theirs, mine = _touching(self.there)[np.ix_(old, old)], _touching(self.here)[np.ix_(new, new)]
         words = {True: "can touch", False: "can't touch"}
+        welded = self.there.body_weldid[self.there.geom_bodyid]
+        joined = self._joined()
         for first, second in np.argwhere(np.triu(theirs != mine)):
-            if theirs[first, second]:
-                shapes = self.shapes[new[first]], self.shapes[new[second]]
-                self.filtered |= {shapes, shapes[::-1]}
-            names = (name_of(self.there, _kind("geom"), old[each]) for each in (first, second))
-            yield Difference(
-                f"geoms {' and '.join(names)}", "contact", words[bool(mine[first, second])], words[bool(theirs[first, second])]
-            )
+            ends = frozenset((int(welded[old[first]]), int(welded[old[second]])))
+            if ends == {0}:
+                continue  # neither can move
+            names = " and ".join(name_of(self.there, _kind("geom"), old[each]) for each in (first, second))
+            if theirs[first, second] and (0 in ends or ends in joined):
+                self.apart.append(names)
+            else:
+                here, there = words[bool(mine[first, second])], words[bool(theirs[first, second])]
+                yield Difference(f"geoms {names}", "contact", here, there)
+
+    def _joined(self) -> set[frozenset[int]]:
+        """Pairs of bodies that an equality joins, by what they are welded to."""
+        model, weld = self.there, self.there.body_weldid
+        joined = set()
+        for equality in range(model.neq):
+            kind, ends = model.eq_objtype[equality], (model.eq_obj1id[equality], model.eq_obj2id[equality])
+            if kind == int(mujoco.mjtObj.mjOBJ_SITE):
+                ends = tuple(model.site_bodyid[list(ends)])
+            if kind in (int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_BODY)):
+                joined.add(frozenset(int(weld[end]) for end in ends))
+        return joined
 
     def _of_tendons(self) -> Iterator[Difference]:
-        count = range(self.here.ntendon)
-        built = {index: plain(_short(mujoco.mj_id2name(self.here, _kind("tendon"), index))) for index in count}
-        for old, new in _pair(_names(self.there, "tendon", range(self.there.ntendon)), built).items():
+        for old, new in self._by_name("tendon").items():
             yield from self._fields(
                 self._element("tendon", old),
                 "tendon",
@@ -281,9 +329,8 @@ class _Judge:
                     yield Difference(element, "joint", self._joint_name(int(self.dofs[built])), name_of(there, _kind("joint"), target))
 
     def _of_equalities(self) -> Iterator[Difference]:
-        for equality in range(min(self.there.neq, self.here.neq)):
-            element = self._element("equality", equality)
-            yield from self._fields(element, "eq", equality, equality, "type active0 solref solimp")
+        for old, new in self._by_name("equality").items():
+            yield from self._fields(self._element("equality", old), "eq", old, new, "type active0 solref solimp")
 
     def _of_options(self) -> Iterator[Difference]:
         yield from _unequal("option", "gravity", gravity(self.here), gravity(self.there))
@@ -298,7 +345,7 @@ class _Judge:
 
     def of_accelerations(self) -> Iterator[Difference]:
         """What no field shows: the accelerations in three states, without contacts."""
-        joints = self._pair_joints()
+        joints = self.pair_joints()
         random = np.random.default_rng(0)
         there, here = _without_contacts(self.there), _without_contacts(self.here)
         here.opt.gravity, here.opt.timestep = gravity(there), there.opt.timestep
@@ -330,7 +377,7 @@ class _Judge:
         """The bodies that carry the other joints of a body, from the nearest on."""
         above = []
         parent = int(self.here.body_parentid[body])
-        while parent and CARRIER in self._body_here(parent):
+        while parent and carriers.is_carrier(self._body_here(parent)):
             above.append(parent)
             parent = int(self.here.body_parentid[parent])
         return above
@@ -346,7 +393,7 @@ def gravity(model: Any) -> Any:
     return model.opt.gravity * (not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY))
 
 
-def _finalized(builder: newton.ModelBuilder) -> newton.Model:
+def finalized(builder: newton.ModelBuilder) -> newton.Model:
     gaps = builder.shape_gap
     builder.shape_gap = [0.0 if gap == builder.rigid_gap else gap for gap in gaps]
     try:
@@ -378,6 +425,10 @@ def _pair(there: dict[int, str], here: dict[int, str]) -> Pairs:
     rest = [index for index in here if index not in pairs.values()]
     unnamed = [index for index, name in there.items() if not name]
     return pairs | dict(zip(unnamed, rest, strict=False))
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _short(label: str) -> str:

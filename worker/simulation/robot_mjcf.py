@@ -13,13 +13,9 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from worker.simulation import carriers
+
 Element = ElementTree.Element
-
-CARRIER = "__carries_joint_"
-"""What stands in the name of a body that only carries one of several joints of the body after it."""
-CARRIER_MASS = 1e-9
-"""Mass [kg] and principal inertias [kg m^2] of such a body: MuJoCo demands some of every body that moves."""
-
 
 
 class _Words(dict[int, str]):
@@ -70,8 +66,7 @@ def write(model: Any, stacked: Iterable[int] = ()) -> str:
 
     Args:
         model: The compiled model, ``mujoco.MjModel``.
-        stacked: Bodies of several joints that Newton can't hold as one joint. Each of their joints but the last moves a body of
-            its own, of the mass :data:`CARRIER_MASS`.
+        stacked: Bodies of several joints that Newton can't hold as one joint. Each of their joints but the last moves a carrier (:mod:`worker.simulation.carriers`).
 
     Returns:
         The XML. Angles are in radians, and each number is written with all its digits.
@@ -185,8 +180,8 @@ class _Writer:
         joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
         carried = list(joints)[:-1] if body in self.stacked else []
         for index, joint in enumerate(carried):
-            parent = _add(parent, "body", name=f"{name}{CARRIER}{index}", **place)
-            _add(parent, "inertial", pos=(0, 0, 0), mass=CARRIER_MASS, diaginertia=(CARRIER_MASS,) * 3)
+            parent = _add(parent, "body", name=f"{name}{carriers.MARK}{index}", **place)
+            _add(parent, "inertial", pos=(0, 0, 0), mass=carriers.MASS, diaginertia=(carriers.INERTIA,) * 3)
             self._write_joint(parent, joint)
             place = {}
         if model.body_mocapid[body] >= 0:

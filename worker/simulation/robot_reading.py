@@ -19,6 +19,7 @@ from newton.solvers import SolverMuJoCo
 
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference
+from worker.simulation.carriers import keep_inertias
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_judge import Comparison, Difference
 from worker.simulation.robot_view import actuator_value
@@ -86,54 +87,51 @@ def read(source: Source) -> Reading:
         file, fixed=source.fixed, ignored=_ignored(source), shown=shown(source.file)
     )
     model = reference.model
-    direct: newton.ModelBuilder | None = None
+    builder: newton.ModelBuilder | None = None
     try:
-        direct = _imported(source, file, floating=None if source.fixed is None else not source.fixed)
-        found = _compared(source, direct, model)
+        builder = _imported(source, file, floating=None if source.fixed is None else not source.fixed)
+        found = _compared(source, builder, model)
         if not found.differences:
-            return Reading(direct, model, (), reference.notes)
+            return Reading(builder, model, (), reference.notes + found.notes)
         corrected = found.differences
         if file.format == "urdf":
-            _stiffen_limits(direct)
-        remaining = _amended(source, direct, model, found)
+            _stiffen_limits(builder)
+        found = _amended(source, builder, model, found)
     except (ValueError, KeyError, RuntimeError, IndexError) as error:
-        corrected = remaining = (Difference("file", "reading by Newton's importer", f"refused ({_line(error)})", "possible"),)
-    if not remaining:
-        return Reading(direct, model, corrected, reference.notes)
-    rewritten = RobotFile(robot_mjcf.write(model, _stacks(model)), "mjcf", {})
-    builder = _imported(source, rewritten, floating=None)
-    remaining = _amended(source, builder, model, _compared(source, builder, model))
-    if remaining:
-        more = f", and {len(remaining) - 1} more" if len(remaining) > 1 else ""
+        corrected = (Difference("file", "reading by Newton's importer", f"refused ({_line(error)})", "possible"),)
+        builder = None
+    if builder is None or found.differences:
+        rewritten = RobotFile(robot_mjcf.write(model, _stacks(model)), "mjcf", {})
+        builder = _imported(source, rewritten, floating=None)
+        found = _amended(source, builder, model, _compared(source, builder, model))
+    if found.differences:
+        more = f", and {len(found.differences) - 1} more" if len(found.differences) > 1 else ""
         raise ValueError(
-            f"{shown(source.file)} would be another robot here: {remaining[0]}{more}; change the file, or look at all of them "
-            f"with: muster robot {shown(source.file)} --compare"
+            f"{shown(source.file)} would be another robot here: {found.differences[0]}{more}; change the file, or look at all of "
+            f"them with: muster robot {shown(source.file)} --compare"
         )
-    return Reading(builder, model, corrected, reference.notes)
+    return Reading(builder, model, corrected, reference.notes + found.notes)
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
     return robot_judge.compare(model, builder, options=source.options, accept=source.accept)
 
 
-def _amended(source: Source, builder: newton.ModelBuilder, model: Any, found: Comparison) -> tuple[Difference, ...]:
+def _amended(source: Source, builder: newton.ModelBuilder, model: Any, found: Comparison) -> Comparison:
     """Correct what the importers don't read or can't say, and compare once more.
 
-    They read whether there is gravity, but not which, round moments of inertia, and never let two bodies touch that a joint connects;
-    in MuJoCo a body that is fixed to the world touches those that hang from it.
+    They read whether there is gravity, but not which, and round moments of inertia; models enlarge small ones.
     """
     if not found.differences:
-        return ()
+        return found
     if source.options:
         builder.gravity = wp.vec3(*robot_judge.gravity(model))
     for body, index in found.bodies.items():
         builder.body_mass[index] = float(model.body_mass[body])
         builder.body_com[index] = wp.vec3(*model.body_ipos[body])
         builder.body_inertia[index] = wp.mat33(*robot_judge.inertia(model, body).ravel())
-    builder.shape_collision_filter_pairs = [
-        pair for pair in builder.shape_collision_filter_pairs if tuple(pair) not in found.filtered
-    ]
-    return _compared(source, builder, model).differences
+    keep_inertias(builder)
+    return _compared(source, builder, model)
 
 
 def _ignored(source: Source) -> list[str]:

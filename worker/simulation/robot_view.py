@@ -14,9 +14,9 @@ from newton.solvers import SolverMuJoCo
 
 from shared_store.wording import nearest
 from worker.simulation.actuators import Input
+from worker.simulation.carriers import is_carrier
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
-from worker.simulation.robot_mjcf import CARRIER
 from worker.simulation.worlds import Worlds
 
 UNLIMITED_EFFORT = 1e6
@@ -69,7 +69,7 @@ class RobotView:
     def __init__(self, template: newton.ModelBuilder, name: str = "robot") -> None:
         self.name = name
         self._prefix = f"{name}/" if name else ""
-        self.bodies = [body for body in self._mine(template.body_label) if CARRIER not in _short(template.body_label[body])]
+        self.bodies = [body for body in self._mine(template.body_label) if not is_carrier(template.body_label[body])]
         if not self.bodies:
             there = sorted({label.partition("/")[0] for label in template.body_label})
             raise ValueError(f"the world has no robot or object {name!r}; {nearest(name, there)}")

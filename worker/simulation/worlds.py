@@ -14,6 +14,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.wording import nearest
+from worker.simulation.carriers import keep_inertias, unload
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives
 from worker.simulation.terrain import Terrain
@@ -199,6 +200,7 @@ class Worlds:
         scene = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(scene)
         has_masks = share(template)
+        keep_inertias(scene)
         scene.replicate(template, world_count)
         if isinstance(ground, Terrain):
             ground.check_memory(device)
@@ -216,6 +218,7 @@ class Worlds:
             warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")
             self.model = scene.finalize(device=device)
         self.solver = _Solver(self.model, **_SET_HERE, **solver_options)
+        unload(self.model, self.solver)
         self.solver.substeps = substeps
         self.after_substep: list[Callable[[], None]] = []
         self.pushed: set[int] = set()
