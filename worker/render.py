@@ -39,7 +39,7 @@ def main() -> int:
     from worker.telemetry.rollout import Rollout
 
     picture.check_film(ending)
-    rollout = Rollout.of(run, job.section.get("checkpoint"), worlds)
+    rollout = Rollout.of(run, job.section, worlds)
     stage = rollout.stage(rollout.task.device)
     end_startup()
     rate = rollout.config.control_hz

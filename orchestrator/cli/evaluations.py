@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import JsonOption, engine_queue, on_queue, submit_spec
+from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec
 from orchestrator.cli.progress import summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
@@ -96,6 +96,7 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    accept_changed_robot: AcceptOption = False,
     engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
@@ -115,6 +116,7 @@ def evaluate(
     if output is not None and (output / SIM_TRACE).exists():
         raise UsageError(f"-o {output}: {output / SIM_TRACE} exists; name another directory")
     asked = {"checkpoint": checkpoint, "episodes": episodes, "worlds": worlds, "seed": seed, **rules}
+    asked |= {"accept_changed_robot": accept_changed_robot or None}
     if (seconds := asked.pop("penalty")) is not None:
         asked |= {"off_track_penalty": seconds, "crash_penalty": seconds}
     with controller(store, cpus) as connect:

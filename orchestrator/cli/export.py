@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.jobs import AcceptOption, submit_spec
 from orchestrator.cli.serving import StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, named
@@ -48,6 +48,7 @@ def export(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the job: resources.gpus=1. Repeatable.")
     ] = None,
+    accept_changed_robot: AcceptOption = False,
     store: StoreOption = None,
 ) -> None:
     """Export a policy as a bundle for a robot (ONNX, contract, self-test), checked against the policy.
@@ -62,6 +63,7 @@ def export(
         client = connect()
         checkpoint = chosen(client, run, wanted)
         section = {"run": run, "checkpoint": checkpoint["iteration"], "episodes": episodes, "worlds": worlds}
+        section |= {"accept_changed_robot": accept_changed_robot}
         document = {"name": f"export-{run}"[:128], "resources": {"cpus": 1, "memory": "2GiB"}, "export": section}
         spec = validate(override(document, set_ or []), "muster export")
         code = see_through(client, submit_spec(client, spec, "muster export")["jobId"])

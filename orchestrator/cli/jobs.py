@@ -26,6 +26,12 @@ from shared_store.evaluations import in_one_line
 from shared_store.wording import counted, nearest
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+AcceptOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept-changed-robot", help="Go on where the robot's file loads otherwise than in the policy's training."
+    ),
+]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", help="Change a key of the spec: train.iterations=600. Repeatable.")
 ]

@@ -16,7 +16,7 @@ import typer
 
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import chosen
-from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.jobs import AcceptOption, submit_spec
 from orchestrator.cli.progress import Activity
 from orchestrator.cli.serving import CpusOption, StoreOption, controller
 from orchestrator.cli.terminal import echo
@@ -54,6 +54,7 @@ def record(
             help="Repair a truncated .mcap.partial into a readable file; nothing is recorded.", metavar="FILE"
         ),
     ] = None,
+    accept_changed_robot: AcceptOption = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
@@ -79,7 +80,11 @@ def record(
             given = [text for pair in options.items() for text in pair]
             raise typer.Exit(run_worker("worker.telemetry.live", run["path"], "--job", live, *given))
         section = Record(
-            run=run["run"], checkpoint=checkpoint_of(client, run, source), worlds=worlds, episodes=episodes
+            run=run["run"],
+            checkpoint=checkpoint_of(client, run, source),
+            accept_changed_robot=accept_changed_robot,
+            worlds=worlds,
+            episodes=episodes,
         )
         _fetch(client, run, Spec(**_common(run, "record"), record=section), output)
 
@@ -91,6 +96,7 @@ def render(
     seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Simulated time.")] = 6.0,
     size: Annotated[str, typer.Option(help="Width and height of a frame [px].")] = "640x360",
     overwrite: OverwriteOption = False,
+    accept_changed_robot: AcceptOption = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
@@ -108,6 +114,7 @@ def render(
         client = connect()
         run, _ = source_of(client, source)
         values: dict[str, Any] = {"run": run["run"], "checkpoint": checkpoint_of(client, run, source), "worlds": worlds}
+        values |= {"accept_changed_robot": accept_changed_robot}
         values |= {"seconds": seconds, "width": int(found[1]), "height": int(found[2])}
         try:
             section = Render.model_validate({**values, "format": output.suffix[1:]})

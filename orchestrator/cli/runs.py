@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue, scored
+from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, scored
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
@@ -30,6 +30,7 @@ def resume(
         int | None, typer.Option(min=1, help="Number of nodes, if it should change; the worlds are resharded.")
     ] = None,
     set_: SetOption = None,
+    accept_changed_robot: AcceptOption = False,
     engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
     as_json: JsonOption = False,
@@ -37,10 +38,15 @@ def resume(
     """Resume a run from its newest checkpoint, at the next iteration."""
     with Client.connect() as client:
         elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
+        accepted = ["train.accept_changed_robot=true"] if accept_changed_robot else []
         body = {
             "checkpoint": checkpoint,
             "nodes": nodes,
-            "set": [*changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_), *elsewhere],
+            "set": [
+                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_),
+                *elsewhere,
+                *accepted,
+            ],
             "directory": os.getcwd(),
         }
         resumed = client.post(f"/api/runs/{named(run)}/resume", body)

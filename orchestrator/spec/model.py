@@ -7,6 +7,7 @@ job model. It is carried whole in the definition's environment, so that a run ca
 from __future__ import annotations
 
 import math
+import operator
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -57,6 +58,13 @@ def _algorithm_name(value: str) -> str:
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
 
 
+ACCEPT = Field(
+    default=False,
+    exclude_if=operator.not_,
+    description="whether to go on where the robot's file loads otherwise than in the training of the checkpoint",
+)
+
+
 class _Train(Section):
     """Train a policy."""
 
@@ -69,6 +77,7 @@ class _Train(Section):
     )
     settings: dict[str, Any] = Field(default_factory=dict, description="of an algorithm of your own")
     config: dict[str, Any] = Field(default_factory=dict, description="overrides of the task's own configuration")
+    accept_changed_robot: bool = ACCEPT
     hyperparameters: dict[str, Any] | str | None = Field(
         default=None,
         exclude=True,
@@ -110,13 +119,17 @@ def _checkpoint(value: object) -> object:
     raise ValueError("expected an iteration, best or latest")
 
 
-class Evaluate(Section):
-    """Evaluate a checkpoint of a run with the mean action."""
-
+class _OfCheckpoint(Section):
     run: RunName
     checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
         default=None, description="iteration, best or latest; the latest where absent"
     )
+    accept_changed_robot: bool = ACCEPT
+
+
+class Evaluate(_OfCheckpoint):
+    """Evaluate a checkpoint of a run with the mean action."""
+
     episodes: int = Field(default=100, ge=1, le=1_000_000, description="of all ranks together")
     worlds: int = Field(default=1024, ge=1, description="simulated worlds of each rank, at most one for each episode")
     seed: int | None = Field(
@@ -128,13 +141,9 @@ class Evaluate(Section):
     keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
 
 
-class Race(Section):
+class Race(_OfCheckpoint):
     """Have a checkpoint of a racer's run drive laps from the start line, in a world each."""
 
-    run: RunName
-    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
-        default=None, description="iteration, best or latest; the latest where absent"
-    )
     trials: int = Field(default=TRIALS, ge=1, le=100, description="laps")
     continuous: bool = Field(
         default=DEFAULTS["continuous"], description="whether a car is put back; else a lap ends with its first mishap"
@@ -156,24 +165,16 @@ class Race(Section):
     keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
 
 
-class Export(Section):
+class Export(_OfCheckpoint):
     """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
-    run: RunName
-    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
-        default=None, description="iteration, best or latest; the latest where absent"
-    )
     episodes: int = Field(default=16, ge=0, description="on which bundle and policy are compared, at least; 0: none")
     worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 
 
-class Record(Section):
+class Record(_OfCheckpoint):
     """Record a checkpoint's policy on a few worlds as an MCAP file."""
 
-    run: RunName
-    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
-        default=None, description="iteration, best or latest; the latest where absent"
-    )
     worlds: int = Field(default=4, ge=1, le=16, description="worlds that are recorded")
     episodes: int = Field(default=2, ge=1, description="episodes of each world")
     seed: int | None = Field(
@@ -181,13 +182,9 @@ class Record(Section):
     )
 
 
-class Render(Section):
+class Render(_OfCheckpoint):
     """Film a checkpoint's policy."""
 
-    run: RunName
-    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
-        default=None, description="iteration, best or latest; the latest where absent"
-    )
     format: Literal["mp4", "gif", "png"] = Field(default="gif", description="png: six moments side by side")
     worlds: int = Field(default=4, ge=1, le=16, description="worlds, side by side")
     seconds: float = Field(default=6.0, gt=0, le=600, description="simulated")

@@ -254,12 +254,14 @@ def play(
     return returns
 
 
-def open_robot(bundle: Path, messages: Messages, seed: int = 0) -> SimulatedRobot:
+def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool = False) -> SimulatedRobot:
     """The robot of a bundle's task, with the configuration of the training.
 
     Raises:
-        UserError: The bundle is damaged, or its task is not here, means something else by now, or has no declared robot.
+        UserError: The bundle is damaged, its task is not here, means something else by now, or has no declared robot; or the robot
+            changed, and ``accept`` is false.
     """
+    from worker.learning.setup import check_robots
     from worker.tasks import find_task
     from worker.tasks.declared import DeclaredTask
     from worker.tasks.policy_contract import policy_contract, same_policy
@@ -278,6 +280,8 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0) -> SimulatedRobo
         raise UserError(f"task {contract.task}: joint commands can't be turned back into its actions")
     if lines := differences(contract, same_policy(policy_contract(task, contract.task), contract)):
         raise UserError(f"bundle {bundle} does not fit task {contract.task} as it is now: {brief(lines)}")
+    if changes := check_robots(contract, task, f"bundle {bundle}", accept=accept):
+        print(f"warning: {changes}", flush=True)
     return SimulatedRobot(task, contract, messages)
 
 
@@ -290,6 +294,11 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bundle", type=Path, help="directory of a bundle")
+    parser.add_argument(
+        "--accept-changed-robot",
+        action="store_true",
+        help="go on where the robot's file loads otherwise than in the training",
+    )
     parser.add_argument("--episodes", type=int, default=10, help="end after so many (default: 10)")
     parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds in a second (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the world (default: 0)")
@@ -307,7 +316,7 @@ def main() -> int:
         raise UserError(f"{error.name} is not installed; pip install ./policy_node") from error
     warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
     messages = Messages()
-    robot = open_robot(given.bundle, messages, given.seed)
+    robot = open_robot(given.bundle, messages, given.seed, accept=given.accept_changed_robot)
     try:
         connect = None if given.listen else given.connect
         with open_session(connect, given.listen) as session:

@@ -15,18 +15,20 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.documents import DocumentError
 from shared_store.epoch import check_epoch
 from shared_store.files import read_json, write_json
-from shared_store.policy_contract import Contract, brief, differences, read
+from shared_store.policy_contract import Contract, brief, differences, read, robot_changes
 from worker.distributed import Gang, warm_marker
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
+from worker.simulation.robot_values import shown_value
 from worker.tasks.adapting import begin_evaluation
 from worker.tasks.mistakes import task_mistakes
 from worker.tasks.policy_contract import policy_contract, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
+    from worker.simulation.robot_reading import Reading
     from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
@@ -180,14 +182,62 @@ def begin_as_trained(task: Task, checkpoint: Checkpoint) -> None:
     begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
 
 
-def check_contract(checkpoint: Checkpoint, task: Task) -> None:
-    """Raise UserError if the meaning of the task's observations, actions or commands changed since the checkpoint's training.
+def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool) -> str:
+    """Compare the task's robots with those of a policy's training.
+
+    A contract of an older Muster knows no robots. Then a robot changed if Newton's importer, which nothing judged, reads it otherwise.
+
+    Args:
+        then: The policy's contract; None: of an older Muster.
+        task: Its task, as it is now.
+        whose: What the contract is of: ``"checkpoint 00000100-e1"``.
+        accept: Whether changed robots are accepted.
+
+    Returns:
+        The changes that are accepted, in a sentence; empty without any.
+
+    Raises:
+        UserError: A robot changed, and that is not accepted.
+    """
+    if then is not None and then.robots:
+        lines = robot_changes(then, policy_contract(task, then.task))
+    else:
+        lines = [f"{name}: {_before(reading)}" for name, reading in task.readings.items() if reading.corrected]
+    if not lines:
+        return ""
+    what = f"{whose} was trained on another robot than the file gives now: {brief(lines)}"
+    if not accept:
+        raise UserError(
+            f"{what}; to go on all the same, add --accept-changed-robot (accept_changed_robot: true in a job's section)"
+        )
+    return what
+
+
+def _before(reading: Reading) -> str:
+    first, more = reading.corrected[0], len(reading.corrected) - 1
+    was, is_now = shown_value(first.built), shown_value(first.file)
+    return f"{first.element}: {first.field} was {was}, is {is_now}" + (f" ({more} more)" if more else "")
+
+
+def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any]) -> None:
+    """Check that a checkpoint's policy can act in the task as it is now.
 
     For a checkpoint without a contract, only sizes are compared.
+
+    Args:
+        checkpoint: The checkpoint.
+        task: Its task, with worlds.
+        section: The job's section, which may accept a changed robot.
+
+    Raises:
+        UserError: The meaning of the task's observations, actions or commands changed since the training, or its robot did.
     """
     facts = checkpoint.manifest
-    name = facts["task"]
-    if then := contract_from(facts, checkpoint.name):
+    name, then = facts["task"], contract_from(facts, checkpoint.name)
+    whose = f"checkpoint {checkpoint.name}"
+    if changes := check_robots(then, task, whose, accept=section.get("accept_changed_robot", False)):
+        print(f"warning: {changes}", flush=True)
+    if then:
         now = same_policy(policy_contract(task, name), then)
         if lines := differences(then, now):
             raise UserError(

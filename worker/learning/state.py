@@ -35,7 +35,7 @@ from worker.learning.algorithms import section_of
 from worker.learning.job import Job
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
-from worker.learning.setup import contract_from
+from worker.learning.setup import check_robots, contract_from
 from worker.learning.shards import Shards, read_file
 from worker.tasks.adapting import adaptive_steps
 
@@ -321,6 +321,10 @@ class TrainingState:
                 "here; start a new run for that (`muster clone` begins one with its weights)"
             )
         then, now = (contract_from(facts, checkpoint.name) for facts in (there, here))
+        accept = bool(self.job.section.get("accept_changed_robot"))
+        changes = check_robots(then, self.task, f"checkpoint {checkpoint.name}", accept=accept)
+        if self.gang.is_main and changes:
+            print(f"warning: {changes}", flush=True)
         if self.gang.is_main and then and now and (lines := differences(then, now, ranges=True)):
             print(f"warning: the task changed since checkpoint {checkpoint.name}: {brief(lines)}", flush=True)
 

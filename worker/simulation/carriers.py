@@ -6,6 +6,8 @@ but the last of them move a body without mass of its own.
 
 from __future__ import annotations
 
+from typing import Any
+
 import newton
 from newton.solvers import SolverMuJoCo
 
@@ -34,7 +36,8 @@ def unload(model: newton.Model, solver: SolverMuJoCo) -> None:
     bodies = [index for index, label in enumerate(model.body_label) if is_carrier(label)]
     if not bodies:
         return
-    for array in (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia):
+    arrays: tuple[Any, ...] = (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia)
+    for array in arrays:
         values = array.numpy()
         values[bodies] = 0.0
         array.assign(values)

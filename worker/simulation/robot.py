@@ -9,7 +9,6 @@ from pathlib import Path
 
 import newton
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from worker.simulation import actuators as actuation
 from worker.simulation import collisions as contacts
@@ -75,18 +74,22 @@ class Robot:
             if value is not None and (len(value) != count or not all(map(math.isfinite, value))):
                 raise ValueError(f"Robot {self.name}: {name} is {value!r}; give {count} finite numbers")
 
-    def add_to(self, builder: newton.ModelBuilder) -> None:
+    def add_to(self, builder: newton.ModelBuilder) -> robot_reading.Reading:
         """Add the robot to a builder that holds one world.
 
         Args:
             builder: ``SolverMuJoCo.register_custom_attributes`` was called on it.
+
+        Returns:
+            How its file was read.
 
         Raises:
             ValueError: The file or a mesh is missing or can't be read, the name is taken, a pattern matches nothing, two actuators
                 drive one joint, or nothing would move the robot's joints.
         """
         check_name(builder, self.name)
-        own = self.read().builder
+        reading = self.read()
+        own = reading.builder
         view = RobotView(own, "")
         self._set_joints(own, view)
         if self.actuators:
@@ -98,6 +101,7 @@ class Robot:
             contacts.without_self(own, builder)
         self._place(own, view)
         builder.add_builder(own, label_prefix=self.name)
+        return reading
 
     def read(self) -> robot_reading.Reading:
         """Read the file alone, without what the other arguments change of the robot.

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from worker.simulation import carriers
+from worker.simulation.robot_elements import name_of
 
 Element = ElementTree.Element
 
@@ -30,7 +31,9 @@ class _Words(dict[int, str]):
         self.kind = kind
 
     def __missing__(self, value: int) -> str:
-        raise ValueError(f"Newton's models have nothing of the kind {self.kind(value).name.rpartition('_')[2].lower()!r}")
+        raise ValueError(
+            f"Newton's models have nothing of the kind {self.kind(value).name.rpartition('_')[2].lower()!r}"
+        )
 
 
 def _names(kind: Any, words: str) -> _Words:
@@ -48,17 +51,6 @@ _INTEGRATORS = _names(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast")
 _CONES = _names(mujoco.mjtCone, "pyramidal elliptic")
 _GAINS = _names(mujoco.mjtGain, "fixed affine muscle user")
 _BIASES = _names(mujoco.mjtBias, "none affine muscle user")
-
-
-def name_of(model: Any, kind: mujoco.mjtObj, index: int) -> str:
-    """An element's name, or one made of its kind and its number where the file gives none.
-
-    Args:
-        model: A compiled model, ``mujoco.MjModel``.
-        kind: Kind of the element.
-        index: Its index among those of its kind.
-    """
-    return mujoco.mj_id2name(model, kind, index) or f"{mujoco.mju_type2Str(kind)}_{index}"
 
 
 def write(model: Any, stacked: Iterable[int] = ()) -> str:
@@ -120,7 +112,7 @@ class _Writer:
             root,
             "option",
             timestep=options.timestep,
-                        wind=options.wind,
+            wind=options.wind,
             magnetic=options.magnetic,
             density=options.density,
             viscosity=options.viscosity,
@@ -372,6 +364,7 @@ class _Writer:
         model = self.model
         transmission = _TRANSMISSIONS[int(model.actuator_trntype[actuator])]
         first, second = model.actuator_trnid[actuator]
+        values: dict[str, Any]
         if transmission == "slidercrank":
             values = {"cranksite": self.name("site", first), "slidersite": self.name("site", second)}
             values["cranklength"] = model.actuator_cranklength[actuator]
@@ -411,4 +404,6 @@ def _text(value: Any) -> str:
         return value
     if isinstance(value, bool):
         return "true" if value else "false"
-    return " ".join(repr(number.item() if isinstance(number, np.generic) else number) for number in np.atleast_1d(value))
+    return " ".join(
+        repr(number.item() if isinstance(number, np.generic) else number) for number in np.atleast_1d(value)
+    )

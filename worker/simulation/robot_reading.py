@@ -17,15 +17,26 @@ import newton
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from shared_store.policy_contract import RobotModel
 from worker.simulation import actuators as actuation
-from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference
+from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference, robot_usd, robot_values
 from worker.simulation.carriers import keep_inertias
 from worker.simulation.robot_files import RobotFile
+from worker.simulation.robot_identity import identity
 from worker.simulation.robot_judge import Comparison, Difference
 from worker.simulation.robot_view import actuator_value
 
 RAW_SOLREF = 1
 """Newton's mode of a joint whose limit's ``solref`` is passed to MuJoCo unchanged."""
+REMEDIES = {
+    **dict.fromkeys(
+        ("delay", "history"), "Declare the delay in the task, in physics steps: PositionActuator(..., delay=STEPS)"
+    ),
+    "dampingpoly": "Give damping one number",
+    "stiffnesspoly": "Give stiffness one number",
+    "fluid": "Leave out fluidshape",
+}
+"""What to do about a value that Newton can't hold, by its field."""
 SOLREF_DEFAULT = (0.02, 1.0)
 """MuJoCo's default ``solref``: time constant [s] and damping ratio."""
 
@@ -60,12 +71,14 @@ class Reading:
         reference: MuJoCo's compiled model, ``mujoco.MjModel``; None for a USD file.
         corrected: What Newton's importer had read otherwise, and is right now.
         notes: What else a user should know of it, one sentence each.
+        identity: By which a policy knows the robot again.
     """
 
     builder: newton.ModelBuilder
-    reference: Any = None
-    corrected: tuple[Difference, ...] = ()
-    notes: tuple[str, ...] = ()
+    reference: Any
+    corrected: tuple[Difference, ...]
+    notes: tuple[str, ...]
+    identity: RobotModel
 
 
 def shown(file: str | Path) -> str:
@@ -74,43 +87,58 @@ def shown(file: str | Path) -> str:
     return "its XML" if text.lstrip().startswith("<") else text
 
 
+class AnotherRobot(ValueError):
+    """A robot can't be held as its file says.
+
+    Args:
+        file: The file's name.
+        differences: What would differ.
+    """
+
+    def __init__(self, file: str, differences: Sequence[Difference]) -> None:
+        self.differences = tuple(differences)
+        first = differences[0]
+        more = f", and {len(differences) - 1} more" if len(differences) > 1 else ""
+        pattern = f"{first.element}: {first.field}"
+        super().__init__(
+            f"{file} would be another robot here: {first}{more}. {REMEDIES.get(first.field, 'Change the file')}, or accept the "
+            f"difference: Robot(..., accept=({pattern!r},)). All of them: muster robot {file} --compare"
+        )
+
+
 def read(source: Source) -> Reading:
     """Read a robot's file.
 
     Raises:
-        ValueError: The file or a mesh is missing or can't be read, MuJoCo refuses it, or the robot would be another one here.
+        AnotherRobot: The robot would be another one here.
+        ValueError: The file or a mesh is missing or can't be read, or MuJoCo refuses it.
     """
-    file = robot_files.read(source.file)
+    file, name = robot_files.read(source.file), shown(source.file)
+    floating = None if source.fixed is None else not source.fixed
     if file.format == "usd":
-        return Reading(_imported(source, file, floating=None if source.fixed is None else not source.fixed))
-    reference = robot_reference.compile_file(
-        file, fixed=source.fixed, ignored=_ignored(source), shown=shown(source.file)
-    )
+        imported = _imported(source, file, floating)
+        robot_usd.check(file.source, imported, name)
+        return Reading(imported, None, (), (), identity(imported, None))
+    reference = robot_reference.compile_file(file, fixed=source.fixed, ignored=_ignored(source), shown=name)
     model = reference.model
-    builder: newton.ModelBuilder | None = None
     try:
-        builder = _imported(source, file, floating=None if source.fixed is None else not source.fixed)
+        builder = _imported(source, file, floating)
         found = _compared(source, builder, model)
-        if not found.differences:
-            return Reading(builder, model, (), reference.notes + found.notes)
         corrected = found.differences
-        if file.format == "urdf":
-            _stiffen_limits(builder)
-        found = _amended(source, builder, model, found)
     except (ValueError, KeyError, RuntimeError, IndexError) as error:
         corrected = (Difference("file", "reading by Newton's importer", f"refused ({_line(error)})", "possible"),)
-        builder = None
-    if builder is None or found.differences:
-        rewritten = RobotFile(robot_mjcf.write(model, _stacks(model)), "mjcf", {})
-        builder = _imported(source, rewritten, floating=None)
+        found = Comparison(corrected, (), {})
+    else:
+        if file.format == "urdf" and corrected:
+            _stiffen_limits(builder)
+        found = _amended(source, builder, model, found)
+    if found.differences:
+        builder = _imported(source, RobotFile(robot_mjcf.write(model, _stacks(model)), "mjcf", {}), None)
         found = _amended(source, builder, model, _compared(source, builder, model))
     if found.differences:
-        more = f", and {len(found.differences) - 1} more" if len(found.differences) > 1 else ""
-        raise ValueError(
-            f"{shown(source.file)} would be another robot here: {found.differences[0]}{more}; change the file, or look at all of "
-            f"them with: muster robot {shown(source.file)} --compare"
-        )
-    return Reading(builder, model, corrected, reference.notes + found.notes)
+        raise AnotherRobot(name, found.differences)
+    notes = (*reference.notes, *found.notes)
+    return Reading(builder, model, corrected, notes, identity(builder, model))
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
@@ -125,11 +153,11 @@ def _amended(source: Source, builder: newton.ModelBuilder, model: Any, found: Co
     if not found.differences:
         return found
     if source.options:
-        builder.gravity = wp.vec3(*robot_judge.gravity(model))
+        builder.gravity = wp.vec3(*robot_values.gravity(model))
     for body, index in found.bodies.items():
         builder.body_mass[index] = float(model.body_mass[body])
         builder.body_com[index] = wp.vec3(*model.body_ipos[body])
-        builder.body_inertia[index] = wp.mat33(*robot_judge.inertia(model, body).ravel())
+        builder.body_inertia[index] = wp.mat33(*robot_values.inertia(model, body).ravel())
     keep_inertias(builder)
     return _compared(source, builder, model)
 
@@ -138,7 +166,7 @@ def _ignored(source: Source) -> list[str]:
     return [fnmatch.translate(pattern) for pattern in source.ignore]
 
 
-def _imported(source: Source, file: RobotFile, *, floating: bool | None) -> newton.ModelBuilder:
+def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.ModelBuilder:
     """The robot as Newton's importer builds it."""
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)

@@ -13,8 +13,8 @@ import numpy as np
 
 from shared_store.wording import nearest
 from worker.simulation import robot_files
+from worker.simulation.robot_elements import name_of
 from worker.simulation.robot_files import RobotFile
-from worker.simulation.robot_mjcf import name_of
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,10 @@ def _moments(body: Any) -> list[float]:
 
 
 _REMEDIES = (
-    ("mjMINVAL", "give that body an <inertial> of a mass greater than 0, or a geom that has one; or fix it to its parent"),
+    (
+        "mjMINVAL",
+        "give that body an <inertial> of a mass greater than 0, or a geom that has one; or fix it to its parent",
+    ),
     ("negative", "give a value of 0 or more"),
 )
 """What to do, by a part of MuJoCo's message."""
@@ -109,7 +112,16 @@ def _refusal(spec: Any, error: Exception, shown: str) -> str:
     return f"{shown}: MuJoCo refuses it: {text}{remedy}"
 
 
-_KINDS = {"body": "body", "jnt": "joint", "dof": "dof", "geom": "geom", "site": "site", "tendon": "tendon", "eq": "equality", "actuator": "actuator"}
+_KINDS = {
+    "body": "body",
+    "jnt": "joint",
+    "dof": "dof",
+    "geom": "geom",
+    "site": "site",
+    "tendon": "tendon",
+    "eq": "equality",
+    "actuator": "actuator",
+}
 
 
 def _check_numbers(model: Any, shown: str) -> None:
@@ -123,7 +135,11 @@ def _check_numbers(model: Any, shown: str) -> None:
             continue
         index = int(np.argwhere(~np.isfinite(array))[0][0])
         element = int(model.dof_jntid[index]) if kind == "dof" else index
-        name = name_of(model, getattr(mujoco.mjtObj, f"mjOBJ_{_KINDS[kind].upper()}") if kind != "dof" else mujoco.mjtObj.mjOBJ_JOINT, element)
+        name = name_of(
+            model,
+            getattr(mujoco.mjtObj, f"mjOBJ_{_KINDS[kind].upper()}") if kind != "dof" else mujoco.mjtObj.mjOBJ_JOINT,
+            element,
+        )
         shown_kind = "joint" if kind == "dof" else _KINDS[kind]
         raise ValueError(f"{shown}: {shown_kind} {name}: {value} is not a finite number; give it one")
 
@@ -179,5 +195,9 @@ def _add_mimics(spec: Any, root: ElementTree.Element) -> None:
         if mimic is not None:
             data = [float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0)), *[0.0] * 9]
             spec.add_equality(
-                type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=joint.get("name"), name2=mimic.get("joint"), data=data
+                type=mujoco.mjtEq.mjEQ_JOINT,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                name1=joint.get("name"),
+                name2=mimic.get("joint"),
+                data=data,
             )

@@ -17,6 +17,7 @@ from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import STEP, check_group, check_observations
 from worker.simulation.randomization_targets import check_patterns
 from worker.simulation.randomizations import Randomizations
+from worker.simulation.robot_reading import Reading
 from worker.simulation.robot_view import RobotView, body_arrays
 from worker.simulation.sensors.camera import Camera
 from worker.simulation.sensors.differential_ik import IkSolver
@@ -91,6 +92,7 @@ class DeclaredTask(Task):
         """Add robots and objects, and bind the terms to them."""
         config: Any = self.config
         self.views: dict[str, RobotView] = {}
+        self.readings = {}
         for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
             self._add(name, entity, builder)
         for name in ("robot", *self.objects(config)):
@@ -122,7 +124,9 @@ class DeclaredTask(Task):
             whose = "robot() returned" if name == "robot" else f"{name} is"
             raise ValueError(f"{where}{whose} {type(entity).__name__}, which can't be put into a world")
         with _placed(where.removesuffix(": ")):
-            dataclasses.replace(entity, name=name).add_to(builder)
+            reading = dataclasses.replace(entity, name=name).add_to(builder)
+        if isinstance(reading, Reading):
+            self.readings = {**self.readings, name: reading}
 
     def stands_on(self) -> bool | Terrain:
         """The result of :meth:`terrain`, or whether there is a plane."""

@@ -49,6 +49,7 @@ def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = Non
         commands=_commands(getattr(task, "plan", None)),
         states=tuple(states),
         discrete=bool(task.discrete),
+        robots=tuple(dataclasses.replace(reading.identity, name=name) for name, reading in task.readings.items()),
         normalizer="unknown" if exported is None else "inside",
     )
 

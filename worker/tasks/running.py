@@ -102,7 +102,9 @@ class Running(DeclaredTask):
             joint_positions={**self.start_pose, "*": 0.0},
             self_collisions=False,
             visuals=False,
-            accept=("joint root: stiffness",),  # the humanoid's free joint inherits a spring of its hinges' class, which nobody meant
+            accept=(
+                "joint root: stiffness",
+            ),  # the humanoid's free joint inherits a spring of its hinges' class, which nobody meant
         )
 
     def declare(self, config: RunningConfig) -> Declaration:

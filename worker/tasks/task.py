@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import newton
@@ -24,6 +25,7 @@ from worker.simulation.episodes import (
     read_mishap,
 )
 from worker.simulation.randomization import Randomizer
+from worker.simulation.robot_reading import Reading
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
 from worker.tasks.adapting import Adapting
@@ -96,6 +98,8 @@ class Task(Telling):
     """Whether the worlds stand on a ground plane."""
     metric_names: tuple[str, ...] = ()
     """Names of the metrics, which are logged besides the rewards as means over the steps; of declared tasks."""
+    readings: Mapping[str, Reading] = MappingProxyType({})
+    """How the file of each robot was read, by its name; of declared tasks."""
     termination_names: tuple[str, ...] = ()
     """Names of the terminations, which are counted; of declared tasks."""
     success: str | None = None

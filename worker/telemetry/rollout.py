@@ -50,13 +50,18 @@ class Rollout:
 
     @classmethod
     def of(
-        cls, run: Run, wanted: int | str | None, worlds: int, seed: int | None = None, device: str | None = None
+        cls,
+        run: Run,
+        section: Mapping[str, Any],
+        worlds: int,
+        seed: int | None = None,
+        device: str | None = None,
     ) -> Rollout:
         """Build the worlds and read the policy.
 
         Args:
             run: The run.
-            wanted: Iteration or name of the checkpoint; None: the newest.
+            section: The job's section: ``checkpoint``, an iteration or a name (the newest where absent), ``accept_changed_robot``.
             worlds: How many.
             seed: Of the worlds; by default one that is not that of the training.
             device: ``"cpu"`` or ``"cuda:<n>"``; None: a GPU where there is one.
@@ -64,7 +69,7 @@ class Rollout:
         Raises:
             UserError: There is no such checkpoint, or it does not fit the task as it is now.
         """
-        checkpoint = find_checkpoint(run, wanted)
+        checkpoint = find_checkpoint(run, section.get("checkpoint"))
         facts = checkpoint.manifest
         with user_errors("task"):
             task_type = find_task(facts["task"])
@@ -77,7 +82,7 @@ class Rollout:
             task = task_type(config, worlds, seed=seed, device=device)
         begin_as_trained(task, checkpoint)
         policy = load_policy(checkpoint, device)
-        check_contract(checkpoint, task)
+        check_contract(checkpoint, task, section)
         return cls(run, checkpoint, config, task, policy, seed)
 
     def stage(self, device: str = "cpu") -> Stage:

@@ -175,7 +175,7 @@ class Policy:
         from worker.telemetry.rollout import Rollout
 
         torch.set_num_threads(1)  # a few worlds: more threads would wait for each other
-        self._rollout = Rollout.of(run, checkpoint, worlds, device="cpu")
+        self._rollout = Rollout.of(run, {"checkpoint": checkpoint}, worlds, device="cpu")
         self._stage, self._episodes, self._stop = self._rollout.stage(), episodes, stop
         self._sums = np.zeros((worlds, 2))
         self._ended = np.zeros(worlds, int)

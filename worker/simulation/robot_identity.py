@@ -1,0 +1,78 @@
+"""The identity of a robot's compiled model, by which a policy knows again the robot it was trained on."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import newton
+import numpy as np
+
+from shared_store.policy_contract import RobotModel
+from worker.simulation.robot_values import gravity, inertia
+
+_COMPILED = (
+    *("body_parentid", "body_pos", "body_quat", "body_mass", "body_ipos", "body_gravcomp", "body_mocapid"),
+    *("jnt_type", "jnt_bodyid", "jnt_pos", "jnt_axis", "jnt_limited", "jnt_range", "jnt_stiffness", "jnt_solref"),
+    *("jnt_solimp", "jnt_margin", "jnt_actfrclimited", "jnt_actfrcrange", "qpos0", "qpos_spring"),
+    *(
+        "dof_damping",
+        "dof_armature",
+        "dof_frictionloss",
+        "geom_type",
+        "geom_bodyid",
+        "geom_size",
+        "geom_pos",
+        "geom_quat",
+    ),
+    *("geom_contype", "geom_conaffinity", "geom_condim", "geom_friction", "geom_solref", "geom_solimp"),
+    *(
+        "tendon_num",
+        "tendon_range",
+        "tendon_stiffness",
+        "tendon_damping",
+        "tendon_lengthspring",
+        "wrap_objid",
+        "wrap_prm",
+    ),
+    *("eq_type", "eq_obj1id", "eq_obj2id", "eq_data", "exclude_signature", "actuator_trntype", "actuator_trnid"),
+    *("actuator_dyntype", "actuator_gaintype", "actuator_biastype", "actuator_dynprm", "actuator_gainprm"),
+    *("actuator_biasprm", "actuator_gear", "actuator_ctrlrange", "actuator_forcerange", "actuator_delay"),
+)
+"""Arrays of ``mujoco.MjModel`` that say what a robot is."""
+_IMPORTED = (
+    *("body_mass", "body_com", "body_inertia", "joint_type", "joint_parent", "joint_child", "joint_X_p", "joint_X_c"),
+    *("joint_axis", "joint_limit_lower", "joint_limit_upper", "joint_armature", "joint_friction", "joint_damping"),
+    *("shape_type", "shape_body", "shape_scale", "shape_transform"),
+)
+"""The same of Newton's builder, for a file that MuJoCo doesn't compile."""
+DIGITS = 5
+"""Significant digits of a number that count."""
+
+
+def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
+    """Identify a robot, without a name.
+
+    Args:
+        builder: The robot as its file says, alone.
+        reference: The file's compiled model, ``mujoco.MjModel``; None for a USD file.
+    """
+    if reference is None:
+        arrays = {field: getattr(builder, field) for field in _IMPORTED}
+        joints, actuators, mass = builder.joint_count, 0, float(sum(builder.body_mass))
+    else:
+        moments = [inertia(reference, body) for body in range(reference.nbody)]
+        arrays = {field: getattr(reference, field) for field in _COMPILED}
+        arrays |= {"inertia": moments, "gravity": gravity(reference)}
+        joints, actuators, mass = reference.njnt, reference.nu, float(reference.body_mass.sum())
+    return RobotModel("", _digest(arrays), float(f"{mass:.6g}"), int(joints), int(actuators))
+
+
+def _digest(arrays: dict[str, Any]) -> str:
+    hashed = hashlib.sha256()
+    for field, values in sorted(arrays.items()):
+        numbers = (
+            np.array([list(each) if hasattr(each, "__len__") else each for each in values], np.float64).ravel() + 0.0
+        )
+        hashed.update(f"{field} {' '.join(f'{number:.{DIGITS}g}' for number in numbers)}\n".encode())
+    return hashed.hexdigest()
