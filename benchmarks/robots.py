@@ -118,7 +118,7 @@ def measure(name: str, path: Path) -> Row:
             name, "refused", str(error).replace(str(path), path.name).removeprefix("robot: ").partition("; change")[0]
         )
     state = "corrected" if reading.corrected else "as it is"
-    twins = Twins(reading.reference, reading.builder)
+    twins = Twins(reading.reference.model, reading.builder)
     there, here = twins.free_of_contacts()
     row = Row(name, state, "; ".join(map(str, reading.corrected[:1])), there.nv)
     controls = np.random.default_rng(1).uniform(-0.3, 0.3, there.nu)

@@ -98,6 +98,7 @@ ENTRIES = (
         _HERE,
         "List the installed tasks, or all terms and numbers of one task.",
     ),
+    Entry("robot", "robot", _HERE, "Show a robot's file as a task would load it, beside MuJoCo's own reading."),
     Entry("tracks", "tracks", _SHARED, "Manage the racer's tracks: list, show, make, import. Tracks are immutable."),
     Entry(
         "league",

@@ -73,6 +73,11 @@ class Robot:
         for name, value, count in (("position", self.position, 3), ("rotation", self.rotation, 4)):
             if value is not None and (len(value) != count or not all(map(math.isfinite, value))):
                 raise ValueError(f"Robot {self.name}: {name} is {value!r}; give {count} finite numbers")
+        for name in ("joint_positions", "armature", "friction_loss", "viscous_damping"):
+            value = getattr(self, name)
+            for number in value.values() if isinstance(value, Mapping) else [] if value is None else [value]:
+                if not math.isfinite(number):
+                    raise ValueError(f"Robot {self.name}: {name} is {value!r}; give finite numbers")
 
     def add_to(self, builder: newton.ModelBuilder) -> robot_reading.Reading:
         """Add the robot to a builder that holds one world.

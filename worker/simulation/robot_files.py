@@ -50,6 +50,8 @@ def read(file: str | Path) -> RobotFile:
             it names is missing.
     """
     text = str(file)
+    if not text.strip():
+        raise ValueError("a robot needs a file: a path, package:NAME/path, newton:NAME, or the text of one")
     if text.lstrip().startswith("<"):
         source, kind = text, _kind_of_xml(text, "the robot's XML")
     else:
@@ -143,22 +145,36 @@ def parse_mjcf(source: str, shown: str) -> Any:
     Raises:
         ValueError: MuJoCo can't parse it.
     """
-    parse = mujoco.MjSpec.from_string if source.lstrip().startswith("<") else mujoco.MjSpec.from_file
+    is_text = source.lstrip().startswith("<")
     try:
-        with quiet():
-            return parse(source)
+        with quiet() as warned:
+            spec = (mujoco.MjSpec.from_string if is_text else mujoco.MjSpec.from_file)(source)
     except ValueError as error:
         raise ValueError(f"{shown}: {' '.join(str(error).split())}") from error
+    if any("NaN" in text for text in warned):
+        raise ValueError(
+            f"{shown}: {_not_a_number(source if is_text else _text_of(Path(source), shown))}; give it a number"
+        )
+    return spec
+
+
+def _not_a_number(text: str) -> str:
+    for element in ElementTree.fromstring(text).iter():
+        for name, value in element.attrib.items():
+            if "nan" in value.lower().split():
+                return f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}> is not a number"
+    return "a value of a file that it includes is not a number"
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Keep MuJoCo's parser and compiler from printing: what they warn of is checked here."""
-    mujoco.set_mju_user_warning(lambda _: None)
+def quiet() -> Iterator[list[str]]:
+    """Keep MuJoCo's parser and compiler from printing, and yield what they warn of."""
+    warned: list[str] = []
+    mujoco.set_mju_user_warning(warned.append)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            yield warned
     finally:
         mujoco.set_mju_user_warning(None)
 

@@ -133,9 +133,8 @@ def _bodies(twins: Twins) -> Iterator[Difference]:
         if twins.bodies.get(parent) != above:
             yield Difference(element, "parent", twins.built_body(above), twins.name("body", parent))
         yield from _fields(twins, "body", body, twin, "mass gravcomp")
-        scale = max(1e-15, float(np.abs(file.body_inertia[body]).max()))
-        yield from _unequal(element, "inertia", inertia(built, twin), inertia(file, body), scale)
         if file.body_mass[body]:
+            yield from _unequal(element, "inertia", inertia(built, twin), inertia(file, body), 1e-15)
             yield from _unequal(element, "centre of mass", built.body_ipos[twin], file.body_ipos[body], size)
         yield from _unequal(element, "pos", built.body_pos[root], file.body_pos[body], size)
         yield from _unequal(element, "orientation", matrix(built.body_quat[root]), matrix(file.body_quat[body]), 1.0)

@@ -24,6 +24,7 @@ from worker.simulation.carriers import keep_inertias
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
 from worker.simulation.robot_judge import Comparison, Difference
+from worker.simulation.robot_reference import Reference
 from worker.simulation.robot_view import actuator_value
 
 RAW_SOLREF = 1
@@ -68,14 +69,14 @@ class Reading:
 
     Attributes:
         builder: Holds the robot alone, with the actuators of its file, whose inputs are the controls.
-        reference: MuJoCo's compiled model, ``mujoco.MjModel``; None for a USD file.
+        reference: MuJoCo's compiled model of the file; None for a USD file.
         corrected: What Newton's importer had read otherwise, and is right now.
         notes: What else a user should know of it, one sentence each.
         identity: By which a policy knows the robot again.
     """
 
     builder: newton.ModelBuilder
-    reference: Any
+    reference: Reference | None
     corrected: tuple[Difference, ...]
     notes: tuple[str, ...]
     identity: RobotModel
@@ -138,7 +139,7 @@ def read(source: Source) -> Reading:
     if found.differences:
         raise AnotherRobot(name, found.differences)
     notes = (*reference.notes, *found.notes)
-    return Reading(builder, model, corrected, notes, identity(builder, model))
+    return Reading(builder, reference, corrected, notes, identity(builder, model))
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:

@@ -13,7 +13,7 @@ import numpy as np
 
 from shared_store.wording import nearest
 from worker.simulation import robot_files
-from worker.simulation.robot_elements import name_of
+from worker.simulation.robot_elements import name_of, word_of
 from worker.simulation.robot_files import RobotFile
 
 
@@ -24,10 +24,12 @@ class Reference:
     Attributes:
         model: ``mujoco.MjModel``.
         notes: What MuJoCo had to correct, one sentence each.
+        sensors: Name and kind of each of the file's own sensors, which nothing here reads.
     """
 
     model: Any
     notes: tuple[str, ...] = ()
+    sensors: tuple[tuple[str, str], ...] = ()
 
 
 def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str], shown: str) -> Reference:
@@ -44,8 +46,9 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     """
     notes: list[str] = []
     spec = _urdf_spec(file, shown, notes) if file.format == "urdf" else robot_files.parse_mjcf(file.source, shown)
+    sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
     for sensor in spec.sensors:
-        spec.delete(sensor)  # MuJoCo's sensors are not used here, and some files name places that do not exist
+        spec.delete(sensor)  # some name places that do not exist
     for element in (*spec.geoms, *spec.sites):
         if any(re.match(pattern, element.name) for pattern in ignored):
             spec.delete(element)
@@ -55,9 +58,11 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
                 spec.delete(joint)
             if not fixed:
                 body.add_freejoint()
+    if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
+        notes.append("the file asks for the solver PGS, which MuJoCo-Warp lacks: worlds use Newton's method")
     model = _compiled(spec, shown, notes)
     _check_numbers(model, shown)
-    return Reference(model, tuple(notes))
+    return Reference(model, tuple(notes), sensors)
 
 
 def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
@@ -150,6 +155,7 @@ URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "plan
 def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> Any:
     """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals."""
     root = robot_files.urdf_root(file.source, shown)
+    _check_tree(root, shown)
     for joint in root.iter("joint"):
         _check_urdf_joint(joint, shown, notes)
     for link in root.iter("link"):
@@ -176,6 +182,20 @@ def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> Any:
     spec = robot_files.parse_mjcf(ElementTree.tostring(root, encoding="unicode"), shown)
     _add_mimics(spec, root)
     return spec
+
+
+def _check_tree(root: ElementTree.Element, shown: str) -> None:
+    """Refuse closed loops: links are the bodies of a tree."""
+    above: dict[str, str] = {}
+    for joint in root.findall("joint"):
+        child = joint.find("child")
+        link = child.get("link", "") if child is not None else ""
+        if link in above:
+            raise ValueError(
+                f"{shown}: link {link} closes a loop: the joints {above[link]} and {joint.get('name')} both move it; leave out one "
+                "of them, or use MJCF, whose <equality> can hold the two ends together"
+            )
+        above[link] = joint.get("name", "")
 
 
 def _check_urdf_joint(joint: ElementTree.Element, shown: str, notes: list[str]) -> None:

@@ -68,6 +68,8 @@ def _joints(stage: Any, prims: list[Any], builder: newton.ModelBuilder) -> Itera
         bodies = {
             str(path) for relation in (joint.GetBody0Rel(), joint.GetBody1Rel()) for path in relation.GetTargets()
         }
+        if builder.joint_articulation[index] < 0:
+            yield f"joint {prim.GetName()} closes a loop, which USD's joints can't here"
         child = builder.body_label[builder.joint_child[index]]
         if bodies and child not in bodies:
             yield f"joint {prim.GetName()} moves {child.rpartition('/')[2]}, in the file one of {some(sorted(bodies))}"

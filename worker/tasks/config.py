@@ -33,6 +33,7 @@ def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
+Substeps = Annotated[int, Field(ge=1, le=1000)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Range = Annotated[tuple[Finite, Finite], Field(strict=False), AfterValidator(_ordered), expecting("[least, greatest]")]
@@ -161,7 +162,7 @@ class _Common:
 
     control_hz: Positive = 60.0
     """Control steps per simulated second [Hz]."""
-    substeps: Count = 2
+    substeps: Substeps = 2
     """Physics steps of one control step."""
     episode_seconds: Positive = 10.0
     """Simulated time after which the clock ends an episode [s]."""

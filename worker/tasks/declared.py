@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -127,6 +127,19 @@ class DeclaredTask(Task):
             reading = dataclasses.replace(entity, name=name).add_to(builder)
         if isinstance(reading, Reading):
             self.readings = {**self.readings, name: reading}
+
+    def notes(self) -> Sequence[str]:
+        """What a user should know of its robots, one sentence each."""
+        lines = []
+        for name, reading in self.readings.items():
+            if reading.corrected:
+                count, first = len(reading.corrected), reading.corrected[0]
+                lines.append(
+                    f"{name}: built as MuJoCo reads its file; Newton's importer differs in {count} values, first in {first.field} of "
+                    f"{first.element}"
+                )
+            lines += [f"{name}: {note}" for note in (*reading.notes, *self.views[name].beyond_limits())]
+        return lines
 
     def stands_on(self) -> bool | Terrain:
         """The result of :meth:`terrain`, or whether there is a plane."""

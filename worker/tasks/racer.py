@@ -100,13 +100,14 @@ class Racer(DeclaredTask):
             self.sensors["race"].follow(self.sensors["car"].arrays)
 
     def notes(self) -> list[str]:
-        """The place where a learner's reward function runs (device or host), and the reason."""
+        """Notes of the robot, and the place where a learner's reward function runs (device or host) with the reason."""
+        notes = [*super().notes()]
         if self.race is None:
-            return []
+            return notes
         if not self.race.reason:
-            return [f"{self.race.reward.file}: compiled to the device", *self.race.notes]
+            return [*notes, f"{self.race.reward.file}: compiled to the device", *self.race.notes]
         graph = "; a step is no part of a CUDA graph" if self.device.startswith("cuda") else ""
-        return [f"{self.race.reason}{graph}"]
+        return [*notes, f"{self.race.reason}{graph}"]
 
     def failures(self) -> dict[str, tuple[int, int]]:
         """The calls of a learner's reward function that returned no reward."""

@@ -113,9 +113,9 @@ def checkpoint(task: Any, **facts: Any) -> Any:
 
 def test_a_checkpoint_whose_task_changed_is_refused_with_the_change(sliders: Sliders) -> None:
     then = checkpoint(sliders, contract=published(sliders).document())
-    check_contract(then, sliders)
+    check_contract(then, sliders, {})
     with pytest.raises(UserError) as caught:
-        check_contract(then, Other(SlidersConfig(), 1))
+        check_contract(then, Other(SlidersConfig(), 1), {})
     said = str(caught.value)
     assert said.startswith(
         "checkpoint 00000004-e1 does not fit task Sliders as it is now: observation 0: place/first_place scale 2.0 became 1.0; "
@@ -124,18 +124,18 @@ def test_a_checkpoint_whose_task_changed_is_refused_with_the_change(sliders: Sli
 
 
 def test_of_a_checkpoint_without_a_contract_sizes_are_compared(sliders: Sliders) -> None:
-    check_contract(checkpoint(sliders), Other(SlidersConfig(), 1))
+    check_contract(checkpoint(sliders), Other(SlidersConfig(), 1), {})
     wider = checkpoint(sliders)
     wider.manifest["policy"]["groups"]["policy"] = [10]
     with pytest.raises(UserError, match=r"does not fit task Sliders as it is now: it had .*\(10,\).*, it has .*\(9,\)"):
-        check_contract(wider, sliders)
+        check_contract(wider, sliders, {})
 
 
 def test_a_damaged_contract_in_a_checkpoint_is_one_line(sliders: Sliders) -> None:
     document = published(sliders).document()
     del document["control_hz"]
     with pytest.raises(UserError, match=r"^checkpoint 00000004-e1: contract: control_hz is missing$"):
-        check_contract(checkpoint(sliders, contract=document), sliders)
+        check_contract(checkpoint(sliders, contract=document), sliders, {})
 
 
 def test_the_contract_of_a_task_is_the_same_each_time(sliders: Sliders) -> None:

@@ -1,0 +1,165 @@
+"""``muster robot``: a robot's file as it is loaded, beside MuJoCo's own reading."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import Console, echo, echo_json
+from orchestrator.domain.errors import ServerError, SpecError, UsageError
+
+_EXAMPLES = """Examples:  muster robot arm.urdf
+muster robot package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml -o go1.png
+muster robot humanoid.xml --compare --no-picture"""
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=_EXAMPLES)(robot)
+
+
+def robot(
+    file: Annotated[str, typer.Argument(help="An MJCF, URDF or USD file: a path, package:NAME/path, or newton:NAME.")],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="List every value that Newton's importer reads otherwise than MuJoCo.")
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Picture of the default pose; NAME.png by default.", show_default=False),
+    ] = None,
+    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Whether to draw it.")] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show a robot as a task would load it: joints, masses, actuators, a picture, and what its file would be read otherwise.
+
+    MuJoCo's compiled model judges the file. What Newton's importer reads otherwise is corrected; what can't be held is refused by name.
+    """
+    drawn = _picture(file, output, overwrite) if picture else None
+    if sys.stderr.isatty():
+        echo("importing the simulation, which takes some seconds …", err=True)
+    found = _ask_worker(file, drawn)
+    if as_json:
+        echo_json(found, indent=1)
+        raise typer.Exit(2 if "error" in found else 0)
+    if "error" in found:
+        if compare:
+            _print_differences("WOULD DIFFER", found["differences"])
+        raise SpecError(found["error"])
+    _print(found, compare)
+
+
+def _picture(file: str, output: Path | None, overwrite: bool) -> Path:
+    path = output or Path(re.sub(r"\W+", "-", Path(file.rpartition(":")[2]).stem) + ".png")
+    if path.suffix != ".png":
+        raise UsageError(f"-o {path}: a picture of a robot ends in .png")
+    if path.exists() and not overwrite:
+        raise UsageError(f"{path} exists; name another with -o, or add --overwrite or --no-picture")
+    return path
+
+
+def _ask_worker(file: str, picture: Path | None) -> dict[str, Any]:
+    """Ask a subprocess, since this package never imports the simulation. Raises ServerError if it can't answer."""
+    if find_spec("newton") is None:
+        raise ServerError("robots can't be read where no simulation is installed: pip install 'muster[worker]'")
+    command = [sys.executable, "-P", "-m", "worker.robot", file]
+    command += ["--picture", str(picture)] if picture else []
+    asked = subprocess.run(command, capture_output=True, text=True, check=False)
+    if asked.returncode not in (0, 2) or not asked.stdout.strip():
+        reason = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
+        raise ServerError(f"{file} can't be shown: {reason[-1]}")
+    found: dict[str, Any] = json.loads(asked.stdout.splitlines()[-1])
+    return found
+
+
+def _print(found: dict[str, Any], compare: bool) -> None:
+    root = "no free root" if found["fixed"] else "a free root"
+    echo(f"{found['file']}: {found['mass']:g} kg, {len(found['bodies'])} bodies, {len(found['joints'])} joints, {root}")
+    _table(
+        "JOINTS",
+        ("NAME", "KIND", "LIMITS [rad, m]", "DEFAULT", "STIFFNESS", "DAMPING", "ARMATURE", "EFFORT"),
+        [
+            (
+                each["name"],
+                each["kind"],
+                _range(each["lower"], each["upper"]),
+                f"{each['default']:.4g}",
+                f"{each['stiffness']:.4g}",
+                f"{each['damping']:.4g}",
+                f"{each['armature']:.4g}",
+                "" if each["effort_limit"] is None else f"{each['effort_limit']:.4g}",
+            )
+            for each in found["joints"]
+        ],
+    )
+    _table("BODIES", ("NAME", "MASS [kg]"), [(each["name"], f"{each['mass']:.6g}") for each in found["bodies"]])
+    _table(
+        "ACTUATORS",
+        ("NAME", "DRIVES", "GEAR", "GAIN", "BIAS", "DYNAMICS", "CONTROL"),
+        [
+            (
+                each["name"],
+                each["drives"],
+                f"{each['gear']:.4g}",
+                f"{each['gain']:.4g}",
+                " ".join(f"{number:.4g}" for number in each["bias"]),
+                each["dynamics"],
+                "" if each["control_range"] is None else _range(*each["control_range"]),
+            )
+            for each in found["actuators"]
+        ],
+    )
+    _table(
+        "SENSORS of the file (a task declares its own)",
+        ("NAME", "KIND"),
+        [(each["name"], each["kind"]) for each in found["sensors"]],
+    )
+    if found["corrected"] and not compare:
+        count, first = len(found["corrected"]), found["corrected"][0]
+        echo(
+            f"\ncorrected: {count} values that Newton's importer reads otherwise, such as {first['field']} of {first['element']} (--compare lists all)"
+        )
+    if compare:
+        _print_differences("CORRECTED", found["corrected"])
+    for note in found["notes"]:
+        echo(f"note: {note}")
+    if found.get("picture"):
+        echo(f"written: {found['picture']}")
+
+
+def _print_differences(title: str, differences: list[dict[str, str]]) -> None:
+    if not differences:
+        echo(f"\n{title}: nothing; Newton's importer and MuJoCo read the same robot")
+        return
+    rows = [(each["element"], each["field"], each["here"], each["file"]) for each in differences]
+    _table(title, ("ELEMENT", "VALUE", "NEWTON", "FILE (MUJOCO)"), rows)
+
+
+def _range(lower: float | None, upper: float | None) -> str:
+    return (
+        ""
+        if lower is None and upper is None
+        else " to ".join("-" if each is None else f"{each:.4g}" for each in (lower, upper))
+    )
+
+
+def _table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    if not rows:
+        return
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left", title_style="")
+    for column in columns:
+        table.add_column(Text(column), overflow="fold", no_wrap=column == "NAME")
+    for row in rows:
+        table.add_row(*row)
+    echo("")
+    Console(highlight=False).print(table)

@@ -1,0 +1,154 @@
+"""``python -m worker.robot FILE`` describes a robot's file as JSON. ``muster robot`` runs it, since it imports no simulation itself."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from worker.simulation.robot import Robot
+from worker.simulation.robot_reading import AnotherRobot, Reading
+from worker.simulation.robot_view import RobotView
+from worker.tasks.task import Task
+
+if TYPE_CHECKING:
+    from worker.simulation.robot_judge import Difference
+
+PICTURE = (960, 720)
+"""Width and height [px]."""
+
+
+def describe(file: str, robot: Robot, reading: Reading) -> dict[str, Any]:
+    """A robot in plain values: angles in radians, lengths in metres, masses in kilograms.
+
+    Args:
+        file: The file's name.
+        robot: The robot.
+        reading: How its file was read.
+    """
+    builder, view = reading.builder, RobotView(reading.builder, "")
+    reference = reading.reference
+    return {
+        "file": file,
+        "mass": reading.identity.mass,
+        "digest": reading.identity.digest,
+        "fixed": view.root_coordinate < 0,
+        "bodies": [
+            {"name": name, "mass": builder.body_mass[body]}
+            for name, body in zip(view.body_names, view.bodies, strict=True)
+        ],
+        "joints": [_joint(builder, view, joint) for joint in range(len(view.joint_names))],
+        "actuators": _actuators(reference.model) if reference else [],
+        "sensors": [{"name": name, "kind": kind} for name, kind in reference.sensors] if reference else [],
+        "sites": view.site_names,
+        "corrected": [_difference(each) for each in reading.corrected],
+        "notes": [*reading.notes, *view.beyond_limits()],
+    }
+
+
+def _joint(builder: newton.ModelBuilder, view: RobotView, joint: int) -> dict[str, Any]:
+    dof = view.dofs[joint]
+    lower, upper = (limit if math.isfinite(limit) else None for limit in view.ranges[joint])
+    return {
+        "name": view.joint_names[joint],
+        "kind": "slide" if _is_linear(builder, dof) else "hinge",
+        "lower": lower,
+        "upper": upper,
+        "default": view.defaults[joint],
+        "stiffness": builder.joint_stiffness[dof],
+        "damping": builder.joint_damping[dof],
+        "armature": builder.joint_armature[dof],
+        "friction_loss": builder.joint_friction[dof],
+        "effort_limit": view.efforts[joint] if math.isfinite(view.efforts[joint]) else None,
+    }
+
+
+def _is_linear(builder: newton.ModelBuilder, dof: int) -> bool:
+    joint = max(index for index, start in enumerate(builder.joint_qd_start[: builder.joint_count]) if start <= dof)
+    return dof - builder.joint_qd_start[joint] < builder.joint_dof_dim[joint][0]
+
+
+def _actuators(model: Any) -> list[dict[str, Any]]:
+    import mujoco
+
+    from worker.simulation.robot_elements import kind_of, name_of, word_of
+
+    found = []
+    for actuator in range(model.nu):
+        kind = word_of(mujoco.mjtTrn, model.actuator_trntype[actuator])
+        target = {"jointinparent": "joint", "slidercrank": "site"}.get(kind, kind)
+        limited = bool(model.actuator_ctrllimited[actuator])
+        found.append(
+            {
+                "name": name_of(model, kind_of("actuator"), actuator),
+                "drives": f"{kind} {name_of(model, kind_of(target), int(model.actuator_trnid[actuator, 0]))}",
+                "gear": float(model.actuator_gear[actuator, 0]),
+                "gain": float(model.actuator_gainprm[actuator, 0]),
+                "bias": [float(each) for each in model.actuator_biasprm[actuator, :3]],
+                "dynamics": word_of(mujoco.mjtDyn, model.actuator_dyntype[actuator]),
+                "control_range": [float(each) for each in model.actuator_ctrlrange[actuator]] if limited else None,
+            }
+        )
+    return found
+
+
+def _difference(difference: Difference) -> dict[str, str]:
+    from worker.simulation.robot_values import shown_value
+
+    return {
+        "element": difference.element,
+        "field": difference.field,
+        "here": shown_value(difference.built),
+        "file": shown_value(difference.file),
+    }
+
+
+def draw(robot: Robot, path: Path) -> None:
+    """Draw a robot in its default pose. Raises UserError if the file can't be written."""
+    from worker.tasks.config import TaskConfig
+    from worker.telemetry import picture
+    from worker.telemetry.stage import Stage
+
+    class Alone(Task):
+        def build(self, builder: newton.ModelBuilder) -> None:
+            robot.add_to(builder)
+
+    stage = Stage(Alone, TaskConfig(), 1)
+    image = picture.Camera(stage, *PICTURE).take(np.array([stage.model.joint_q.numpy()]))
+    picture.write(path, picture.encode([image], ".png", 1.0))
+
+
+def main() -> int:
+    """Returns the exit code: 2 for a file that is refused."""
+    parser = argparse.ArgumentParser(prog="python -m worker.robot", description=__doc__)
+    parser.add_argument("file", help="as Robot's: a path, package:NAME/path, newton:NAME")
+    parser.add_argument("--picture", type=Path, help="draw the robot in its default pose into this PNG file")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    warnings.simplefilter("ignore")
+    robot = Robot(options.file, passive=True)
+    try:
+        reading = robot.read()
+    except ValueError as error:
+        another = error.__cause__ if isinstance(error.__cause__, AnotherRobot) else None
+        refused = [_difference(each) for each in another.differences] if another else []
+        print(json.dumps({"file": options.file, "error": str(error).removeprefix("robot: "), "differences": refused}))
+        return 2
+    described = describe(options.file, robot, reading)
+    if options.picture:
+        draw(robot, options.picture)
+        described["picture"] = str(options.picture)
+    print(json.dumps(described))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
