@@ -213,7 +213,7 @@ def _add_mimics(spec: Any, root: ElementTree.Element) -> None:
     for joint in root.iter("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
-            data = [float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0)), *[0.0] * 9]
+            data = [float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0)), *[0.0] * 10]
             spec.add_equality(
                 type=mujoco.mjtEq.mjEQ_JOINT,
                 objtype=mujoco.mjtObj.mjOBJ_JOINT,

@@ -55,24 +55,24 @@ def _bodies(stage: Any, prims: list[Any], builder: newton.ModelBuilder) -> Itera
 
 def _joints(stage: Any, prims: list[Any], builder: newton.ModelBuilder) -> Iterator[str]:
     built = {label: index for index, label in enumerate(builder.joint_label)}
+    moved = {builder.body_label[child] for child in builder.joint_child}
     metres = UsdGeom.GetStageMetersPerUnit(stage)
     for prim in prims:
         joint = UsdPhysics.Joint(prim)
         if not joint or not joint.GetJointEnabledAttr().Get() or joint.GetExcludeFromArticulationAttr().Get():
             continue
         index = built.get(str(prim.GetPath()))
+        ends = {str(path) for each in (joint.GetBody0Rel(), joint.GetBody1Rel()) for path in each.GetTargets()}
+        is_loop = ends <= moved if index is None else builder.joint_articulation[index] < 0
+        if is_loop and len(ends) == 2:
+            yield f"joint {prim.GetName()} closes a loop, and joints make a tree here"
+        elif index is None and not prim.IsA(UsdPhysics.FixedJoint):  # one to the world is the root of a fixed robot
+            yield f"joint {prim.GetName()} is missing"
         if index is None:
-            if not prim.IsA(UsdPhysics.FixedJoint):  # one to the world is the root of a fixed robot
-                yield f"joint {prim.GetName()} is missing"
             continue
-        bodies = {
-            str(path) for relation in (joint.GetBody0Rel(), joint.GetBody1Rel()) for path in relation.GetTargets()
-        }
-        if builder.joint_articulation[index] < 0:
-            yield f"joint {prim.GetName()} closes a loop, which USD's joints can't here"
         child = builder.body_label[builder.joint_child[index]]
-        if bodies and child not in bodies:
-            yield f"joint {prim.GetName()} moves {child.rpartition('/')[2]}, in the file one of {some(sorted(bodies))}"
+        if ends and child not in ends:
+            yield f"joint {prim.GetName()} moves {child.rpartition('/')[2]}, in the file one of {some(sorted(ends))}"
         for kind, unit in ((UsdPhysics.RevoluteJoint, math.pi / 180.0), (UsdPhysics.PrismaticJoint, metres)):
             if prim.IsA(kind):
                 yield from _limits(kind(prim), unit, builder, index)

@@ -124,11 +124,30 @@ def test_a_checkpoint_whose_task_changed_is_refused_with_the_change(sliders: Sli
 
 
 def test_of_a_checkpoint_without_a_contract_sizes_are_compared(sliders: Sliders) -> None:
-    check_contract(checkpoint(sliders), Other(SlidersConfig(), 1), {})
+    accepted = {"accept_changed_robot": True}  # that the file's gravity counts by now
+    check_contract(checkpoint(sliders), Other(SlidersConfig(), 1), accepted)
     wider = checkpoint(sliders)
     wider.manifest["policy"]["groups"]["policy"] = [10]
     with pytest.raises(UserError, match=r"does not fit task Sliders as it is now: it had .*\(10,\).*, it has .*\(9,\)"):
-        check_contract(wider, sliders, {})
+        check_contract(wider, sliders, accepted)
+
+
+def test_a_policy_of_another_robot_is_refused_unless_it_is_accepted(sliders: Sliders, capsys: Any) -> None:
+    document = published(sliders).document()
+    document["robots"][0] |= {"digest": "0" * 64, "mass": 21.18}
+    then = checkpoint(sliders, contract=document)
+    words = r"was trained on another robot than the file gives now: robot: mass \[kg\] 21.18 became .*add --accept-changed-robot"
+    with pytest.raises(UserError, match=words):
+        check_contract(then, sliders, {})
+    check_contract(then, sliders, {"accept_changed_robot": True})
+    assert "warning: checkpoint 00000004-e1 was trained on another robot" in capsys.readouterr().out
+
+
+def test_a_policy_of_an_older_muster_was_trained_on_what_newton_s_importer_read(sliders: Sliders) -> None:
+    document = published(sliders).document()
+    del document["robots"]
+    with pytest.raises(UserError, match=r"robot: option: gravity was .*, is \(0 0 0\)"):
+        check_contract(checkpoint(sliders, contract=document | {"format": 3}), sliders, {})
 
 
 def test_a_damaged_contract_in_a_checkpoint_is_one_line(sliders: Sliders) -> None:
