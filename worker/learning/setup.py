@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -28,7 +28,7 @@ from worker.tasks.policy_contract import policy_contract, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
-    from worker.simulation.robot_reading import Reading
+    from worker.simulation.robot_judge import Difference
     from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
@@ -202,7 +202,11 @@ def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool)
     if then is not None and then.robots:
         lines = robot_changes(then, policy_contract(task, then.task))
     else:
-        lines = [f"{name}: {_before(reading)}" for name, reading in task.readings.items() if reading.corrected]
+        changed = {
+            name: [each for each in reading.corrected if not each.is_rounding]
+            for name, reading in task.readings.items()
+        }
+        lines = [f"{name}: {_before(differences)}" for name, differences in changed.items() if differences]
     if not lines:
         return ""
     what = f"{whose} was trained on another robot than the file gives now: {brief(lines)}"
@@ -213,8 +217,8 @@ def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool)
     return what
 
 
-def _before(reading: Reading) -> str:
-    first, more = reading.corrected[0], len(reading.corrected) - 1
+def _before(found: Sequence[Difference]) -> str:
+    first, more = found[0], len(found) - 1
     was, is_now = shown_value(first.built), shown_value(first.file)
     return f"{first.element}: {first.field} was {was}, is {is_now}" + (f" ({more} more)" if more else "")
 

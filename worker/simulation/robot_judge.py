@@ -28,6 +28,8 @@ from worker.simulation.robot_values import (
 
 RELATIVE = 1e-6
 """Two values are equal up to this share of the greater one: Newton computes in float32."""
+ROUNDING = 1e-4
+"""Up to this share of the greater one, a difference is of no consequence to a policy."""
 ACCELERATION = 1e-3
 """Accelerations in the same state are equal up to this share of the greatest one."""
 ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY")
@@ -68,6 +70,17 @@ class Difference:
     field: str
     built: Any
     file: Any
+
+    @property
+    def is_rounding(self) -> bool:
+        """Whether the values are equal but for the last of a float's digits, so that no policy would notice."""
+        built, file = (
+            None if isinstance(value, str | bool) else np.asarray(value, np.float64)
+            for value in (self.built, self.file)
+        )
+        if built is None or file is None or built.shape != file.shape:
+            return False
+        return bool(np.allclose(built, file, rtol=0.0, atol=ROUNDING * np.abs(file).max(initial=0.0)))
 
     def __str__(self) -> str:
         return f"{self.element}: {self.field} is {shown_value(self.built)}, in the file {shown_value(self.file)}"

@@ -28,6 +28,12 @@ def check(path: str, builder: newton.ModelBuilder, shown: str) -> None:
     """
     stage = Usd.Stage.Open(path)
     prims = list(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
+    joints = [prim for prim in prims if prim.IsA(UsdPhysics.Joint)]
+    if joints and not any(prim.HasAPI(UsdPhysics.ArticulationRootAPI) for prim in prims):
+        raise ValueError(
+            f"{shown}: its joints ({some([prim.GetName() for prim in joints])}) belong to no articulation; apply "
+            "PhysicsArticulationRootAPI to the prim above the robot"
+        )
     found = [*_bodies(stage, prims, builder), *_joints(stage, prims, builder)]
     if found:
         raise ValueError(
