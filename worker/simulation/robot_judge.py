@@ -42,6 +42,8 @@ COUNTS = {
     "tendons": "ntendon",
     "equalities": "neq",
     "contact pairs": "npair",
+    "flexible bodies": "nflex",
+    "plugins": "nplugin",
 }
 """What is counted, and its field of ``mujoco.MjModel``."""
 TENDON = (
@@ -182,9 +184,12 @@ def _joints(twins: Twins) -> Iterator[Difference]:
 
 def _geoms(twins: Twins) -> Iterator[Difference]:
     file, built = twins.file, twins.built
-    for geom in range(file.ngeom):
-        if geom not in twins.geoms and (file.geom_contype[geom] or file.geom_conaffinity[geom]):
+    for geom in set(range(file.ngeom)) - set(twins.geoms):
+        if file.geom_contype[geom] or file.geom_conaffinity[geom]:
             yield Difference(twins.name("geom", geom), "existence", "missing", "there")
+        yield from _unequal(
+            twins.name("geom", geom), "fluid", np.zeros_like(file.geom_fluid[geom]), file.geom_fluid[geom]
+        )
     for geom, twin in twins.geoms.items():
         element = twins.name("geom", geom)
         kind, other = (word_of(mujoco.mjtGeom, model.geom_type[each]) for model, each in ((file, geom), (built, twin)))
@@ -257,7 +262,7 @@ def _equalities(twins: Twins) -> Iterator[Difference]:
 def _options(twins: Twins) -> Iterator[Difference]:
     file, built = twins.file.opt, twins.built.opt
     yield from _unequal("option", "gravity", gravity(twins.built), gravity(twins.file))
-    for name in ("wind", "magnetic", "density", "viscosity", "impratio", "cone"):
+    for name in ("wind", "density", "viscosity", "impratio", "cone"):
         yield from _unequal("option", name, getattr(built, name), getattr(file, name))
     for kind, name in ((mujoco.mjtDisableBit, "disableflags"), (mujoco.mjtEnableBit, "enableflags")):
         mine, theirs = int(getattr(built, name)), int(getattr(file, name))

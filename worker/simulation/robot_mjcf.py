@@ -6,7 +6,6 @@ elements and of their meaning: MuJoCo's XML reference.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from typing import Any
 from xml.etree import ElementTree
 
@@ -14,66 +13,69 @@ import mujoco
 import numpy as np
 
 from worker.simulation import carriers
-from worker.simulation.robot_elements import name_of
+from worker.simulation.robot_elements import kind_of, name_of, word_of
 
 Element = ElementTree.Element
 
 
-class _Words(dict[int, str]):
-    """The words of MJCF for the values of one of MuJoCo's enumerations.
+class _Words:
+    """The words of MJCF for values of one of MuJoCo's enumerations, as far as Newton's models have them."""
 
-    Raises:
-        ValueError: At a value that Newton can't hold.
-    """
+    def __init__(self, kind: Any, words: str) -> None:
+        self._kind = kind
+        prefix = next(iter(kind.__members__)).partition("_")[0]
+        self._words = {int(kind.__members__[f"{prefix}_{word.upper()}"]): word for word in words.split()}
 
-    def __init__(self, words: dict[int, str], kind: Any) -> None:
-        super().__init__(words)
-        self.kind = kind
-
-    def __missing__(self, value: int) -> str:
-        raise ValueError(
-            f"Newton's models have nothing of the kind {self.kind(value).name.rpartition('_')[2].lower()!r}"
-        )
-
-
-def _names(kind: Any, words: str) -> _Words:
-    prefix = next(iter(kind.__members__)).partition("_")[0]
-    return _Words({int(kind.__members__[f"{prefix}_{word.upper()}"]): word for word in words.split()}, kind)
+    def of(self, value: Any, element: str) -> str:
+        """The word of a value of an element. Raises ValueError, with the element's name, where Newton has nothing of the kind."""
+        if int(value) not in self._words:
+            raise ValueError(
+                f"{element} is of the kind {word_of(self._kind, value)!r}, which Newton's models don't have"
+            )
+        return self._words[int(value)]
 
 
-_GEOM_TYPES = _names(mujoco.mjtGeom, "plane hfield sphere capsule ellipsoid cylinder box mesh")
-_JOINT_TYPES = _names(mujoco.mjtJoint, "free ball slide hinge")
-_WRAP_TYPES = _names(mujoco.mjtWrap, "joint pulley site sphere cylinder")
-_EQUALITY_TYPES = _names(mujoco.mjtEq, "connect weld joint tendon")
-_TRANSMISSIONS = _names(mujoco.mjtTrn, "joint jointinparent slidercrank tendon site body")
-_DYNAMICS = _names(mujoco.mjtDyn, "none integrator filter filterexact muscle user")
-_INTEGRATORS = _names(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast")
-_CONES = _names(mujoco.mjtCone, "pyramidal elliptic")
-_GAINS = _names(mujoco.mjtGain, "fixed affine muscle user")
-_BIASES = _names(mujoco.mjtBias, "none affine muscle user")
+_GEOM_TYPES = _Words(mujoco.mjtGeom, "plane hfield sphere capsule ellipsoid cylinder box mesh")
+_JOINT_TYPES = _Words(mujoco.mjtJoint, "free ball slide hinge")
+_WRAP_TYPES = _Words(mujoco.mjtWrap, "joint pulley site sphere cylinder")
+_EQUALITY_TYPES = _Words(mujoco.mjtEq, "connect weld joint tendon")
+_TRANSMISSIONS = _Words(mujoco.mjtTrn, "joint jointinparent slidercrank tendon site body")
+_DYNAMICS = _Words(mujoco.mjtDyn, "none integrator filter filterexact muscle user")
+_INTEGRATORS = _Words(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast")
+_CONES = _Words(mujoco.mjtCone, "pyramidal elliptic")
+_GAINS = _Words(mujoco.mjtGain, "fixed affine muscle user")
+_BIASES = _Words(mujoco.mjtBias, "none affine muscle user")
 
 
-def write(model: Any, stacked: Iterable[int] = ()) -> str:
+def write(model: Any) -> str:
     """Write a compiled model as MJCF.
+
+    Of several joints of a body all but the last move carriers (:mod:`worker.simulation.carriers`), so that each keeps its own place,
+    its order and its part in a tendon.
 
     Args:
         model: The compiled model, ``mujoco.MjModel``.
-        stacked: Bodies of several joints that Newton can't hold as one joint. Each of their joints but the last moves a carrier (:mod:`worker.simulation.carriers`).
 
     Returns:
         The XML. Angles are in radians, and each number is written with all its digits.
+
+    Raises:
+        ValueError: An element is of a kind that Newton's models don't have.
     """
-    return _Writer(model, frozenset(stacked)).write()
+    return _Writer(model).write()
 
 
 class _Writer:
-    def __init__(self, model: Any, stacked: frozenset[int]) -> None:
+    def __init__(self, model: Any) -> None:
         self.model = model
-        self.stacked = stacked
         self.bodies: dict[int, Element] = {}
 
     def name(self, kind: str, index: int) -> str:
-        return name_of(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), int(index))
+        return name_of(self.model, kind_of(kind), int(index))
+
+    def word(self, words: _Words, values: Any, kind: str, index: int) -> str:
+        """The word for the value of an element of some kind."""
+        return words.of(values[index], f"{kind} {self.name(kind, index)}")
 
     def write(self) -> str:
         root = Element("mujoco", model="robot")
@@ -92,38 +94,32 @@ class _Writer:
         for site in range(self.model.nsite):
             self._write_site(site)
         self._write_contacts(_add(root, "contact"))
-        self._write_section(root, "tendon", self.model.ntendon, self._write_tendon)
-        self._write_section(root, "equality", self.model.neq, self._write_equality)
-        self._write_section(root, "actuator", self.model.nu, self._write_actuator)
+        tendons, equalities, actuators = (_add(root, tag) for tag in ("tendon", "equality", "actuator"))
+        for tendon in range(self.model.ntendon):
+            self._write_tendon(tendons, tendon)
+        for equality in range(self.model.neq):
+            self._write_equality(equalities, equality)
+        for actuator in range(self.model.nu):
+            self._write_actuator(actuators, actuator)
         return ElementTree.tostring(root, encoding="unicode")
-
-    @staticmethod
-    def _write_section(root: Element, tag: str, count: int, write: Callable[[Element, int], None]) -> None:
-        section = _add(root, tag)
-        for index in range(count):
-            write(section, index)
 
     def _write_options(self, root: Element) -> None:
         options = self.model.opt
-        chosen = {"integrator": _INTEGRATORS[int(options.integrator)]} if options.integrator else {}
+        chosen = {"integrator": _INTEGRATORS.of(options.integrator, "option")} if options.integrator else {}
         if options.solver == int(mujoco.mjtSolver.mjSOL_CG):
             chosen["solver"] = "CG"
         element = _add(
             root,
             "option",
-            timestep=options.timestep,
             wind=options.wind,
-            magnetic=options.magnetic,
             density=options.density,
             viscosity=options.viscosity,
             impratio=options.impratio,
             tolerance=options.tolerance,
             ls_tolerance=options.ls_tolerance,
-            ccd_tolerance=options.ccd_tolerance,
             iterations=options.iterations,
             ls_iterations=options.ls_iterations,
-            ccd_iterations=options.ccd_iterations,
-            cone=_CONES[int(options.cone)],
+            cone=_CONES.of(options.cone, "option"),
             **chosen,
         )
         flags = {}
@@ -170,8 +166,7 @@ class _Writer:
         name = self.name("body", body)
         place: dict[str, Any] = {"pos": model.body_pos[body], "quat": model.body_quat[body]}
         joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-        carried = list(joints)[:-1] if body in self.stacked else []
-        for index, joint in enumerate(carried):
+        for index, joint in enumerate(joints[:-1]):
             parent = _add(parent, "body", name=f"{name}{carriers.MARK}{index}", **place)
             _add(parent, "inertial", pos=(0, 0, 0), mass=carriers.MASS, diaginertia=(carriers.INERTIA,) * 3)
             self._write_joint(parent, joint)
@@ -188,12 +183,12 @@ class _Writer:
                 mass=model.body_mass[body],
                 diaginertia=model.body_inertia[body],
             )
-        for joint in list(joints)[len(carried) :]:
+        for joint in joints[-1:]:
             self._write_joint(element, joint)
 
     def _write_joint(self, element: Element, joint: int) -> None:
         model = self.model
-        name, kind = self.name("joint", joint), _JOINT_TYPES[int(model.jnt_type[joint])]
+        name, kind = self.name("joint", joint), self.word(_JOINT_TYPES, model.jnt_type, "joint", joint)
         if kind == "free":
             _add(element, "freejoint", name=name)
             return
@@ -222,7 +217,7 @@ class _Writer:
 
     def _write_geom(self, geom: int) -> None:
         model = self.model
-        kind = _GEOM_TYPES[int(model.geom_type[geom])]
+        kind = self.word(_GEOM_TYPES, model.geom_type, "geom", geom)
         values: dict[str, Any] = {"size": model.geom_size[geom]}
         if kind in ("mesh", "hfield"):
             values = {kind: self.name(kind, model.geom_dataid[geom])}
@@ -251,7 +246,7 @@ class _Writer:
 
     def _write_site(self, site: int) -> None:
         model = self.model
-        kind = _GEOM_TYPES[int(model.site_type[site])]
+        kind = self.word(_GEOM_TYPES, model.site_type, "site", site)
         _add(
             self.bodies[int(model.site_bodyid[site])],
             "site",
@@ -280,8 +275,8 @@ class _Writer:
             )
         for signature in model.exclude_signature:
             self._exclude(section, int(signature) >> 16, int(signature) & 0xFFFF)
-        for body in self.stacked:
-            self._exclude_parents(section, body)
+        for body in np.flatnonzero(model.body_jntnum > 1):
+            self._exclude_parents(section, int(body))
 
     def _exclude_parents(self, section: Element, body: int) -> None:
         """Parents never touch children in MuJoCo: exclude those between which a carrier now stands."""
@@ -301,7 +296,9 @@ class _Writer:
         wraps = range(first, first + model.tendon_num[tendon])
         element = _add(
             section,
-            "fixed" if _WRAP_TYPES[int(model.wrap_type[first])] == "joint" else "spatial",
+            "fixed"
+            if _WRAP_TYPES.of(model.wrap_type[first], f"tendon {self.name('tendon', tendon)}") == "joint"
+            else "spatial",
             name=self.name("tendon", tendon),
             limited=bool(model.tendon_limited[tendon]),
             range=model.tendon_range[tendon],
@@ -323,7 +320,7 @@ class _Writer:
 
     def _write_wrap(self, element: Element, wrap: int) -> None:
         model = self.model
-        kind = _WRAP_TYPES[int(model.wrap_type[wrap])]
+        kind = _WRAP_TYPES.of(model.wrap_type[wrap], "tendon")
         index, number = model.wrap_objid[wrap], model.wrap_prm[wrap]
         if kind == "joint":
             _add(element, "joint", joint=self.name("joint", index), coef=number)
@@ -337,7 +334,7 @@ class _Writer:
 
     def _write_equality(self, section: Element, equality: int) -> None:
         model = self.model
-        tag, data = _EQUALITY_TYPES[int(model.eq_type[equality])], model.eq_data[equality]
+        tag, data = self.word(_EQUALITY_TYPES, model.eq_type, "equality", equality), model.eq_data[equality]
         values: dict[str, Any] = {}
         if tag in ("connect", "weld"):
             of = "site" if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE) else "body"
@@ -362,7 +359,7 @@ class _Writer:
 
     def _write_actuator(self, section: Element, actuator: int) -> None:
         model = self.model
-        transmission = _TRANSMISSIONS[int(model.actuator_trntype[actuator])]
+        transmission = self.word(_TRANSMISSIONS, model.actuator_trntype, "actuator", actuator)
         first, second = model.actuator_trnid[actuator]
         values: dict[str, Any]
         if transmission == "slidercrank":
@@ -383,9 +380,9 @@ class _Writer:
             "general",
             name=self.name("actuator", actuator),
             gear=model.actuator_gear[actuator],
-            dyntype=_DYNAMICS[int(model.actuator_dyntype[actuator])],
-            gaintype=_GAINS[int(model.actuator_gaintype[actuator])],
-            biastype=_BIASES[int(model.actuator_biastype[actuator])],
+            dyntype=self.word(_DYNAMICS, model.actuator_dyntype, "actuator", actuator),
+            gaintype=self.word(_GAINS, model.actuator_gaintype, "actuator", actuator),
+            biastype=self.word(_BIASES, model.actuator_biastype, "actuator", actuator),
             dynprm=model.actuator_dynprm[actuator],
             gainprm=model.actuator_gainprm[actuator],
             biasprm=model.actuator_biasprm[actuator],

@@ -134,7 +134,7 @@ def read(source: Source) -> Reading:
             _stiffen_limits(builder)
         found = _amended(source, builder, model, found)
     if found.differences:
-        builder = _imported(source, RobotFile(robot_mjcf.write(model, _stacks(model)), "mjcf", {}), None)
+        builder = _imported(source, RobotFile(_rewritten(model, name), "mjcf", {}), None)
         found = _amended(source, builder, model, _compared(source, builder, model))
     if found.differences:
         raise AnotherRobot(name, found.differences)
@@ -206,9 +206,11 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _stacks(model: Any) -> list[int]:
-    """Bodies of several joints: as separate joints each keeps its own place, its order and its part in a tendon."""
-    return [body for body in range(model.nbody) if model.body_jntnum[body] > 1]
+def _rewritten(model: Any, shown: str) -> str:
+    try:
+        return robot_mjcf.write(model)
+    except ValueError as error:
+        raise ValueError(f"{shown}: {error}") from error
 
 
 def _stiffen_limits(builder: newton.ModelBuilder) -> None:

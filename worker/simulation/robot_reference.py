@@ -103,6 +103,7 @@ _REMEDIES = (
         "give that body an <inertial> of a mass greater than 0, or a geom that has one; or fix it to its parent",
     ),
     ("negative", "give a value of 0 or more"),
+    ("only be used on top level", "leave that joint out, and let the root move freely: Robot(..., fixed=False)"),
 )
 """What to do, by a part of MuJoCo's message."""
 

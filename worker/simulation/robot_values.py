@@ -105,12 +105,12 @@ def move_joint(twins: Sequence[tuple[Any, Any, int]], amount: float, random: np.
 
     Args:
         twins: Model, data and the joint's index in each of them.
-        amount: Greatest displacement [m, rad] and velocity [m/s, rad/s].
+        amount: Greatest displacement [m, rad], and a tenth of the greatest velocity [m/s, rad/s].
         random: Draws them.
     """
     model, _, joint = twins[0]
     count = {0: 6, 1: 3}.get(int(model.jnt_type[joint]), 1)
-    moved, velocity = random.uniform(-amount, amount, count), random.uniform(-amount, amount, count)
+    moved, velocity = random.uniform(-amount, amount, count), 10.0 * random.uniform(-amount, amount, count)
     for model, data, joint in twins:
         coordinate, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
         data.qvel[dof : dof + count] = velocity
