@@ -32,7 +32,7 @@ from worker.tasks.declaration import Choice, Declaration
 from worker.tasks.functions import reads_poses
 from worker.tasks.interface import Interface
 from worker.tasks.numbers import flat
-from worker.tasks.plan import Plan
+from worker.tasks.plan import Plan, stacked
 from worker.tasks.task import Task
 from worker.tasks.torch_terms import TorchTerms
 
@@ -267,6 +267,13 @@ class DeclaredTask(Task):
     def _number(self, name: str) -> torch.Tensor:
         return self.numbers(name) if "." in name else super()._number(name)
 
+    @property
+    def checked_names(self) -> tuple[str, ...]:
+        """As :attr:`Task.checked_names`; those of further groups as ``critic.NAME``."""
+        groups = {group: self.plan.groups[group] for group in further(self.plan)}
+        others = (f"{group}.{name}" for group, terms in groups.items() for seen in terms for name in stacked(seen))
+        return (*self.observation_names, *others)
+
     def _noise(self) -> list[float]:
         """No noise from the randomizer: the kernels add the configured noise."""
         checked_interface(self)
@@ -380,8 +387,10 @@ class DeclaredTask(Task):
             inputs = [mode, self.max_episode_length, *rows, *self._common]
             wp.launch(self._kernels.observe, dim=self.world_count, inputs=inputs, device=self.device)
         wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
+        first = len(self.observation_names)
         for both in self._rows.values():
-            wp.launch(check_group, dim=self.world_count, inputs=[self._episodes.dones, *both], device=self.device)
+            wp.launch(check_group, dim=self.world_count, inputs=[first, self._episodes, *both], device=self.device)
+            first += both[0].shape[1]
         if self._camera:
             self._camera.render(mode)
 

@@ -20,6 +20,7 @@ from worker.simulation.episodes import (
     WATCHED,
     EpisodeArrays,
     check_observations,
+    mishap_causes,
     randomize_ages,
     read_mishap,
 )
@@ -298,7 +299,7 @@ class Task(Telling):
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
         """Decode a value of :attr:`mishap`: the index of the failed world in this task and the cause; None: no world failed."""
-        return None if code == NO_MISHAP else read_mishap(code, self.observation_names)
+        return None if code == NO_MISHAP else read_mishap(code, self._causes)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The state from which :meth:`load_state_dict` continues bit for bit (on the CPU), copied to host memory.
@@ -324,6 +325,11 @@ class Task(Telling):
         check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
+
+    @property
+    def checked_names(self) -> tuple[str, ...]:
+        """Names of the columns of all observation groups that must be finite, the policy's first."""
+        return self.observation_names
 
     def _noise(self) -> list[float]:
         """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
@@ -363,6 +369,8 @@ class Task(Telling):
         self._earlier_actions = buffer("earlier_actions", tuple(self.actions.shape), wp.float32)
         self._broken = buffer("broken", (count,), wp.int32)
         self.mishap = buffer("mishap", (1,), wp.int32)
+        self._causes = mishap_causes(self.reward_terms, self.checked_names)
+        self._episodes.causes_of_mishaps = len(self._causes)
         self._weights = buffer("weights", (len(self.reward_terms),), wp.float32)
         self._weights.copy_(torch.tensor(list(self.config.rewards.values())))
         self.level = buffer("level", (1,), wp.float32)

@@ -18,6 +18,7 @@ from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.support.refusals import refusal
+from tests.support.worker.declared import Sliders
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import run_ranks, training
@@ -29,6 +30,16 @@ from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import StopRequest, configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
+from worker.tasks import Adaptive
+
+
+class Climbing(Sliders):
+    """Sliders with an adaptive number that takes a step in every iteration once episodes have ended."""
+
+    def sections(self) -> dict[str, Any]:
+        rule = Adaptive("events.kick.speed", 0.75, 1.75, steps=9, above=-1e6, below=-2e6)
+        sections = super().sections()
+        return sections | {"curricula": sections["curricula"] | {"kicks": rule}}
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
@@ -121,6 +132,21 @@ def test_what_is_ordered_while_a_device_works_is_the_state_before_that_work(
         assert one.manifest["reward"] == other.manifest["reward"]
     stalls = [record["stall_seconds"] > 0 for record in read_metrics(Store(tmp_path).run("later"))]
     assert stalls == seen
+
+
+def test_a_checkpoint_that_is_ordered_late_names_the_adaptive_steps_of_its_own_iteration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next iteration, in which it is ordered as on a GPU, has moved the number before."""
+    monkeypatch.setattr(CudaGraphFunction, "can_be_captured", True)
+    name = f"{Climbing.__module__}:{Climbing.__qualname__}"
+    loop = train(training(tmp_path, iterations=4, every=1, worlds=2, task=name), task=Climbing)
+    assert loop.task.adapting is not None and loop.task.adapting.steps == {"kicks": 3.0}
+    for checkpoint in list_checkpoints(Store(tmp_path).run("run")):
+        worlds = torch.load(checkpoint.path / "rank-0.pt", weights_only=True)["worlds"]["state"]
+        begun, step = worlds["adaptive_numbers"][0].tolist()
+        assert (begun, step) == (checkpoint.iteration - 1, checkpoint.manifest["adaptive_steps"]["kicks"])
+        assert step == checkpoint.iteration - 1
 
 
 def test_a_chosen_checkpoint_is_gone_on_from(tmp_path: Path) -> None:
