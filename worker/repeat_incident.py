@@ -56,6 +56,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
         if own is not None and torch.allclose(state["world_factors"], own.cpu(), rtol=1e-5):
             state["world_factors"] = own.cpu()  # drawn anew, on another device with other last digits
         task.load_state_dict(state)
+    task.take_counts(content.get("others", {}))  # files of older versions have none
     task.begin_iteration(*content["began"])
     task.clear_statistics()
     return task, content

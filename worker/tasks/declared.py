@@ -34,6 +34,7 @@ from worker.tasks.interface import Interface
 from worker.tasks.numbers import flat
 from worker.tasks.plan import Plan, stacked
 from worker.tasks.task import Task
+from worker.tasks.terms.motion import RecordedMotion
 from worker.tasks.torch_terms import TorchTerms
 
 
@@ -132,6 +133,10 @@ class DeclaredTask(Task):
         """Take names from the terms."""
         plan = self.plan
         self.observation_names, self.action_names = plan.names, plan.actions
+        groups = {group: plan.groups[group] for group in further(plan)}
+        self.further_names = tuple(
+            f"{group}.{name}" for group, terms in groups.items() for seen in terms for name in stacked(seen)
+        )
         self.discrete = isinstance(self.declaration.actions, Choice)
         self.memory_size, self.lasting_size = plan.binder.memory, plan.binder.lasting
         metrics = {f"metric_{name}": term for name, term in self.declaration.metrics.items()}
@@ -182,6 +187,8 @@ class DeclaredTask(Task):
             name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
         }
         self._cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
+        motions = {name: sensor for name, sensor in self.sensors.items() if isinstance(sensor, RecordedMotion)}
+        self._samplings = {name: each.sampling for name, each in motions.items() if each.sampling.is_adaptive}
         self._movers = [sensor for sensor in self.sensors.values() if isinstance(sensor, IkSolver)]
         self._sees = any(isinstance(sensor, Camera | RayCasting) for sensor in self.sensors.values())
         structs: dict[str, Any] = {"bodies": bodies, "terrain": terrain}
@@ -264,15 +271,17 @@ class DeclaredTask(Task):
             self.adapting.begin(iteration, reward, episode_length)
         super().begin_iteration(iteration, reward, episode_length)
 
+    def own_counts(self) -> Mapping[str, torch.Tensor]:
+        """The failures in each part of each motion."""
+        return {name: sampling.own_failures() for name, sampling in self._samplings.items()}
+
+    def take_counts(self, others: Mapping[str, torch.Tensor]) -> None:
+        """See :meth:`Telling.take_counts`."""
+        for name, failures in others.items():
+            self._samplings[name].take_failures(failures)
+
     def _number(self, name: str) -> torch.Tensor:
         return self.numbers(name) if "." in name else super()._number(name)
-
-    @property
-    def checked_names(self) -> tuple[str, ...]:
-        """As :attr:`Task.checked_names`; those of further groups as ``critic.NAME``."""
-        groups = {group: self.plan.groups[group] for group in further(self.plan)}
-        others = (f"{group}.{name}" for group, terms in groups.items() for seen in terms for name in stacked(seen))
-        return (*self.observation_names, *others)
 
     def _noise(self) -> list[float]:
         """No noise from the randomizer: the kernels add the configured noise."""

@@ -28,10 +28,10 @@ from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
 from worker.tasks.adapting import Adapting
-from worker.tasks.checks import assert_replays, check_arguments, checked_interface
+from worker.tasks.checks import assert_replays, check_arguments, noise_of
 from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.ended import Ended
-from worker.tasks.interface import Interface, deviations
+from worker.tasks.interface import Interface
 from worker.tasks.saved import check_state, completed
 from worker.tasks.telling import Telling
 
@@ -85,6 +85,8 @@ class Task(Telling):
     """Names of the reward terms, in the order of the configuration's ``rewards`` and of the kernel's indices; on the class, the default ones."""
     observation_names: tuple[str, ...]
     """Name of each observation, in order."""
+    further_names: tuple[str, ...] = ()
+    """Name of each column of the further observation groups, such as ``critic.speed``; of declared tasks."""
     action_names: tuple[str, ...]
     """Name of each action, in order (the joint that it drives); of a task with discrete actions, of each choice."""
     discrete: bool = False
@@ -326,18 +328,9 @@ class Task(Telling):
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
 
-    @property
-    def checked_names(self) -> tuple[str, ...]:
-        """Names of the columns of all observation groups that must be finite, the policy's first."""
-        return self.observation_names
-
     def _noise(self) -> list[float]:
         """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
-        interface = checked_interface(self)
-        try:
-            return deviations(self.config.randomize.observation_noise, interface.observations)
-        except ValueError as error:
-            raise ValueError(f"config.randomize.observation_noise: {error}") from error
+        return noise_of(self)
 
     def _allocate(self) -> None:
         """Allocate every buffer once, as views that torch and Warp share."""
@@ -369,7 +362,7 @@ class Task(Telling):
         self._earlier_actions = buffer("earlier_actions", tuple(self.actions.shape), wp.float32)
         self._broken = buffer("broken", (count,), wp.int32)
         self.mishap = buffer("mishap", (1,), wp.int32)
-        self._causes = mishap_causes(self.reward_terms, self.checked_names)
+        self._causes = mishap_causes(self.reward_terms, (*self.observation_names, *self.further_names))
         self._episodes.causes_of_mishaps = len(self._causes)
         self._weights = buffer("weights", (len(self.reward_terms),), wp.float32)
         self._weights.copy_(torch.tensor(list(self.config.rewards.values())))
@@ -387,7 +380,6 @@ class Task(Telling):
             )
             known, ended = map(wp.to_torch, self._exact)
         else:
-            self._exact = None
             known, ended = self.states, self.terminal_observations
         seen = {"policy": self.observations, "critic": known}
         before = {"critic": ended} if self._camera else {"policy": self.terminal_observations, "critic": ended}

@@ -45,7 +45,7 @@ class RootedCritic(Cartpole):
     def declare(self, config: CartpoleConfig) -> Declaration:
         whole = super().declare(config)
         critic = {"position": Observation(terms.joint_position), "root": Observation(root)}
-        return dataclasses.replace(whole, observations={"policy": whole.observations, "critic": critic})
+        return dataclasses.replace(whole, observations={"policy": whole.groups["policy"], "critic": critic})
 
 
 @dataclasses.dataclass(frozen=True)
