@@ -186,15 +186,21 @@ class Attempts:
             allowed=job.attempts_allowed,
             spent=sum(1 for each in job.attempts if each.spent and each is not attempt),
             conditions=job.evaluate_on_exit,
+            last_fault=next(
+                (each.fault for each in reversed(job.attempts) if each.spent and each is not attempt), None
+            ),
         )
-        decided = Ending(attempt.ending) if attempt.ending is not None else None
+        verdict = None
+        if attempt.ending is not None:
+            ending, reason = Ending(attempt.ending), attempt.status_reason or ""
+            verdict = Verdict(ending, reason, attempt.exit_code, fault=attempt.fault)
         return State(
             terms,
             prepared=attempt.epoch != NO_EPOCH,
             launched=attempt.handle is not None,
             started=job.status != Status.STARTING,
             running_since=attempt.running_since,
-            verdict=Verdict(decided, attempt.status_reason or "", attempt.exit_code) if decided else None,
+            verdict=verdict,
             stop_reason=job.stop_reason,
             cause_since=memory.cause_since,
             done_since=memory.done_since,
@@ -231,7 +237,7 @@ class Attempts:
                 self._memory(attempt).done_since = since
             case Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
-                attempt.exit_code = verdict.exit_code
+                attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
             case Save():
                 session.commit()
             case Stop(grace):
