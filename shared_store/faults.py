@@ -71,15 +71,26 @@ def fault_in(text: str, directory: str) -> Fault | None:
         name, message, file, line = found
         if _is_from_outside(name, message, file):
             return None
-        fault = fault or fault_from(name, file.removeprefix(f"{directory}/"), line)
+        fault = fault or _bounded(Fault(name, file.removeprefix(f"{directory}/"), line))
     return fault
 
 
-def fault_from(name: object, file: object, line: object) -> Fault | None:
-    """A fault from values that anybody may have written; None where they are none of a fault."""
-    if not isinstance(name, str) or not isinstance(file, str) or type(line) is not int or not 0 <= line < 2**31:
+def fault_from(value: object) -> Fault | None:
+    """The fault of its ``asdict`` form, which a job can write itself, with bounded texts; None for None. Raises TypeError if it is damaged."""
+    if value is None:
         return None
-    return Fault(name[-_LONGEST_NAME:], file[-_LONGEST_FILE:], line)
+    if not isinstance(value, dict):
+        raise TypeError("a fault is a mapping")
+    fault = Fault(**value)
+    if not isinstance(fault.type, str) or not isinstance(fault.file, str) or type(fault.line) is not int:
+        raise TypeError("a field of a fault is of the wrong type")
+    if not 0 <= fault.line < 2**31:
+        raise TypeError("a fault is in a line that no file has")
+    return _bounded(fault)
+
+
+def _bounded(fault: Fault) -> Fault:
+    return Fault(fault.type[-_LONGEST_NAME:], fault.file[-_LONGEST_FILE:], fault.line)
 
 
 def _last(text: str) -> tuple[str, str, str, int] | None:

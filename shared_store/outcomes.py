@@ -93,8 +93,8 @@ def parse_outcome(value: dict[str, Any]) -> Outcome:
     """The outcome from its ``asdict`` form, with bounded texts. Raises TypeError if it is damaged."""
     error = None
     if value.get("error"):
-        fault = value["error"].get("fault")
-        error = FirstError(**{**value["error"], "fault": fault and fault_from(**fault)})
+        error = FirstError(**value["error"])
+        error = replace(error, fault=fault_from(error.fault))
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
     if not isinstance(outcome.asked, bool):

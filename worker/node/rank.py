@@ -235,11 +235,7 @@ class Rank:
             when = float(extra.get("time") or extra.get("timestamp", self.ended))
             when = when if 0 <= when <= self.ended else self.ended
             trace = str(extra.get("py_callstack", ""))
-            known = (
-                extra["fault"] and fault_from(**extra["fault"])
-                if "fault" in extra
-                else fault_in(trace, self._directory)
-            )
+            known = fault_from(extra["fault"]) if "fault" in extra else fault_in(trace, self._directory)
             return FirstError(self.number, text, trace, when, known if self._failed_alone else None)
         except DamagedFile as error:
             return self._traceback() or FirstError(self.number, str(error), "", self.ended)
