@@ -153,9 +153,7 @@ class Attempts:
             pause = (state.done_since + FINISHING - self.clock.now()) / 1000
         elif state.verdict is not None:
             pause = self._stops.pause(key)
-        elif state.cause_since is not None or any(
-            self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes
-        ):
+        elif state.cause_since is not None or self._observer.has_silent(key):
             pause = CHECK_INTERVAL
         elif job.timeout is not None and attempt.running_since is not None:
             pause = attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000
@@ -345,7 +343,7 @@ class Attempts:
     def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""
         memory, key = self._memory(attempt), (job.id, attempt.number)
-        if not self._observer.know_outcomes(job, attempt, status):
+        if not self._observer.know_outcomes(job, attempt, status, [None] * len(status)):
             return self._errands.delayed(key)
         if memory.progress is None:
             reading = partial(self.runs.progress, job.run, attempt.epoch)
