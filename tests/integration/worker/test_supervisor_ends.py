@@ -68,7 +68,6 @@ FAULTY = "import traceback\ntry: {}[1]\nexcept KeyError: traceback.print_exc()\n
         ("sys.exit(1)", Fault("KeyError", "<string>", 2)),
         ("sys.exit(3)", None),
         ("os.kill(os.getpid(), 9)", None),
-        ("os.kill(os.getpid(), 11)", None),
     ],
 )
 def test_a_traceback_is_the_fault_only_of_a_program_that_left_as_python_does_after_it(
