@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import run_ranks, training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.distributed import Placement
-from worker.errors import TrainingError, UserError
+from worker.errors import GangError, TrainingError, UserError
 from worker.learning import algorithms
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import StopRequest, configure
@@ -289,6 +290,31 @@ def test_an_unexpected_error_shows_its_traceback(tmp_path: Path) -> None:
 
 def break_down() -> int:
     raise ValueError("a defect")
+
+
+def diverge() -> int:
+    raise TrainingError("iteration 3: the loss is not finite")
+
+
+def meet_nobody() -> int:
+    raise GangError("rank 1 did not report")
+
+
+@pytest.mark.parametrize(("body", "kind"), [(break_down, "ValueError"), (diverge, "worker.errors.TrainingError")])
+def test_the_supervisor_hears_of_the_fault_that_another_attempt_would_meet(
+    tmp_path: Path, body: Callable[[], int], kind: str
+) -> None:
+    errors = tmp_path / "error.json"
+    assert call_worker(body, {"TORCHELASTIC_ERROR_FILE": str(errors)}).returncode == 1
+    fault = json.loads(errors.read_text())["message"]["extraInfo"]["fault"]
+    line = body.__code__.co_firstlineno + 1
+    assert (fault["type"], Path(fault["file"]).name, fault["line"]) == (kind, "test_runner.py", line)
+
+
+def test_what_another_rank_did_is_no_fault(tmp_path: Path) -> None:
+    errors = tmp_path / "error.json"
+    assert call_worker(meet_nobody, {"TORCHELASTIC_ERROR_FILE": str(errors)}).returncode == 1
+    assert json.loads(errors.read_text())["message"]["extraInfo"]["fault"] is None
 
 
 def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
