@@ -6,8 +6,10 @@ Memory, signals, hosts, volumes, networks, GPUs and collectives fail by chance o
 from __future__ import annotations
 
 import builtins
+import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 _LONGEST_NAME, _LONGEST_FILE = 128, 512
 """Characters that are kept of a type's name and of a file's path, the ends of both."""
@@ -57,21 +59,21 @@ class Fault:
         return f"{self.type} in {self.file}, line {self.line}"
 
 
-def fault_in(text: str, directory: str) -> Fault | None:
+def fault_in(text: str, directory: Path | None = None) -> Fault | None:
     """The fault in a traceback, as Python prints it; None for an exception that another attempt may not meet, or without a traceback.
 
     Args:
         text: Ends with the traceback. Exceptions that led to it, also printed, must be faults too.
-        directory: The rank's working directory.
+        directory: The rank's working directory; None: that of this process.
     """
-    fault = None
+    fault, above = None, f"{directory or _here()}/"
     for part in reversed(_CHAINED.split(text)):
         if (found := _last(part)) is None:
             return None
         name, message, file, line = found
         if _is_from_outside(name, message, file):
             return None
-        fault = fault or _bounded(Fault(name, file.removeprefix(f"{directory}/"), line))
+        fault = fault or _bounded(Fault(name, file.removeprefix(above), line))
     return fault
 
 
@@ -91,6 +93,14 @@ def fault_from(value: object) -> Fault | None:
 
 def _bounded(fault: Fault) -> Fault:
     return Fault(fault.type[-_LONGEST_NAME:], fault.file[-_LONGEST_FILE:], fault.line)
+
+
+def _here() -> str:
+    """This process's working directory; empty where it is deleted."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
 
 
 def _last(text: str) -> tuple[str, str, str, int] | None:

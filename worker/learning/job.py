@@ -221,7 +221,7 @@ def _write_error_file(message: str, shown: str, trace: str) -> None:
         return
     now = time.time()
     # torch writes whole seconds; "time" is ours, to tell the first failure of a gang from those that it caused, and so is "fault"
-    fault = fault_in(trace, os.getcwd())
+    fault = fault_in(trace)
     extra = {
         "py_callstack": shown,
         "timestamp": str(int(now)),

@@ -59,7 +59,7 @@ class Rank:
         self.spoke = time.monotonic()
         """Time of its start or of its last message (monotonic [s])."""
         self._process: subprocess.Popen[bytes]
-        self._directory: str
+        self._directory: Path | None = None
         self._beacon = b""
         self._partial = {"o": b"", "e": b""}
         self._stderr: deque[str] = deque(maxlen=200)
@@ -109,7 +109,7 @@ class Rank:
             problem = errno.EACCES if os.path.exists(program) else errno.ENOENT
             raise OSError(problem, os.strerror(problem))
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._directory = str(directory or os.getcwd())
+        self._directory = directory
         self._process = subprocess.Popen(
             tied([*prefix, *command]),
             cwd=directory,

@@ -19,7 +19,7 @@ def raised(tmp_path: Path, text: str) -> Fault | None:
     (tmp_path / "train.py").write_text(text)
     ended = subprocess.run([sys.executable, "train.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 1, ended.stderr
-    return fault_in(ended.stderr, str(tmp_path.resolve()))
+    return fault_in(ended.stderr, tmp_path.resolve())
 
 
 def test_a_fault_is_the_place_where_the_exception_was_raised(tmp_path: Path) -> None:
@@ -89,14 +89,14 @@ def test_what_comes_from_outside_the_program_is_no_fault(tmp_path: Path, text: s
     ],
 )
 def test_types_of_memory_networks_peers_and_volumes_are_none(name: str) -> None:
-    assert fault_in(f"{FRAME}{name}: why\n", "/job") is None
-    assert fault_in(f"{FRAME}worker.errors.TrainingError: why\n", "/job") is not None
+    assert fault_in(f"{FRAME}{name}: why\n", Path("/job")) is None
+    assert fault_in(f"{FRAME}worker.errors.TrainingError: why\n", Path("/job")) is not None
 
 
 def test_an_exception_that_a_collective_raised_is_none_whatever_it_says() -> None:
     inside = FRAME + '  File "/lib/torch/distributed/distributed_c10d.py", line 3000, in all_reduce\n    work.wait()\n'
-    assert fault_in(f"{inside}RuntimeError: what is this\n", "/job") is None
-    assert fault_in(f"{FRAME}RuntimeError: what is this\n", "/job") == Fault("RuntimeError", "train.py", 7)
+    assert fault_in(f"{inside}RuntimeError: what is this\n", Path("/job")) is None
+    assert fault_in(f"{FRAME}RuntimeError: what is this\n", Path("/job")) == Fault("RuntimeError", "train.py", 7)
 
 
 def test_values_of_other_types_are_refused_and_long_ones_cut() -> None:
