@@ -270,6 +270,26 @@ class CheckpointWriter:
             StaleEpoch: A newer attempt owns the run; nothing was published.
             OSError: The volume is full or gone; the last checkpoint remains valid.
         """
+        target = self.run.checkpoints / self.name
+        if not (stands := target.exists()):
+            self._write_manifest(facts, digests)
+        check_epoch(self.run, self.epoch)
+        if not stands:
+            os.rename(self.path, target)
+        sync_directory(self.run.checkpoints)
+        # The checkpoint is committed. A failure from here on costs a hint or space, and an attempt that was frozen in the rename
+        # must not prune its successor's checkpoints.
+        with contextlib.suppress(OSError, StaleEpoch):
+            check_epoch(self.run, self.epoch)
+            if keep is not None:
+                retain(self.run, keep)
+            # every rank's writer takes its saves in order: no rank still works on an earlier, failed one
+            sweep(self.run, up_to=(self.epoch, self.iteration))
+            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode())
+        return Checkpoint(target, self.iteration, self.epoch)
+
+    def _write_manifest(self, facts: Mapping[str, Any], digests: Mapping[str, Any] | None) -> None:
+        """The last file of the directory, in place of the notes that the ranks left for the main rank."""
         for notes in self.path.glob(".*"):
             notes.unlink()
         files = digests or {
@@ -285,21 +305,6 @@ class CheckpointWriter:
             "files": files,
         }
         write_json(self.path / "manifest.json", {**facts, **manifest})
-        target = self.run.checkpoints / self.name
-        check_epoch(self.run, self.epoch)
-        if not target.exists():
-            os.rename(self.path, target)
-        sync_directory(self.run.checkpoints)
-        # The checkpoint is committed. A failure from here on costs a hint or space, and an attempt that was frozen in the rename
-        # must not prune its successor's checkpoints.
-        with contextlib.suppress(OSError, StaleEpoch):
-            check_epoch(self.run, self.epoch)
-            if keep is not None:
-                retain(self.run, keep)
-            # every rank's writer takes its saves in order: no rank still works on an earlier, failed one
-            sweep(self.run, up_to=(self.epoch, self.iteration))
-            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode())
-        return Checkpoint(target, self.iteration, self.epoch)
 
 
 def retain(run: Run, keep: int) -> list[str]:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from shared_store.faults import Fault, fault_from
 from shared_store.files import read_json, refuse_links, write_json
 from shared_store.layout import Run
 
@@ -33,6 +34,8 @@ class FirstError:
     traceback: str
     time: float
     """Its Unix time [s]."""
+    fault: Fault | None = None
+    """None where another attempt may not meet it. Outcomes of older versions lack it."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,10 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
 
 def parse_outcome(value: dict[str, Any]) -> Outcome:
     """The outcome from its ``asdict`` form, with bounded texts. Raises TypeError if it is damaged."""
-    error = FirstError(**value["error"]) if value.get("error") else None
+    error = None
+    if value.get("error"):
+        error = FirstError(**value["error"])
+        error = replace(error, fault=fault_from(error.fault))
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
     if not isinstance(outcome.asked, bool):

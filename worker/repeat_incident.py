@@ -1,8 +1,8 @@
 """``python -m worker.repeat_incident FILE [--device cuda:0]``: do an iteration again in which worlds failed.
 
 A run that stops for that reason leaves ``FILE`` in its ``incidents/`` directory: the worlds as they were when the iteration began, and
-every action. Shown are the first worlds that go wrong, the step, what was wrong, and the joint state before that step. Exits 0
-where it happened again, 1 where it did not, 2 where the file can't be read.
+every action. Shown are the first worlds that go wrong, the step, what was wrong, the joint state before that step, and, where the reward
+was not finite, each of its terms. Exits 0 where it happened again, 1 where it did not, 2 where the file can't be read.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from worker.errors import UserError
 from worker.learning.job import EX_ERROR, configure, run_command, user_errors
 
 if TYPE_CHECKING:
+    import torch
+
     from worker.tasks.task import Task
 
 SHOWN = 10
@@ -54,6 +56,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
         if own is not None and torch.allclose(state["world_factors"], own.cpu(), rtol=1e-5):
             state["world_factors"] = own.cpu()  # drawn anew, on another device with other last digits
         task.load_state_dict(state)
+    task.take_counts(content.get("others", {}))  # files of older versions have none
     task.begin_iteration(*content["began"])
     task.clear_statistics()
     return task, content
@@ -68,9 +71,7 @@ def repeat(path: Path, device: str) -> int:
     )
     found = 0
     for step, action in enumerate(actions):
-        before = {
-            name: tensor.cpu().clone() for name, tensor in task.state_tensors().items() if name.startswith("joint")
-        }
+        state = {name: tensor.cpu().clone() for name, tensor in task.state_tensors().items()}
         task.step(action)
         mishap = task.read_mishap(int(task.mishap))
         if mishap is None:
@@ -78,15 +79,34 @@ def repeat(path: Path, device: str) -> int:
         found += 1
         world, cause = mishap
         print(f"step {step + 1}: world {content['first_world'] + world}: {cause}; before it:")
-        for name, tensor in before.items():
-            print(f"  {name}: {[round(value, 6) for value in tensor.view(task.world_count, -1)[world].tolist()]}")
+        for name in (name for name in state if name.startswith("joint")):
+            print(f"  {name}: {[round(value, 6) for value in state[name].view(task.world_count, -1)[world].tolist()]}")
         print(f"  action: {[round(value, 6) for value in action[world].tolist()]}")
+        if terms := _terms_of_step(task, world, state["episode_sums"]):
+            print(f"  reward terms of the step: {terms}")
         task.clear_statistics()
         if found == SHOWN:
             print(f"(the first {SHOWN} such steps)")
             break
     print("it happened again" if found else "nothing failed: on another device the last digits differ")
     return 0 if found else EX_ERROR
+
+
+def _terms_of_step(task: Task, world: int, sums: torch.Tensor) -> str:
+    """The weighted reward terms of a world's last step, with their names; empty where their sum is finite.
+
+    Args:
+        task: The task, after the step that ended the world's episode.
+        world: Index of the world.
+        sums: The sums of all running episodes before the step, shape ``(worlds, 2 + terms)``.
+    """
+    from worker.simulation.episodes import TERMS
+
+    columns = slice(int(TERMS), int(TERMS) + len(task.reward_terms))
+    values = task.ended.sums[world, columns].cpu() - sums[world, columns]
+    if values.sum().isfinite():
+        return ""
+    return ", ".join(f"{name} {value:g}" for name, value in zip(task.reward_terms, values.tolist(), strict=True))
 
 
 def main() -> int:

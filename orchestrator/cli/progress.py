@@ -94,7 +94,8 @@ def summary(client: Client, job_id: str) -> int:
         if value:
             console.print(f"  {name + ':':12} {value}", markup=False)
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
-        console.print(f"  continue with:  muster resume {detail['run']}", markup=False)
+        label = "once that is corrected:" if attempt and attempt.get("fault") else "continue with: "
+        console.print(f"  {label} muster resume {detail['run']}", markup=False)
     return 0 if succeeded else 1
 
 

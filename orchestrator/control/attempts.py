@@ -153,9 +153,7 @@ class Attempts:
             pause = (state.done_since + FINISHING - self.clock.now()) / 1000
         elif state.verdict is not None:
             pause = self._stops.pause(key)
-        elif state.cause_since is not None or any(
-            self.bus.presence.is_silent((*key, node.index)) for node in attempt.nodes
-        ):
+        elif state.cause_since is not None or self._observer.has_silent(key):
             pause = CHECK_INTERVAL
         elif job.timeout is not None and attempt.running_since is not None:
             pause = attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000
@@ -186,15 +184,21 @@ class Attempts:
             allowed=job.attempts_allowed,
             spent=sum(1 for each in job.attempts if each.spent and each is not attempt),
             conditions=job.evaluate_on_exit,
+            last_fault=next(
+                (each.fault for each in reversed(job.attempts) if each.spent and each is not attempt), None
+            ),
         )
-        decided = Ending(attempt.ending) if attempt.ending is not None else None
+        verdict = None
+        if attempt.ending is not None:
+            ending, reason = Ending(attempt.ending), attempt.status_reason or ""
+            verdict = Verdict(ending, reason, attempt.exit_code, fault=attempt.fault)
         return State(
             terms,
             prepared=attempt.epoch != NO_EPOCH,
             launched=attempt.handle is not None,
             started=job.status != Status.STARTING,
             running_since=attempt.running_since,
-            verdict=Verdict(decided, attempt.status_reason or "", attempt.exit_code) if decided else None,
+            verdict=verdict,
             stop_reason=job.stop_reason,
             cause_since=memory.cause_since,
             done_since=memory.done_since,
@@ -231,7 +235,7 @@ class Attempts:
                 self._memory(attempt).done_since = since
             case Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
-                attempt.exit_code = verdict.exit_code
+                attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
             case Save():
                 session.commit()
             case Stop(grace):
@@ -339,7 +343,7 @@ class Attempts:
     def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""
         memory, key = self._memory(attempt), (job.id, attempt.number)
-        if not self._observer.know_outcomes(job, attempt, status):
+        if not self._observer.know_outcomes(job, attempt, status, [None] * len(status)):
             return self._errands.delayed(key)
         if memory.progress is None:
             reading = partial(self.runs.progress, job.run, attempt.epoch)

@@ -25,12 +25,15 @@ def node_end(outcome: Outcome | None, node: NodeStatus, is_native: bool, moment:
         return seen_end(node, is_native, moment / 1000), moment
     # a supervisor sees that its rank was killed; only the engine knows for what
     starved = outcome.signal == "SIGKILL" and node.cause is Cause.OUT_OF_MEMORY
+    # another attempt fails by this exception, too, unless its node is to blame
+    error = outcome.error if not outcome.asked and node.cause in (None, Cause.EXIT) else None
     end = NodeEnd(
         outcome.exit_code,
         node.words if starved else outcome.reason,
         outcome.error.time if outcome.error else outcome.ended,
         outcome.error.message if outcome.error else None,
         asked=outcome.asked,
+        fault=str(error.fault) if error and error.fault else None,
     )
     return end, min(moment, int(outcome.ended * 1000))
 

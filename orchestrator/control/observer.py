@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -29,6 +30,8 @@ class _Seen:
     """Of nodes that have ended, by index; None for one that has left none."""
     checked: float | None = None
     """When they were read last (monotonic [s])."""
+    is_silent: bool = False
+    """Whether a node was silent at the last look."""
 
 
 class Observer:
@@ -48,13 +51,15 @@ class Observer:
         status = self._engine.observe(attempt.handle)
         if status is None:
             return None  # the engine's first look is under way
-        known = self.know_outcomes(job, attempt, status)
+        silences = [self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)]
+        self._of(attempt).is_silent = any(silences)
+        known = self.know_outcomes(job, attempt, status, silences)
         ends = self.ends(job, attempt, status)
         head, away = status[job.gang.main], (node.words for node in status if node.phase is NodePhase.UNREACHABLE)
         return Observed(
             moment=self._clock.now(),
             ends=ends,
-            silences=[self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)],
+            silences=silences,
             unread=None if known else self._errands.trouble((job.id, attempt.number)),
             waits=head.words
             if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
@@ -62,6 +67,10 @@ class Observer:
             words=head.words if head.running else "",
             stale=next((node.stale for node in status if node.stale), ""),
         )
+
+    def has_silent(self, key: Key) -> bool:
+        """Whether a node of the attempt was silent at the last look."""
+        return key in self._seen and self._seen[key].is_silent
 
     def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
         """The silence of a node, by what its engine and the store say of it; None for one that has ended."""
@@ -73,21 +82,26 @@ class Observer:
         runs = status.phase is not NodePhase.UNREACHABLE and not status.stale
         return self._bus.presence.silence((attempt.job_id, attempt.number, node.index), asked, runs)
 
-    def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
+    def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus, silences: Sequence[Silence | None]) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
 
-        Returns whether those of the nodes that have ended are known.
+        Args:
+            job: The job.
+            attempt: Its open attempt.
+            status: Of each node.
+            silences: Of each node, at the same look.
+
+        Returns:
+            Whether those of the nodes that have ended are known.
         """
-        memory, presence, moment = self._of(attempt), self._bus.presence, machine.monotonic()
+        memory, moment = self._of(attempt), machine.monotonic()
         ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
         hidden = [
             index
-            for index, node in enumerate(status)
+            for index, (node, silence) in enumerate(zip(status, silences, strict=True))
             if node.running
             and memory.outcomes.get(index) is None
-            and (
-                node.phase is NodePhase.UNREACHABLE or node.stale or presence.is_silent((job.id, attempt.number, index))
-            )
+            and (node.phase is NodePhase.UNREACHABLE or node.stale or silence)
         ]
         if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < CHECK_INTERVAL)):
             return True
@@ -98,7 +112,7 @@ class Observer:
         # of the call that has returned: a node that has ended since may have left its outcome after it was looked for
         memory.checked, over, outcomes = found
         memory.outcomes |= {**dict.fromkeys(over), **outcomes}
-        return all(index in memory.outcomes for index in ended) or self.know_outcomes(job, attempt, status)
+        return all(index in memory.outcomes for index in ended) or self.know_outcomes(job, attempt, status, silences)
 
     def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node, None while it is not known; noted in the attempt's record with the other facts about its nodes."""

@@ -141,12 +141,6 @@ class Presence:
         with self._lock:
             return node in self._nodes
 
-    def is_silent(self, node: Node) -> bool:
-        """Whether the node was connected, to this router or an earlier one, and is not heard now."""
-        with self._lock:
-            heard = self._nodes.get(node)
-            return node in self._missing or (heard is not None and heard.gone is not None)
-
     @property
     def cut_off(self) -> str | None:
         """Why the controller takes itself to be cut off from its nodes; None while it does not, or not for long."""

@@ -250,12 +250,13 @@ class Reconciler:
     def _take_up(self, session: Session) -> None:
         """Read the jobs, and expect the nodes of all open attempts, and of no other."""
         self.work_queue.load(session)
-        found = open_attempts(session, self.work_queue.active())
-        for closed in self.bus.presence.expected() - {(job.id, attempt.number) for job, attempt in found}:
+        found = {(job.id, attempt.number): attempt for job, attempt in open_attempts(session, self.work_queue.active())}
+        expected = self.bus.presence.expected()
+        for closed in expected - found.keys():
             self.bus.forget(*closed)
-        for job, attempt in found:
-            met = [node.index for node in attempt.nodes if node.met]
-            self.bus.expect(job.id, attempt.number, len(attempt.nodes), met)
+        for key in found.keys() - expected:
+            nodes = found[key].nodes
+            self.bus.expect(*key, len(nodes), [node.index for node in nodes if node.met])
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:

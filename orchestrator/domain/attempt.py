@@ -44,6 +44,7 @@ from orchestrator.domain.attempt_instructions import (
     WindUp,
     Withdraw,
 )
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws, lost_host
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.domain.retry import retries
@@ -63,6 +64,7 @@ _FAILED_GRACE = 5.0
 _MARGIN = 5.0
 """Seconds that an engine waits beyond the grace time: supervisors count it too, and record what did not leave in time."""
 _DONE = "done before it was {}"
+_REPEATED = "{} ended the attempt before, too: not tried again after {} of {} attempts; correct it before you resume or submit again"
 
 
 class Phase(StrEnum):
@@ -102,6 +104,8 @@ class Terms:
     """How many of them the attempts before this one have spent."""
     conditions: Sequence[Mapping[str, str]] = ()
     """``evaluateOnExit`` of the job."""
+    last_fault: str | None = None
+    """:attr:`Verdict.fault` of the last attempt that the job has spent before this one."""
 
     @property
     def size(self) -> str:
@@ -315,6 +319,9 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         case Ending.REQUEUE if is_free or is_left:
             return to(Status.RUNNABLE, f"attempt {number} left on request{progress}; starting again")
         case Ending.FAILED | Ending.LOST if is_left and _retries(terms, verdict, head):
+            if native and verdict.fault is not None and verdict.fault == terms.last_fault:
+                words = f" ({_REPEATED.format(verdict.fault, spent, terms.allowed)})"
+                return to(Status.FAILED, excerpt(verdict.reason, LONGEST_REASON - len(words)) + words)
             return to(Status.RUNNABLE, f"attempt {number} failed ({verdict.reason}){progress}; trying again")
         case Ending.FAILED | Ending.LOST if native:
             return to(Status.FAILED, f"{verdict.reason} (attempt {spent} of {terms.allowed})")

@@ -82,6 +82,8 @@ class NodeEnd:
     """The end was not observed: the node vanished, presumably with its host."""
     asked: bool | None = False
     """The node was told to end: the cause lies elsewhere. None: that is not known."""
+    fault: str | None = None
+    """Type, file and line of the Python exception that ended it, if another attempt would meet that, too."""
 
     def __post_init__(self) -> None:
         object.__setattr__(
@@ -98,6 +100,8 @@ class Verdict:
     exit_code: int | None = None
     certain: bool = True
     """False while every node that has ended was told to end: the cause may be observed later."""
+    fault: str | None = None
+    """As :attr:`NodeEnd.fault`, of the node that was the cause; native jobs only."""
 
 
 AWS_EXITED = "Essential container in task exited"
@@ -143,11 +147,13 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
     if head is not None and head.exit_code == EX_TEMPFAIL:
         return Verdict(Ending.REQUEUE, head.reason, EX_TEMPFAIL)
     if policy == "ignore":
-        return None if head is None else Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code)
+        if head is None:
+            return None
+        return Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code, fault=head.fault)
     if not failures:
         return None
     # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
     index, first = failures[first_cause([(bool(end.asked), end.ended) for _, end in failures])]
     ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
     reason = f"{'main node' if index == main else f'node {index}'}: {first.reason}"
-    return Verdict(ending, reason, first.exit_code, certain=not (first.asked and is_unseen))
+    return Verdict(ending, reason, first.exit_code, certain=not (first.asked and is_unseen), fault=first.fault)

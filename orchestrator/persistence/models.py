@@ -312,6 +312,8 @@ class Attempt(Base):
     """``created_at`` and ``started_at`` in steady time [ms] (:mod:`orchestrator.control.clock`)."""
     status_reason: Mapped[str | None] = mapped_column(default=None)
     exit_code: Mapped[int | None] = mapped_column(default=None)
+    fault: Mapped[str | None] = mapped_column(default=None)
+    """As :attr:`orchestrator.domain.job.Verdict.fault`."""
     gpu_seconds: Mapped[float] = mapped_column(default=0.0)
     """GPUs times seconds held; set with ``cpu_seconds`` when the attempt is closed."""
     cpu_seconds: Mapped[float] = mapped_column(default=0.0)
@@ -325,6 +327,10 @@ class Attempt(Base):
     @validates("status_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
         return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
+
+    @validates("fault")
+    def _storable(self, _key: str, fault: str | None) -> str | None:
+        return None if fault is None else storable(fault)
 
     @property
     def environment(self) -> str:

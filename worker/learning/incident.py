@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +26,17 @@ class Incident:
         self._kept = {name: tensor.clone() for name, tensor in self._live.items()}
         self._actions = torch.zeros(steps, *task.actions.shape, device=task.device)
         self._began: tuple[int, float | None, float | None] = (0, None, None)
+        self._others: Mapping[str, torch.Tensor] = {}
 
-    def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """Keep the arguments of the task's ``begin_iteration``, for its curriculum."""
-        self._began = iteration, reward, episode_length
+    def begin(
+        self,
+        iteration: int,
+        reward: float | None,
+        episode_length: float | None,
+        others: Mapping[str, torch.Tensor],
+    ) -> None:
+        """Keep the arguments of the task's ``begin_iteration``, for its curriculum, and of its ``take_counts``."""
+        self._began, self._others = (iteration, reward, episode_length), others
 
     def keep(self) -> None:
         """Keep the worlds' state before the first step."""
@@ -45,6 +53,7 @@ class Incident:
             "iteration": iteration,
             "directory": os.getcwd(),
             "began": list(self._began),
+            "others": {name: counts.cpu() for name, counts in self._others.items()},
             "train": self._section,
             "seed": self._seed,
             "first_world": share.first,

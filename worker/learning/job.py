@@ -13,12 +13,13 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import DamagedCheckpoint
 from shared_store.epoch import StaleEpoch
+from shared_store.faults import fault_in
 from shared_store.layout import Run, Store, StoreError
 from shared_store.wording import kind_of
 from worker.errors import GangError, TrainingError, UserError
@@ -192,7 +193,7 @@ def run_command(body: Callable[[], int]) -> None:
     except Exception as error:
         trace = traceback.format_exc()
         print(trace, file=sys.stderr, flush=True)
-        _write_error_file(f"{type(error).__name__}: {error}", trace)
+        _write_error_file(f"{type(error).__name__}: {error}", trace, trace)
         code = EX_ERROR
     sys.stdout.flush()
     sys.stderr.flush()
@@ -201,19 +202,32 @@ def run_command(body: Callable[[], int]) -> None:
 
 
 def _fail(message: str, code: int) -> int:
+    """Report the exception that is being handled in one line; returns ``code``."""
     print(f"error: {message}", file=sys.stderr, flush=True)
-    _write_error_file(message, "")
+    _write_error_file(message, "", traceback.format_exc())
     return code
 
 
-def _write_error_file(message: str, trace: str) -> None:
-    """Write the file of ``torch.distributed.elastic``'s ``@record``, without importing it."""
+def _write_error_file(message: str, shown: str, trace: str) -> None:
+    """Write the file of ``torch.distributed.elastic``'s ``@record``, without importing it.
+
+    Args:
+        message: The error.
+        shown: The traceback for people, empty for an error that says all in one line.
+        trace: The traceback with its place.
+    """
     path = os.environ.get("TORCHELASTIC_ERROR_FILE")
     if not path:
         return
     now = time.time()
-    # torch writes whole seconds; "time" is ours, to tell the first failure of a gang from those that it caused
-    extra = {"py_callstack": trace, "timestamp": str(int(now)), "time": now}
+    # torch writes whole seconds; "time" is ours, to tell the first failure of a gang from those that it caused, and so is "fault"
+    fault = fault_in(trace)
+    extra = {
+        "py_callstack": shown,
+        "timestamp": str(int(now)),
+        "time": now,
+        "fault": None if fault is None else asdict(fault),
+    }
     try:
         Path(path).write_text(json.dumps({"message": {"message": message, "extraInfo": extra}}))
     except OSError as error:

@@ -24,7 +24,7 @@ from worker.learning.job import Job, user_errors
 from worker.simulation.robot_values import shown_value
 from worker.tasks.adapting import begin_evaluation
 from worker.tasks.mistakes import task_mistakes
-from worker.tasks.policy_contract import policy_contract, same_policy
+from worker.tasks.policy_contract import policy_contract, readings_of, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -204,7 +204,7 @@ def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool)
     else:
         changed = {
             name: [each for each in reading.corrected if not each.is_rounding]
-            for name, reading in task.readings.items()
+            for name, reading in readings_of(task).items()
         }
         lines = [f"{name}: {_before(differences)}" for name, differences in changed.items() if differences]
     if not lines:

@@ -57,6 +57,17 @@ class Ended(NamedTuple):
     """The sum of the squares of their returns; unknown in older checkpoints."""
 
 
+class _Copies(NamedTuple):
+    """What was copied for a save that may be ordered after the next iteration has begun."""
+
+    iteration: int
+    """Iterations done."""
+    parts: dict[str, Any]
+    """The copies of the state after them."""
+    adaptive_steps: dict[str, float]
+    """The step of each adaptive number in the last of them: the next iteration moves it when it begins."""
+
+
 @dataclass
 class Progress:
     """Progress of training."""
@@ -142,8 +153,7 @@ class TrainingState:
         self.seconds = 0.0
         """Time spent in iterations by all attempts [s]; kept in the manifest, since no two runs take the same time."""
         self.saver = Saver(job.run, job.epoch, gang.rank, gang.size, keep, gate)
-        self._copied: tuple[int, dict[str, Any]] = -1, {}
-        """Iterations done, and the copies of the state after them."""
+        self._copied = _Copies(-1, {}, {})
         self.ordered_at: int | None = None
         """Iteration of the newest save that was ordered, or of the checkpoint that was loaded."""
         self.load_seconds = 0.0
@@ -159,21 +169,17 @@ class TrainingState:
         Called before the host waits for the iteration's numbers, it costs the host no time: the device copies when it gets there.
         """
         worlds = {"first": self.share.first, "count": self.share.count}
-        self._copied = (
-            iteration,
-            self.saver.copy(
-                {
-                    "worlds": {**worlds, "state": {**self.task.state_tensors(), **self._of_algorithm()}},
-                    "generators": generator_state(),
-                    "algorithm": self.algorithm.state_dict() if self.gang.is_main else {},
-                }
-            ),
-        )
+        parts = {
+            "worlds": {**worlds, "state": {**self.task.state_tensors(), **self._of_algorithm()}},
+            "generators": generator_state(),
+            "algorithm": self.algorithm.state_dict() if self.gang.is_main else {},
+        }
+        self._copied = _Copies(iteration, self.saver.copy(parts), adaptive_steps(self.task))
 
     @property
     def is_copied(self) -> bool:
         """Whether the present state has been copied already."""
-        return self._copied[0] == self.progress.iteration
+        return self._copied.iteration == self.progress.iteration
 
     def save(self, reporter: Reporter | None = None, *, wait: bool = True, scheduled: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
@@ -190,14 +196,16 @@ class TrainingState:
         iteration = self.progress.iteration
         if not self.is_copied:
             self.copy(iteration)
-        copied = self._copied[1]
-        self._copied = -1, {}
+        copied, adaptive = self._copied.parts, self._copied.adaptive_steps
+        self._copied = _Copies(-1, {}, {})
         files = {f"rank-{self.gang.rank}.pt": {name: copied[name] for name in ("worlds", "generators")}}
         if self.gang.is_main:
             files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": self.progress.saved()}
         if reporter:
             reporter.do(self.saver.note_records, iteration)
-        facts = {**self._manifest(), "scheduled": scheduled} if self.gang.is_main else None
+        facts = None
+        if self.gang.is_main:
+            facts = {**self._manifest(), "adaptive_steps": adaptive, "scheduled": scheduled}
         self.saver.save(iteration, files, facts, after_records=reporter is not None, wait=wait)
         self.ordered_at = iteration
 
@@ -231,7 +239,6 @@ class TrainingState:
             "score_error": self.progress.score_error,
             "score_episodes": self.progress.score_episodes,
             "episode_length": self.progress.episode_length,
-            "adaptive_steps": adaptive_steps(self.task),
             "env_steps": self.progress.env_steps,
             "learning_rate": self.learning_rate,
             "seconds": self.seconds,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from shared_store.contract import NodeContract
+from shared_store.faults import fault_from, fault_in
 from shared_store.files import DamagedFile, json_object, read_json
 from shared_store.outcomes import FirstError
 from shared_store.tied import tied
@@ -58,6 +59,7 @@ class Rank:
         self.spoke = time.monotonic()
         """Time of its start or of its last message (monotonic [s])."""
         self._process: subprocess.Popen[bytes]
+        self._directory: Path | None = None
         self._beacon = b""
         self._partial = {"o": b"", "e": b""}
         self._stderr: deque[str] = deque(maxlen=200)
@@ -107,6 +109,7 @@ class Rank:
             problem = errno.EACCES if os.path.exists(program) else errno.ENOENT
             raise OSError(problem, os.strerror(problem))
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._directory = directory
         self._process = subprocess.Popen(
             tied([*prefix, *command]),
             cwd=directory,
@@ -228,14 +231,21 @@ class Rank:
             message = (read_json(self.error_file, _LARGEST_ERROR_FILE) or {})["message"]
             if isinstance(message, str):
                 return FirstError(self.number, message, "", self.ended)
-            extra = message["extraInfo"]
+            extra, text = message["extraInfo"], str(message["message"])
             when = float(extra.get("time") or extra.get("timestamp", self.ended))
             when = when if 0 <= when <= self.ended else self.ended
-            return FirstError(self.number, str(message["message"]), str(extra.get("py_callstack", "")), when)
+            trace = str(extra.get("py_callstack", ""))
+            known = fault_from(extra["fault"]) if "fault" in extra else fault_in(trace, self._directory)
+            return FirstError(self.number, text, trace, when, known if self._failed_alone else None)
         except DamagedFile as error:
             return self._traceback() or FirstError(self.number, str(error), "", self.ended)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return self._traceback()
+
+    @property
+    def _failed_alone(self) -> bool:
+        """Whether the program itself ended, for a reason of its own."""
+        return not (self.asked or self.overdue or self.stalled or self.stuck or self.signal_name)
 
     def _traceback(self) -> FirstError | None:
         lines = list(self._stderr)
@@ -243,7 +253,9 @@ class Rank:
         if starts:
             block = lines[starts[-1] :]
             end = next((i for i, line in enumerate(block[1:], 1) if line and not line.startswith(" ")), len(block) - 1)
-            return FirstError(self.number, block[end], "\n".join(block[: end + 1]), self.ended)
+            # Python leaves with 1 after an exception: a program that leaves otherwise had another reason
+            fault = fault_in("\n".join(lines), self._directory) if self._failed_alone and self.exit_code == 1 else None
+            return FirstError(self.number, block[end], "\n".join(block[: end + 1]), self.ended, fault)
         last = next((line for line in reversed(lines) if line.strip()), None)
         return FirstError(self.number, last, "", self.ended) if last and self.exit_code else None
 

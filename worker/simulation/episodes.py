@@ -59,7 +59,9 @@ class EpisodeArrays:
         earlier_actions: Those of one step earlier; shape ``(worlds, actions)``.
         warm_start: Accelerations of the worlds from which the constraint solver starts, shape ``(worlds, dofs)``.
         activations: State of the worlds' stateful actuators, shape ``(worlds, activations)``.
-        broken: First column of the last observation that was not finite, plus 1; 0 where all were finite; shape ``(worlds,)``.
+        broken: First column of the last observation groups that was not finite, plus 1; the columns of further groups follow those of
+            ``observations``; 0 where all were finite; shape ``(worlds,)``.
+        causes_of_mishaps: How many causes :func:`mishap_code` tells apart.
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
         last_sums: The ``sums`` of the world's last episode that ended, shape ``(worlds, 2 + terms)``.
@@ -89,6 +91,7 @@ class EpisodeArrays:
     warm_start: wp.array2d[wp.float32]
     activations: wp.array2d[wp.float32]
     broken: wp.array[wp.int32]
+    causes_of_mishaps: int
     mishap: wp.array[wp.int32]
     last_sums: wp.array2d[wp.float32]
     causes: wp.array[wp.int32]
@@ -146,20 +149,40 @@ def begin_episode(episodes: EpisodeArrays, world: int):
 
 @wp.func
 def mishap_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
-    """World and cause as one number, the lower worlds first; :func:`read_mishap` takes it apart."""
-    columns = episodes.observations.shape[1]
-    cause = columns + 1  # the reward
+    """World and cause as one number, the lower worlds first; :func:`read_mishap` takes it apart.
+
+    Only a step in which the world failed computes it. The reward terms are judged by their sums over the episode, which were finite before.
+    """
+    terms = episodes.weights.shape[0]
+    cause = int(1)  # noqa: RUF046 (a variable for Warp, not a constant)
     if not valid:
-        cause = columns
+        cause = 0
     elif episodes.broken[world] > 0:
-        cause = episodes.broken[world] - 1
-    return world * (columns + 2) + cause
+        cause = 1 + terms + episodes.broken[world]
+    else:
+        for term in range(terms):
+            if cause == 1 and not wp.isfinite(episodes.sums[world, TERMS + term]):
+                cause = 2 + term
+    return world * episodes.causes_of_mishaps + cause
 
 
-def read_mishap(code: int, observations: Sequence[str]) -> tuple[int, str]:
-    """World and cause in a ``code`` other than :data:`NO_MISHAP`: the index of the world in this task, and what was wrong with it."""
-    causes = [f"its observation {name} was not finite" for name in observations]
-    causes += ["its physics failed (a joint faster than `fastest`, or not finite)", "its reward was not finite"]
+def mishap_causes(rewards: Sequence[str], observations: Sequence[str]) -> list[str]:
+    """The causes that :func:`mishap_code` tells apart, in words.
+
+    Args:
+        rewards: Names of the reward terms.
+        observations: Names of the columns of all observation groups, the policy's first.
+    """
+    return [
+        "its physics failed (a joint faster than `fastest`, or not finite)",
+        "its reward was not finite, though each of its terms was",
+        *(f"its reward term {name} was not finite" for name in rewards),
+        *(f"its observation {name} was not finite" for name in observations),
+    ]
+
+
+def read_mishap(code: int, causes: Sequence[str]) -> tuple[int, str]:
+    """World and cause in a ``code`` other than :data:`NO_MISHAP`: the index of the world in this task, and which of ``causes`` it was."""
     world, cause = divmod(code, len(causes))
     return world, causes[cause]
 
@@ -242,13 +265,15 @@ def check_observations(episodes: EpisodeArrays):
 
 
 @wp.kernel
-def check_group(dones: wp.array[wp.bool], rows: wp.array2d[wp.float32], ended: wp.array2d[wp.float32]):
-    """Replace non-finite numbers of a further observation group by 0."""
+def check_group(first: int, episodes: EpisodeArrays, rows: wp.array2d[wp.float32], ended: wp.array2d[wp.float32]):
+    """As :func:`check_observations`, for a further group. ``first``: number of columns of the groups before it, which were checked."""
     world = wp.tid()
     for column in range(rows.shape[1]):
         if not wp.isfinite(rows[world, column]):
             rows[world, column] = 0.0
-        if dones[world] and not wp.isfinite(ended[world, column]):
+            if episodes.broken[world] == 0:
+                episodes.broken[world] = first + column + 1
+        if episodes.dones[world] and not wp.isfinite(ended[world, column]):
             ended[world, column] = 0.0
 
 

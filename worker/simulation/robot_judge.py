@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -13,6 +12,7 @@ import newton
 import numpy as np
 
 from worker.simulation.robot_elements import some, word_of
+from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import (
     effort,
@@ -114,8 +114,7 @@ def compare(
         options: Whether gravity, the medium and the flags of the file's options count.
         accept: Patterns of differences that do not count, ``"ELEMENT: FIELD"``. Where one does not, accelerations are not compared.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of values that are compared here
+    with quiet():
         twins = Twins(reference, builder)
         found = [difference for check in CHECKS for difference in check(twins)]
         found += _options(twins) if options else ()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from shared_store.wording import nearest, shown
-from worker.tasks.interface import Interface, Observation
+from worker.tasks.interface import Interface, Observation, deviations
 from worker.tasks.numbers import flat
 
 if TYPE_CHECKING:
@@ -56,6 +56,15 @@ def checked_interface(task: Task) -> Interface:
                 f"they are {', '.join(names)}"
             )
     return interface
+
+
+def noise_of(task: Task) -> list[float]:
+    """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
+    interface = checked_interface(task)
+    try:
+        return deviations(task.config.randomize.observation_noise, interface.observations)
+    except ValueError as error:
+        raise ValueError(f"config.randomize.observation_noise: {error}") from error
 
 
 def assert_replays(task: Task, steps: Sequence[Callable[[], None]]) -> bool:

@@ -33,8 +33,9 @@ from worker.tasks.declaration import Choice, Declaration
 from worker.tasks.functions import reads_poses
 from worker.tasks.interface import Interface
 from worker.tasks.numbers import flat
-from worker.tasks.plan import Plan
+from worker.tasks.plan import Plan, stacked
 from worker.tasks.task import Task
+from worker.tasks.terms.motion import RecordedMotion
 from worker.tasks.torch_terms import TorchTerms
 
 
@@ -63,6 +64,7 @@ class DeclaredTask(Task):
 
     Attributes:
         views: Joints, bodies, sites and geoms of each robot and object, by its name.
+        readings: How the file of each robot was read, by its name.
         declaration: The result of :meth:`declare`.
         plan: The declaration, bound to the robots.
         sensors: The declared sensors, by name.
@@ -92,7 +94,7 @@ class DeclaredTask(Task):
         """Add robots and objects, and bind the terms to them."""
         config: Any = self.config
         self.views: dict[str, RobotView] = {}
-        self.readings = {}
+        self.readings: dict[str, Reading] = {}
         for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
             self._add(name, entity, builder)
         for name in ("robot", *self.objects(config)):
@@ -126,7 +128,7 @@ class DeclaredTask(Task):
         with _placed(where.removesuffix(": ")):
             reading = dataclasses.replace(entity, name=name).add_to(builder)
         if isinstance(reading, Reading):
-            self.readings = {**self.readings, name: reading}
+            self.readings[name] = reading
 
     def notes(self) -> Sequence[str]:
         """What a user should know of its robots, one sentence each."""
@@ -149,6 +151,10 @@ class DeclaredTask(Task):
         """Take names from the terms."""
         plan = self.plan
         self.observation_names, self.action_names = plan.names, plan.actions
+        groups = {group: plan.groups[group] for group in further(plan)}
+        self.further_names = tuple(
+            f"{group}.{name}" for group, terms in groups.items() for seen in terms for name in stacked(seen)
+        )
         self.discrete = isinstance(self.declaration.actions, Choice)
         self.memory_size, self.lasting_size = plan.binder.memory, plan.binder.lasting
         metrics = {f"metric_{name}": term for name, term in self.declaration.metrics.items()}
@@ -199,6 +205,8 @@ class DeclaredTask(Task):
             name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
         }
         self._cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
+        motions = {name: sensor for name, sensor in self.sensors.items() if isinstance(sensor, RecordedMotion)}
+        self._samplings = {name: each.sampling for name, each in motions.items() if each.sampling.is_adaptive}
         self._movers = [sensor for sensor in self.sensors.values() if isinstance(sensor, IkSolver)]
         self._sees = any(isinstance(sensor, Camera | RayCasting) for sensor in self.sensors.values())
         structs: dict[str, Any] = {"bodies": bodies, "terrain": terrain}
@@ -280,6 +288,15 @@ class DeclaredTask(Task):
         if self.adapting:
             self.adapting.begin(iteration, reward, episode_length)
         super().begin_iteration(iteration, reward, episode_length)
+
+    def own_counts(self) -> Mapping[str, torch.Tensor]:
+        """The failures in each part of each motion."""
+        return {name: sampling.own_failures() for name, sampling in self._samplings.items()}
+
+    def take_counts(self, others: Mapping[str, torch.Tensor]) -> None:
+        """See :meth:`Telling.take_counts`."""
+        for name, failures in others.items():
+            self._samplings[name].take_failures(failures)
 
     def _number(self, name: str) -> torch.Tensor:
         return self.numbers(name) if "." in name else super()._number(name)
@@ -397,8 +414,10 @@ class DeclaredTask(Task):
             inputs = [mode, self.max_episode_length, *rows, *self._common]
             wp.launch(self._kernels.observe, dim=self.world_count, inputs=inputs, device=self.device)
         wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
+        first = len(self.observation_names)
         for both in self._rows.values():
-            wp.launch(check_group, dim=self.world_count, inputs=[self._episodes.dones, *both], device=self.device)
+            wp.launch(check_group, dim=self.world_count, inputs=[first, self._episodes, *both], device=self.device)
+            first += both[0].shape[1]
         if self._camera:
             self._camera.render(mode)
 

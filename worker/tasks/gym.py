@@ -15,7 +15,9 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from worker.simulation.episodes import ACTION_LIMIT
 from worker.tasks import BUILT_IN, find_task
+from worker.tasks.task import Task
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -28,6 +30,7 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
     the one before the last step.
 
     An observation is an array; for a task with both images and numbers, a dictionary of arrays: ``policy``, and each image group.
+    The action space has the limits to which the task clips its actions; an action that it does not clip has none.
 
     Args:
         task: Name or ``module:Class``, as for :func:`worker.tasks.find_task`.
@@ -61,12 +64,7 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             gymnasium.spaces.Dict(spaces) if self._several else spaces["policy"]
         )
         self._images = {name: self._numpy(groups[name]) for name in self._image_groups}
-        size = self.task.action_size
-        self.single_action_space: gymnasium.Space[Any] = (
-            gymnasium.spaces.Discrete(size)
-            if self.task.discrete
-            else gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
-        )
+        self.single_action_space: gymnasium.Space[Any] = _action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -76,7 +74,8 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         """Begin a new episode in every world.
 
         Args:
-            seed: Restart the random streams from this seed; None: continue them.
+            seed: The worlds become those of this seed, as if they had just been built; only the physics and scenes that
+                ``config.randomize`` drew at the construction stay. None: their random streams continue.
             options: Not used by any task.
 
         Returns:
@@ -89,16 +88,17 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         if options is not None and "reset_mask" in options:
             raise ValueError("reset_mask is for environments that do not reset themselves; these do, in the same step")
         if seed is not None:
-            self.task.seed(seed)
+            self.task.restart(seed, self.task.first_world)
             super().reset(seed=seed)
-        self.task.reset()
+        else:
+            self.task.reset()
         return self._observe(), {}
 
     def step(self, actions: np.ndarray) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance every world by one control step.
 
         Args:
-            actions: Shape ``(num_envs, actions)``, clipped to [-1, 1]; of choices ``(num_envs,)``.
+            actions: Shape ``(num_envs, actions)``, clipped to the limits of :attr:`single_action_space`; of choices ``(num_envs,)``.
 
         Returns:
             Observations (float32, images uint8), rewards (float32), terminations, truncations (bool) and info.
@@ -142,6 +142,18 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
     def _numpy(tensor: torch.Tensor) -> np.ndarray:
         """A copy, since the task's buffers change with the next step."""
         return tensor.cpu().numpy().copy()
+
+
+def _action_space(task: Task) -> gymnasium.Space[Any]:
+    """The space of one world's actions."""
+    if task.discrete:
+        return gymnasium.spaces.Discrete(task.action_size)
+    interface = task.interface()
+    if interface is None:  # kernels written by hand
+        return gymnasium.spaces.Box(-float(ACTION_LIMIT), float(ACTION_LIMIT), (task.action_size,), np.float32)
+    limits = [action.clip or (-np.inf, np.inf) for action in interface.actions]
+    low, high = np.array(limits, np.float32).T
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
 
 def _space(group: torch.Tensor) -> gymnasium.Space[Any]:

@@ -15,6 +15,7 @@ from worker.tasks.tables import settings
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy
+    from worker.simulation.robot_reading import Reading
     from worker.tasks.plan import Plan, Seen
     from worker.tasks.task import Task
 
@@ -49,9 +50,15 @@ def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = Non
         commands=_commands(getattr(task, "plan", None)),
         states=tuple(states),
         discrete=bool(task.discrete),
-        robots=tuple(dataclasses.replace(reading.identity, name=name) for name, reading in task.readings.items()),
+        robots=tuple(dataclasses.replace(reading.identity, name=name) for name, reading in readings_of(task).items()),
         normalizer="unknown" if exported is None else "inside",
     )
+
+
+def readings_of(task: Task) -> Mapping[str, Reading]:
+    """How the file of each robot of a task was read, by its name; a task of kernels by hand keeps none."""
+    readings: Mapping[str, Reading] = getattr(task, "readings", {})
+    return readings
 
 
 def _group(task: Task, name: str, given: str, shape: tuple[int, ...]) -> Group:

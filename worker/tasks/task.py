@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import newton
@@ -21,18 +20,18 @@ from worker.simulation.episodes import (
     WATCHED,
     EpisodeArrays,
     check_observations,
+    mishap_causes,
     randomize_ages,
     read_mishap,
 )
 from worker.simulation.randomization import Randomizer
-from worker.simulation.robot_reading import Reading
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
 from worker.tasks.adapting import Adapting
-from worker.tasks.checks import assert_replays, check_arguments, checked_interface
+from worker.tasks.checks import assert_replays, check_arguments, noise_of
 from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.ended import Ended
-from worker.tasks.interface import Interface, deviations
+from worker.tasks.interface import Interface
 from worker.tasks.saved import check_state, completed
 from worker.tasks.telling import Telling
 
@@ -86,6 +85,8 @@ class Task(Telling):
     """Names of the reward terms, in the order of the configuration's ``rewards`` and of the kernel's indices; on the class, the default ones."""
     observation_names: tuple[str, ...]
     """Name of each observation, in order."""
+    further_names: tuple[str, ...] = ()
+    """Name of each column of the further observation groups, such as ``critic.speed``; of declared tasks."""
     action_names: tuple[str, ...]
     """Name of each action, in order (the joint that it drives); of a task with discrete actions, of each choice."""
     discrete: bool = False
@@ -98,8 +99,6 @@ class Task(Telling):
     """Whether the worlds stand on a ground plane."""
     metric_names: tuple[str, ...] = ()
     """Names of the metrics, which are logged besides the rewards as means over the steps; of declared tasks."""
-    readings: Mapping[str, Reading] = MappingProxyType({})
-    """How the file of each robot was read, by its name; of declared tasks."""
     termination_names: tuple[str, ...] = ()
     """Names of the terminations, which are counted; of declared tasks."""
     success: str | None = None
@@ -302,7 +301,7 @@ class Task(Telling):
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
         """Decode a value of :attr:`mishap`: the index of the failed world in this task and the cause; None: no world failed."""
-        return None if code == NO_MISHAP else read_mishap(code, self.observation_names)
+        return None if code == NO_MISHAP else read_mishap(code, self._causes)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The state from which :meth:`load_state_dict` continues bit for bit (on the CPU), copied to host memory.
@@ -331,11 +330,7 @@ class Task(Telling):
 
     def _noise(self) -> list[float]:
         """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
-        interface = checked_interface(self)
-        try:
-            return deviations(self.config.randomize.observation_noise, interface.observations)
-        except ValueError as error:
-            raise ValueError(f"config.randomize.observation_noise: {error}") from error
+        return noise_of(self)
 
     def _allocate(self) -> None:
         """Allocate every buffer once, as views that torch and Warp share."""
@@ -367,6 +362,8 @@ class Task(Telling):
         self._earlier_actions = buffer("earlier_actions", tuple(self.actions.shape), wp.float32)
         self._broken = buffer("broken", (count,), wp.int32)
         self.mishap = buffer("mishap", (1,), wp.int32)
+        self._causes = mishap_causes(self.reward_terms, (*self.observation_names, *self.further_names))
+        self._episodes.causes_of_mishaps = len(self._causes)
         self._weights = buffer("weights", (len(self.reward_terms),), wp.float32)
         self._weights.copy_(torch.tensor(list(self.config.rewards.values())))
         self.level = buffer("level", (1,), wp.float32)
@@ -383,7 +380,6 @@ class Task(Telling):
             )
             known, ended = map(wp.to_torch, self._exact)
         else:
-            self._exact = None
             known, ended = self.states, self.terminal_observations
         seen = {"policy": self.observations, "critic": known}
         before = {"critic": ended} if self._camera else {"policy": self.terminal_observations, "critic": ended}

@@ -1,12 +1,16 @@
-"""A task's report on its metrics and on functions of the user, such as a learner's reward: where they run, and their errors."""
+"""A task's report to the training loop: on its metrics, on functions of the user, such as a learner's reward, and on shared counts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 
 class Telling:
-    """A task that shows no metric and has no function of the user; others override this."""
+    """A task that shows no metric, has no function of the user and shares no counts; others override this."""
 
     final_metrics: tuple[str, ...] = ()
     """Metrics whose value at an episode's last step counts."""
@@ -27,3 +31,10 @@ class Telling:
             By error line: its count, and the first world, counted over all ranks; the most frequent first.
         """
         return {}
+
+    def own_counts(self) -> Mapping[str, torch.Tensor]:
+        """Counts of this rank's worlds that decide together with those of other ranks, by name; integers on the device."""
+        return {}
+
+    def take_counts(self, others: Mapping[str, torch.Tensor]) -> None:
+        """Called before every iteration of a gang's training with the sums of the other ranks' :meth:`own_counts`."""

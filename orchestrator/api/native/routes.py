@@ -284,6 +284,7 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
         "ending": attempt.ending,
         "exitCode": attempt.exit_code,
         "statusReason": attempt.status_reason,
+        "fault": attempt.fault,
         "spent": attempt.spent,
         "computeEnvironment": attempt.compute_environment,
         "gpuSeconds": attempt.gpu_seconds,

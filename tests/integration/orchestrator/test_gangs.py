@@ -44,6 +44,44 @@ def test_on_child_failure_fail_ends_the_job_at_once(shared_server: Serving) -> N
     assert detail["status"] == "FAILED" and len(detail["attempts"]) == 1 and "child trouble" in detail["statusReason"]
 
 
+FAULTY = "import os\ndef reward():\n  raise ValueError(os.environ['AWS_BATCH_JOB_ATTEMPT'])\nreward()"
+
+
+def test_the_same_fault_twice_is_not_tried_a_third_time(shared_server: Serving) -> None:
+    found = shared_server.wait(shared_server.gang(FAULTY, attempts=5, env=NATIVE))
+    fault = "ValueError in <string>, line 3"
+    assert found["status"] == "FAILED" and [each["fault"] for each in found["attempts"]] == [fault] * 2
+    assert found["statusReason"] == (
+        "main node: rank 0 exited with code 1: ValueError: 2 (ValueError in <string>, line 3 ended the attempt before, too: "
+        "not tried again after 2 of 5 attempts; correct it before you resume or submit again)"
+    )
+    assert [each["exitCode"] for each in found["attempts"]] == [1, 1] and all(
+        each["spent"] for each in found["attempts"]
+    )
+
+
+def test_a_job_of_the_batch_api_is_tried_as_often_as_it_says_whatever_its_fault(shared_server: Serving) -> None:
+    found = shared_server.wait(shared_server.gang(FAULTY, attempts=3))
+    assert found["status"] == "FAILED" and [each["fault"] for each in found["attempts"]] == [None] * 3
+    assert found["statusReason"] == "Essential container in task exited"
+
+
+def test_two_faults_in_a_row_and_a_failure_without_one_are_tried_again(shared_server: Serving) -> None:
+    script = (
+        "import os\nattempt = int(os.environ['AWS_BATCH_JOB_ATTEMPT'])\n"
+        "if attempt == 1: [][1]\nif attempt == 2: {}[1]\nif attempt == 3: open('missing')\nif attempt == 4: {}[1]"
+    )
+    found = shared_server.wait(shared_server.gang(script, attempts=5, env=NATIVE))
+    faults = [
+        "IndexError in <string>, line 3",
+        "KeyError in <string>, line 4",
+        None,
+        "KeyError in <string>, line 6",
+        None,
+    ]
+    assert found["status"] == "SUCCEEDED" and [each["fault"] for each in found["attempts"]] == faults
+
+
 def test_leaving_on_request_requeues_without_spending_an_attempt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

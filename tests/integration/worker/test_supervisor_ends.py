@@ -14,6 +14,7 @@ import pytest
 
 from shared_store.contract import sealed
 from shared_store.epoch import raise_epoch
+from shared_store.faults import Fault
 from shared_store.outcomes import LONGEST_TEXT
 from tests.conftest import PATIENCE, wait_for
 from tests.support.faults.full_disk import full_volume
@@ -35,6 +36,7 @@ def test_an_exception_is_reported_with_its_traceback(node: Nodes) -> None:
     assert outcome.error.traceback.startswith("Traceback (most recent call last):\n")
     assert "in f" in outcome.error.traceback
     assert outcome.error.traceback.endswith("\nValueError: bad reward")
+    assert outcome.error.fault == Fault("ValueError", "<string>", 4)
     assert n.lines()[-1] == (None, "o", f"node 0 ended: {outcome.reason}")
 
 
@@ -55,6 +57,34 @@ def test_the_last_traceback_or_line_on_standard_error_is_the_error(node: Nodes, 
     outcome = n.ended()
     assert outcome.reason == "rank 0 exited with code 9" + (f": {message}" if message else "")
     assert (outcome.error and outcome.error.message) == message
+
+
+FAULTY = "import traceback\ntry: {}[1]\nexcept KeyError: traceback.print_exc()\nimport os, sys\nsys.stderr.flush()\n"
+
+
+@pytest.mark.parametrize(
+    ("how", "fault"),
+    [
+        ("sys.exit(1)", Fault("KeyError", "<string>", 2)),
+        ("sys.exit(3)", None),
+        ("os.kill(os.getpid(), 9)", None),
+    ],
+)
+def test_a_traceback_is_the_fault_only_of_a_program_that_left_as_python_does_after_it(
+    node: Nodes, how: str, fault: Fault | None
+) -> None:
+    n = node()
+    assert n.python(FAULTY + how) != 0
+    error = n.ended().error
+    assert error is not None and error.message == "KeyError: 1" and error.fault == fault
+
+
+def test_the_rank_that_failed_first_gives_the_fault_and_one_that_was_asked_to_leave_has_none(node: Nodes) -> None:
+    n = node(ranks_per_node=2)
+    script = "import os, time\nif os.environ['RANK'] == '1': raise ValueError('bad')\ntime.sleep(60)"
+    assert n.python(script) == 1
+    error = n.ended().error
+    assert error is not None and (error.rank, error.fault) == (1, Fault("ValueError", "<string>", 2))
 
 
 EXTRA = {"py_callstack": "Traceback …", "timestamp": "1234"}

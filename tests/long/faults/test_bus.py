@@ -85,12 +85,12 @@ def test_a_cut_network_takes_the_controller_s_own_session_away_with_its_only_nod
     node, home = start_node(bus, "time.sleep(600)"), SimpleNamespace(path=tmp_path)
     bus.presence.lost_after = 4.0  # less than from the node's silence to Zenoh's own lease of 10 s
     with partition(home):
-        wait_for(lambda: bus.presence.is_silent(("j", 1, 0)), 6, "the silence of the node")
+        wait_for(lambda: bus.presence.silence(("j", 1, 0), 0.0) is not None, 6, "the silence of the node")
         for _ in range(80):
             silence = bus.presence.silence(("j", 1, 0), 0.0)
             assert silence is not None and not silence.is_lost
             time.sleep(0.1)
-    wait_for(lambda: not bus.presence.is_silent(("j", 1, 0)), 20, "the node's return")
+    wait_for(lambda: bus.presence.silence(("j", 1, 0), 0.0) is None, 20, "the node's return")
     node.kill()
     node.wait()
 

@@ -309,6 +309,20 @@ def test_frames_behind_which_worlds_failed_become_likelier() -> None:
     near(sampling.arrays.evenness.numpy(), [-(wanted * np.log(wanted)).sum() / np.log(4)])
 
 
+def test_failures_on_other_ranks_count_as_those_of_a_rank_itself() -> None:
+    declaration = AdaptiveSampling(seconds=2.0, even=0.1, rate=0.25)
+    one, other = (FrameSampling(declaration, 7.0, 2, "cpu") for _ in range(2))
+    for sampling, failed in ((one, [2, 2]), (other, [0, 3])):
+        sampling.state_tensors()["failed"].copy_(torch.tensor(failed))
+        sampling.advance()
+    assert one.own_failures().tolist() == [0, 0, 500_000_000, 0]
+    assert other.own_failures().tolist() == [250_000_000, 0, 0, 250_000_000]
+    one.take_failures(other.own_failures())
+    one.advance()
+    failures = np.array([0.25, 0.0, 0.75 * 0.5, 0.25]) + 0.1 / 4
+    near(one.arrays.likely.numpy(), np.cumsum(failures / failures.sum()))
+
+
 @pytest.mark.parametrize("changed", [{"seconds": 0.0}, {"even": 0.0}, {"rate": 1.5}, {"reach": 0}, {"decay": -1.0}])
 def test_a_wrong_sampling_is_refused_in_one_line(changed: dict[str, Any], tmp_path: Path) -> None:
     name, value = next(iter(changed.items()))

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tests.support.faults.checks import Reference, Verdict, judge
 from tests.support.faults.home import Broken, Home, open_commit, reached
@@ -75,6 +75,19 @@ def run_straight(home: Home, nodes: int, iterations: int, steps: int = 16) -> Re
     return Reference(home.run(run))
 
 
+class _Frozen(NamedTuple):
+    """A process that was frozen."""
+
+    process: Process
+    since: float
+    until: float
+    """Times of the blow and of its end (monotonic [s])."""
+    trained: bool
+    """Whether the gang trained."""
+    starts: int
+    """How often the controller had been started by then."""
+
+
 class Fire:
     """Carries out one plan on one home."""
 
@@ -84,8 +97,7 @@ class Fire:
         self.found = self.result.verdict.violations
         self._restart_at: float | None = None
         self._thaw_controller_at: float | None = None
-        self._frozen: list[tuple[Process, float, float, bool, int]] = []
-        """With the time of the blow and that of its end [s], whether the gang trained, and how often the controller had been started."""
+        self._frozen: list[_Frozen] = []
         self._killed: set[Process] = set()
         self._next_look = 0.0
         self._over = False
@@ -167,7 +179,7 @@ class Fire:
         inside = commit is not None and (self.run.checkpoints / commit).exists()
         if blow.freeze:
             now = time.monotonic()
-            self._frozen.append((process, now, now + (blow.pause or 1e9), trains, self.home.starts))
+            self._frozen.append(_Frozen(process, now, now + (blow.pause or 1e9), trains, self.home.starts))
         self._note(blow, f"{process} at iteration {reached(self.run, epoch)} of epoch {epoch}", inside)
         return True
 
@@ -257,21 +269,20 @@ class Fire:
 
     def _thaw(self, now: float) -> None:
         for each in list(self._frozen):
-            process, since, until, trained, starts = each
-            if process not in gang_members(self.home.path):
+            if each.process not in gang_members(self.home.path):
                 self._frozen.remove(each)
-            elif now >= until or self._is_named(process, starts):
-                process.strike(signal.SIGCONT)
+            elif now >= each.until or self._is_named(each):
+                each.process.strike(signal.SIGCONT)
                 self._frozen.remove(each)
-            elif now - since > _NOTICE_SECONDS:
-                when = "while it trained" if trained else "while it did not train"
-                self.found.append(f"nobody noticed in {_NOTICE_SECONDS:g} s that {process} was frozen {when}")
-                process.strike(signal.SIGCONT)
+            elif now - each.since > _NOTICE_SECONDS:
+                when = "while it trained" if each.trained else "while it did not train"
+                self.found.append(f"nobody noticed in {_NOTICE_SECONDS:g} s that {each.process} was frozen {when}")
+                each.process.strike(signal.SIGCONT)
                 self._frozen.remove(each)
 
-    def _is_named(self, process: Process, starts: int) -> bool:
+    def _is_named(self, frozen: _Frozen) -> bool:
         """Whether the job says that the supervisor is unreachable: all that a controller can do that was started after the blow."""
-        if process.role != "supervisor" or self.home.starts == starts or not self._jobs:
+        if frozen.process.role != "supervisor" or self.home.starts == frozen.starts or not self._jobs:
             return False
         return "has not come to this controller" in (self._jobs[-1]["status_reason"] or "")
 
@@ -314,8 +325,8 @@ class Fire:
         self._next_look = 0.0
 
     def _thaw_all(self) -> None:
-        for process, *_ in self._frozen:
-            process.strike(signal.SIGCONT)
+        for each in self._frozen:
+            each.process.strike(signal.SIGCONT)
         self._frozen.clear()
         if self._thaw_controller_at is not None:
             self.home.strike(signal.SIGCONT)

@@ -20,6 +20,8 @@ class SimulatedBus:
         self.presence.hear_itself(True)
         self.changed: Callable[[str], None] = lambda _: None
         self._world = world
+        self._gone: set[tuple[str, int, int]] = set()
+        """Nodes that this process has heard, and does not hear any more."""
 
     def expect(self, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
         self.presence.expect(job, attempt, nodes, met)
@@ -37,18 +39,20 @@ class SimulatedBus:
     def listen(self) -> None:
         """One of the nodes that are heard sends something, as each does once a second."""
         for node in self._world.cluster.running:
-            if self._world.hears(node) and self.presence.met(node.key) and not self.presence.is_silent(node.key):
+            if self._world.hears(node) and self.presence.met(node.key) and node.key not in self._gone:
                 self.presence.sent(node.key)
                 return
 
     def notice(self, node: SimulatedNode) -> None:
         """A node's connection may have come or gone."""
         here = self._world.hears(node)
-        silent = self.presence.is_silent(node.key)
-        if here and (silent or not self.presence.met(node.key)):
+        gone, met = node.key in self._gone, self.presence.met(node.key)
+        if here and (gone or not met):
             self.presence.came(node.key)
-        elif not here and self.presence.met(node.key) and not silent:
+            self._gone.discard(node.key)
+        elif not here and met and not gone:
             self.presence.left(node.key)
+            self._gone.add(node.key)
         else:
             return
         self.changed(node.key[0])

@@ -7,7 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from orchestrator.engines.api import Gang
-from shared_store.outcomes import EX_TEMPFAIL, Outcome
+from shared_store.faults import Fault
+from shared_store.outcomes import EX_TEMPFAIL, FirstError, Outcome
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
@@ -18,6 +19,8 @@ _CLOSING = 20.0
 """Seconds from the last checkpoint to the end, at most."""
 _TRIES = 60
 """Seconds for which a node tries to write its outcome."""
+
+_FAULT = Fault("ValueError", "train.py", 3)
 
 
 @dataclass
@@ -135,7 +138,7 @@ class Cluster:
         left = job.work - job.done
         if left <= 0:
             closing = self._rng.uniform(0.1, _CLOSING)
-            self._machine.after(closing, lambda: self._finish(gang.nodes[0], job.code))
+            self._machine.after(closing, lambda: self._finish(gang.nodes[0], job.code, fault=job.code == 1))
             return
         piece = min(left, _SAVING)
         self._machine.after(piece, lambda: self._save(gang, piece))
@@ -172,25 +175,30 @@ class Cluster:
         if node.acts:
             self._finish(node, EX_TEMPFAIL)
 
-    def _finish(self, node: SimulatedNode, code: int, tries: int = _TRIES, asked: bool | None = None) -> None:
+    def _finish(
+        self, node: SimulatedNode, code: int, tries: int = _TRIES, asked: bool | None = None, fault: bool = False
+    ) -> None:
         """The node ends: it writes its outcome until that stands, or leaves without one after a while.
 
-        ``asked``: whether it was asked to end when its work ended; None: as it is now.
+        ``asked``: whether it was asked to end when its work ended; None: as it is now. ``fault``: whether the job's own fault ends it.
         """
         if not node.alive:
             return
         was_asked = node.asked if asked is None else asked
         if not node.acts:
-            self._machine.after(5.0, lambda: self._finish(node, code, tries, was_asked))
+            self._machine.after(5.0, lambda: self._finish(node, code, tries, was_asked, fault))
             return
         gang, volume = node.gang, self._world.volume
         can_write = not volume.unusable and gang.run in volume.runs
         if not can_write and tries and not node.asked:
-            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1, was_asked))
+            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1, was_asked, fault))
             return
         if can_write:
             wall, words = self._machine.wall(), f"exit {code}"
-            outcome = Outcome(node.index, gang.epoch, code, None, words, None, wall - 1, wall, asked=was_asked)
+            error = FirstError(0, words, "", wall, _FAULT) if fault else None
+            outcome = Outcome(node.index, gang.epoch, code, None, words, error, wall - 1, wall, asked=was_asked)
+            if fault:
+                self._world.job(gang.job).faults.add(gang.attempt)
             volume.runs[gang.run].outcomes[gang.job, gang.attempt, node.index] = outcome
         node.alive, node.exit_code = False, code
         if node.index == 0 and code != EX_TEMPFAIL:

@@ -49,12 +49,15 @@ class Invariants:
         self._requests.add(request)
 
     def check_launch(self, gang: Gang) -> None:
-        """Never two writers, and nothing without its run."""
+        """Never two writers, nothing without its run, and no third attempt after the same fault twice."""
         if gang.run not in self._world.volume.runs:
             raise Violation(f"{gang.name} is launched, and the store does not have its run")
         for other in self._world.cluster.gangs.values():
             if other.run == gang.run and any(self._world.cluster.can_write(node) for node in other.running):
                 raise Violation(f"{gang.name} is launched while {other.name} runs")
+        before, last = self._faults(gang.job, gang.attempt)
+        if last and before and last[1] is not None and last[1] == before[1]:
+            raise Violation(f"{gang.name} is launched after {last[1]} ended attempts {before[0]} and {last[0]}")
 
     def launched(self, gang: SimulatedGang) -> None:
         """A gang that is to be seen soon."""
@@ -116,8 +119,17 @@ class Invariants:
             return
         query = "SELECT count(*) FROM attempts WHERE job_id = ? AND spent"
         spent = self._world.memory.execute(query, (job.id,)).fetchone()[0]
-        if spent < job.attempts:
+        ended_alike = [each and each[1] is not None and each[0] in job.faults for each in self._faults(job.id, 1 << 30)]
+        if spent < job.attempts and not all(ended_alike):
             raise Violation(f"{job.name} is FAILED ({reason}) after {spent} of {job.attempts} attempts")
+
+    def _faults(self, job: str, before: int) -> list[tuple[int, str | None] | None]:
+        """Number and fault of the last two attempts that a job has spent before one, the later last; None where there was none."""
+        query = (
+            "SELECT number, fault FROM attempts WHERE job_id = ? AND number < ? AND spent ORDER BY number DESC LIMIT 2"
+        )
+        found = [tuple(row) for row in self._world.memory.execute(query, (job, before)).fetchall()]
+        return [*[None] * (2 - len(found)), *reversed(found)]
 
     def check_reachable(self, process: int) -> None:
         """Once all has been as it is for a while: a RUNNING gang says whether its engine is away and whether a node is unreachable; a new gang

@@ -29,7 +29,7 @@ class SimulatedJob:
     work: float
     """Seconds that its main node needs in all."""
     code: int
-    """Exit code once the work is done."""
+    """Exit code once the work is done; 1 by a fault, which every attempt meets there."""
     breaks: list[float]
     """Seconds after which an attempt fails by itself, by attempt."""
     attempts: int
@@ -44,6 +44,8 @@ class SimulatedJob:
     """Seconds of work that its checkpoints hold."""
     main_ends: list[tuple[int, int, bool]] = field(default_factory=list)
     """Attempt and exit code of each main node that ended by itself, and whether it had been asked to end by then."""
+    faults: set[int] = field(default_factory=set)
+    """Attempts whose main node has left an outcome with the fault."""
     final: str = ""
     """The state that was shown once, and must stay."""
 

@@ -130,12 +130,23 @@ def without_an_outcome_is_killed() -> Mutant:
     return mock.patch.object(endings, "seen_end", seen)
 
 
+def a_fault_is_forgotten() -> Mutant:
+    """The same fault is tried as often as the job has attempts."""
+    step = rules.step
+
+    def stepped(state: rules.State, event: Event) -> Instructions:
+        return step(replace(state, terms=replace(state.terms, last_fault=None)), event)
+
+    return mock.patch.object(attempts, "step", stepped)
+
+
 MUTANTS: Mapping[str, Callable[[], Mutant]] = {
     "B1": silence_alone_counts,
     "B2": those_whom_another_router_met_are_silent,
     "B3": the_loop_shares_its_connections,
     "B4": the_loop_reads_the_store,
     "B9": what_is_to_end_is_launched,
+    "fault": a_fault_is_forgotten,
     "look": a_launched_gang_waits_for_its_look,
     "missing": nodes_that_do_not_reconnect_are_not_reported,
     "stop": a_stop_waits_for_outcomes,

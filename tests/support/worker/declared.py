@@ -174,6 +174,13 @@ class Sliders(DeclaredTask):
         }
 
 
+class FreeSliders(Sliders):
+    """The same robot, whose actions are not clipped."""
+
+    def sections(self) -> dict[str, Any]:
+        return super().sections() | {"actions": {"force": Action(terms.effort, clip=None)}}
+
+
 class TorchSliders(Sliders):
     """The same robot with terms in torch."""
 

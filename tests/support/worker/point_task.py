@@ -45,7 +45,13 @@ class Point(Telling):
     """Push a point to the middle: 2 observations (place, velocity), 1 action."""
 
     config_type = PointConfig
-    statistic_names = ("episodes", "episode_return", "episode_length", "reward_place", "squared_return")
+    statistic_names: tuple[str, ...] = (
+        "episodes",
+        "episode_return",
+        "episode_length",
+        "reward_place",
+        "squared_return",
+    )
     final_metrics = ()
     shown_metrics = MappingProxyType[str, str]({})
     action_size, discrete, observation_shape = 1, False, (2,)
@@ -141,6 +147,27 @@ class Point(Telling):
             if state[name].shape != tensor.shape:
                 raise ValueError(f"{name}: expected shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}")
             tensor.copy_(state[name])
+
+
+class Tripping(Point):
+    """The point, whose last world's physics fails in every iteration."""
+
+    statistic_names = (*Point.statistic_names, "nan_worlds")
+
+    def __init__(self, *arguments: Any, first_world: int = 0, **options: Any) -> None:
+        super().__init__(*arguments, first_world=first_world, **options)
+        self.statistics = torch.zeros(len(self.statistic_names), dtype=torch.float64)
+        self._trips = first_world > 0
+
+    def step(self, actions: torch.Tensor) -> None:
+        whole, self.statistics = self.statistics, self.statistics[:-1]
+        super().step(actions)
+        self.statistics = whole
+        self.statistics[-1] += self._trips
+        self.mishap.fill_(self._trips)
+
+    def read_mishap(self, code: int) -> tuple[int, str] | None:
+        return (self.world_count - 1, "it tripped") if code else None
 
 
 TASK: Any = Point

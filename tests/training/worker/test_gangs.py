@@ -17,7 +17,8 @@ from tests.support.worker.clones import make_clone
 from tests.support.worker.collectives import ALONE, TESTS, paths
 from tests.support.worker.gangs import Played, begun, case, digest, given, play_cases
 from tests.support.worker.loop import alone, iterate, setting_of
-from tests.support.worker.point_task import Point, PointConfig, PointPPO
+from tests.support.worker.motion_task import Turning, motion
+from tests.support.worker.point_task import Point, PointConfig, PointPPO, Tripping
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from tests.support.worker.sac import make
@@ -327,27 +328,6 @@ def test_a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(told: list[A
     assert [each.name for each in list_checkpoints(Store(store).run("poisoned"))] == ["00000001-e1"]
 
 
-class Tripping(Point):
-    """The point, whose last world's physics fails in every iteration."""
-
-    statistic_names = (*Point.statistic_names, "nan_worlds")
-
-    def __init__(self, *arguments: Any, first_world: int = 0, **options: Any) -> None:
-        super().__init__(*arguments, first_world=first_world, **options)
-        self.statistics = torch.zeros(len(self.statistic_names), dtype=torch.float64)
-        self._trips = first_world > 0
-
-    def step(self, actions: torch.Tensor) -> None:
-        whole, self.statistics = self.statistics, self.statistics[:-1]
-        super().step(actions)
-        self.statistics = whole
-        self.statistics[-1] += self._trips
-        self.mishap.fill_(self._trips)
-
-    def read_mishap(self, code: int) -> tuple[int, str] | None:
-        return (self.world_count - 1, "it tripped") if code else None
-
-
 @case
 def too_many_resets_on_one_rank_end_all_after_it_has_written_why(gang: Gang, store: Path) -> Any:
     from worker.learning.loop import Loop
@@ -364,6 +344,24 @@ def test_too_many_resets_on_one_rank_end_all_after_it_has_written_why(told: list
     for each in told:
         assert each.startswith("TrainingError: iteration 1: 8 resets of worlds, among them world 15: it tripped; ")
         assert each.endswith(f"worker.repeat_incident {written}")
+
+
+@case
+def start_frames_follow_the_failures_of_all_ranks(gang: Gang, store: Path) -> Any:
+    begun(gang, Store(store).run("turning"))
+    Turning.motion = motion(store / f"turning-{gang.rank}.npz")
+    name = f"{Turning.__module__}:{Turning.__qualname__}"
+    loop = runner(training(store, run="turning", worlds=8, iterations=3, task=name), gang, task=Turning)
+    assert loop.train() == 0
+    own = loop.task.own_counts()["motion"].tolist()
+    loop._begin_iteration(loop.state.progress.iteration)
+    return {"own": own, "others": loop.incident._others["motion"].tolist()}
+
+
+def test_start_frames_follow_the_failures_of_all_ranks(told: list[Any]) -> None:
+    first, second = told
+    assert first["others"] == second["own"] and second["others"] == first["own"]
+    assert first["own"] != second["own"] and min(sum(first["own"]), sum(second["own"])) > 0
 
 
 # -- algorithms -------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from shared_store.layout import Store
-from tests.support.worker.broken_task import Rooted
+from tests.support.worker.broken_task import Rooted, RootedCritic, Rotten, RottenInTorch
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner
@@ -49,7 +49,7 @@ def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None
     put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0], [900.0, 0.0], [0.0, 0.0], [math.nan, 0.0]])
     task.step(STILL)
     assert task.dones.tolist() == [False, True, False, True] and statistics(task)["nan_worlds"] == 2
-    assert task.read_mishap(int(task.mishap)) == (1, "its reward was not finite")
+    assert task.read_mishap(int(task.mishap)) == (1, "its reward term velocity was not finite")
     put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0]] * 3 + [[math.nan, 0.0]])
     task.step(STILL)
     assert task.read_mishap(int(task.mishap)) == (
@@ -61,13 +61,38 @@ def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None
     assert task.dones.tolist() == [False, False, True, False] and task.rewards[2] == 0, "finite, but past belief"
 
 
-def rooted(path: Path, limit: float) -> Loop:
-    name = "tests.support.worker.broken_task:Rooted"
-    return runner(training(path, iterations=3, worlds=16, config={"nan_limit": limit}, task=name), task=Rooted)
+def test_a_reward_of_finite_terms_that_overflows_names_none_of_them() -> None:
+    task = Cartpole(CartpoleConfig(rewards={"alive": 3e38, "position": 3e38}), 4, seed=1)
+    put(task, joint_q=[[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]], joint_qd=[[0.0, 0.0]] * 4)
+    task.step(STILL)
+    assert task.read_mishap(int(task.mishap)) == (1, "its reward was not finite, though each of its terms was")
+
+
+def test_a_privileged_observation_that_is_not_finite_is_hidden_and_counted_as_the_policys_is() -> None:
+    task = RootedCritic(CartpoleConfig(), 4, seed=1)
+    put(task, joint_q=[[0.0, 0.0], [0.0, -0.3], [0.0, 0.0], [0.0, 0.0]], joint_qd=[[0.0, 0.0]] * 4)
+    task.step(STILL)
+    critic = task.groups["critic"]
+    assert critic[1, 2] == 0 and critic.isfinite().all() and not task.dones.any()
+    assert statistics(task)["nan_worlds"] == 0 and task.read_mishap(int(task.mishap)) is None
+    saved = task.state_dict()
+    task.step(STILL)
+    assert task.dones.tolist() == [False, True, False, False] and not task.time_outs.any()
+    assert statistics(task)["nan_worlds"] == 1
+    assert task.read_mishap(int(task.mishap)) == (1, "its observation critic.root was not finite")
+    after = task.state_dict()
+    task.load_state_dict(saved)
+    task.step(STILL)
+    assert all(torch.equal(tensor, after[name]) for name, tensor in task.state_dict().items())
+
+
+def broken(path: Path, limit: float, task: type[Cartpole] = Rooted) -> Loop:
+    name = f"{task.__module__}:{task.__qualname__}"
+    return runner(training(path, iterations=3, worlds=16, config={"nan_limit": limit}, task=name), task=task)
 
 
 def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert rooted(tmp_path, 10.0).train() == 0
+    assert broken(tmp_path, 10.0).train() == 0
     output = capsys.readouterr().out
     assert re.search(
         r"warning: iteration \d: \d+ resets? of worlds, among them world \d+: its observation slider_velocity was not finite",
@@ -78,7 +103,7 @@ def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pyte
 
 def test_past_the_limit_it_stops_with_the_state_and_it_happens_again(tmp_path: Path) -> None:
     with pytest.raises(TrainingError) as stop:
-        rooted(tmp_path, 0.0).train()
+        broken(tmp_path, 0.0).train()
     found = re.fullmatch(
         r"iteration (\d): (\d+) resets? of worlds, among them (world \d+: its observation slider_velocity was not finite); that is more "
         r"than nan_limit, 0 times 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.repeat_incident (\S+)",
@@ -94,6 +119,23 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again(tmp_path: P
     assert found[3] in again.stdout and again.stdout.count("joint_q:") >= 1
     angle = re.search(r"joint_q: \[\S+ (\S+)\]", again.stdout)
     assert angle and float(angle[1]) < -0.2, "the pole leant to the left"
+
+
+@pytest.mark.parametrize("task", [Rotten, RottenInTorch])
+def test_the_reward_term_that_is_not_finite_is_named_at_the_end_and_in_the_replay(
+    task: type[Cartpole], tmp_path: Path
+) -> None:
+    with pytest.raises(TrainingError) as stop:
+        broken(tmp_path, 0.0, task).train()
+    found = re.search(
+        r"among them (world \d+): (its reward term rotten was not finite); .*repeat_incident (\S+)", str(stop.value)
+    )
+    assert found, stop.value
+    again = call_worker(repeat_incident.main, {}, found[3])
+    assert again.returncode == 0, again.stderr
+    assert f"{found[1]}: {found[2]}; before it:" in again.stdout
+    terms = set(re.findall(r"  reward terms of the step: (.+)", again.stdout))
+    assert terms <= {"alive 1, rotten nan, fall 0", "alive 0, rotten nan, fall -2"} and terms
 
 
 def test_a_file_that_is_no_incident_is_refused_in_one_line(tmp_path: Path) -> None:

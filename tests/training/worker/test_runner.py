@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,28 @@ from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.support.refusals import refusal
+from tests.support.worker.declared import Sliders
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import run_ranks, training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.distributed import Placement
-from worker.errors import TrainingError, UserError
+from worker.errors import GangError, TrainingError, UserError
 from worker.learning import algorithms
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import StopRequest, configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
+from worker.tasks import Adaptive
+
+
+class Climbing(Sliders):
+    """Sliders with an adaptive number that takes a step in every iteration once episodes have ended."""
+
+    def sections(self) -> dict[str, Any]:
+        rule = Adaptive("events.kick.speed", 0.75, 1.75, steps=9, above=-1e6, below=-2e6)
+        sections = super().sections()
+        return sections | {"curricula": sections["curricula"] | {"kicks": rule}}
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
@@ -121,6 +133,21 @@ def test_what_is_ordered_while_a_device_works_is_the_state_before_that_work(
         assert one.manifest["reward"] == other.manifest["reward"]
     stalls = [record["stall_seconds"] > 0 for record in read_metrics(Store(tmp_path).run("later"))]
     assert stalls == seen
+
+
+def test_a_checkpoint_that_is_ordered_late_names_the_adaptive_steps_of_its_own_iteration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next iteration, in which it is ordered as on a GPU, has moved the number before."""
+    monkeypatch.setattr(CudaGraphFunction, "can_be_captured", True)
+    name = f"{Climbing.__module__}:{Climbing.__qualname__}"
+    loop = train(training(tmp_path, iterations=4, every=1, worlds=2, task=name), task=Climbing)
+    assert loop.task.adapting is not None and loop.task.adapting.steps == {"kicks": 3.0}
+    for checkpoint in list_checkpoints(Store(tmp_path).run("run")):
+        worlds = torch.load(checkpoint.path / "rank-0.pt", weights_only=True)["worlds"]["state"]
+        begun, step = worlds["adaptive_numbers"][0].tolist()
+        assert (begun, step) == (checkpoint.iteration - 1, checkpoint.manifest["adaptive_steps"]["kicks"])
+        assert step == checkpoint.iteration - 1
 
 
 def test_a_chosen_checkpoint_is_gone_on_from(tmp_path: Path) -> None:
@@ -263,6 +290,31 @@ def test_an_unexpected_error_shows_its_traceback(tmp_path: Path) -> None:
 
 def break_down() -> int:
     raise ValueError("a defect")
+
+
+def diverge() -> int:
+    raise TrainingError("iteration 3: the loss is not finite")
+
+
+def meet_nobody() -> int:
+    raise GangError("rank 1 did not report")
+
+
+@pytest.mark.parametrize(("body", "kind"), [(break_down, "ValueError"), (diverge, "worker.errors.TrainingError")])
+def test_the_supervisor_hears_of_the_fault_that_another_attempt_would_meet(
+    tmp_path: Path, body: Callable[[], int], kind: str
+) -> None:
+    errors = tmp_path / "error.json"
+    assert call_worker(body, {"TORCHELASTIC_ERROR_FILE": str(errors)}).returncode == 1
+    fault = json.loads(errors.read_text())["message"]["extraInfo"]["fault"]
+    line = body.__code__.co_firstlineno + 1
+    assert (fault["type"], Path(fault["file"]).name, fault["line"]) == (kind, "test_runner.py", line)
+
+
+def test_what_another_rank_did_is_no_fault(tmp_path: Path) -> None:
+    errors = tmp_path / "error.json"
+    assert call_worker(meet_nobody, {"TORCHELASTIC_ERROR_FILE": str(errors)}).returncode == 1
+    assert json.loads(errors.read_text())["message"]["extraInfo"]["fault"] is None
 
 
 def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,14 +116,18 @@ def test_a_checkpoint_is_durable_before_it_gets_its_name(run: Run, monkeypatch: 
     assert ("rename", str(run.checkpoints / "LATEST")) in after
 
 
-def test_a_commit_that_ended_after_its_rename_is_finished_by_the_next_one_which_writes_nothing_twice(run: Run) -> None:
+def test_a_commit_that_ended_after_its_rename_is_finished_by_the_next_one_which_writes_nothing_twice(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     commit(run, 24)
     first = commit(run, 25)
     before = (first.path / "rank-0.pt").read_bytes()
     (run.checkpoints / "LATEST").write_text("00000024-e1\n")
     writer = CheckpointWriter(run, 25, 1)
     (writer.path / "rank-0.pt").write_bytes(b"something else")
+    seen = durable_operations(monkeypatch)
     assert writer.commit({}) == first
+    assert [what for what, _ in seen] and not [path for _, path in seen if str(path).endswith("manifest.json")]
     first.verify()
     assert (first.path / "rank-0.pt").read_bytes() == before
     assert sorted(os.listdir(run.checkpoints)) == ["00000024-e1", "00000025-e1", "LATEST"]

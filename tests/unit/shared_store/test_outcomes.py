@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from shared_store import outcomes
+from shared_store.faults import Fault
 from shared_store.layout import Run
 
 ERROR = outcomes.FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
@@ -30,10 +31,19 @@ def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(t
     assert max(len(outcome.reason), len(traceback)) <= outcomes.LONGEST_TEXT
 
 
+@pytest.mark.parametrize("fault", [None, Fault("ValueError", "reward.py", 3)])
+def test_an_outcome_comes_back_with_its_fault(tmp_path: Path, fault: Fault | None) -> None:
+    error = replace(ERROR, fault=fault)
+    outcomes.write_outcome(Run(tmp_path), "job", 1, replace(OUTCOME, error=error))
+    assert outcomes.read_outcome(Run(tmp_path), "job", 1, 0) == replace(OUTCOME, error=error)
+
+
 WRONG: list[dict[str, Any]] = [
     *({"exit_code": each} for each in (10**30, -1, 256, "1", True)),
     *({"ended": -1e300}, {"ended": 1e300}, {"started": None}, {"reason": ["x"]}),
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
+    {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": "x"}},
+    {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": {"type": "x"}}},
     *({"error": [1]}, {"error": "x"}, {"other": 1}, {"asked": 1}),
 ]
 

@@ -15,6 +15,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from tests.support.worker.rsl_loop import Seen
 from worker.tasks import BUILT_IN
 from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.gym import TaskVectorEnv
 from worker.tasks.rsl_rl_env import TaskVecEnv
 
 WORLDS = 8
@@ -50,6 +51,34 @@ def test_reset_honours_the_seed(env: VectorEnv) -> None:
     assert len({row.tobytes() for row in first}) == WORLDS, "every world starts differently"
     with pytest.raises(ValueError, match="seed is -1"):
         env.reset(seed=-1)
+
+
+def test_a_reset_with_a_seed_begins_the_same_episodes_whatever_was_played_before() -> None:
+    """Also what outlasts episodes begins anew: the sliders' masses are drawn for each seed, and each world counts its episodes."""
+    task = "tests.support.worker.declared:Sliders"
+    fresh, used = (TaskVectorEnv(task, num_envs=4, seed=seed) for seed in (1, 2))
+    used.reset(seed=3)
+    play(used, steps=40)
+    first, again = play(fresh, seed=7), play(used, seed=7)
+    assert all(np.array_equal(one, other) for one, other in zip(first, again, strict=True))
+    assert torch.equal(fresh.task.groups["critic"], used.task.groups["critic"])
+    assert not np.array_equal(first[-1], play(used, seed=8)[-1])
+
+
+def play(env: TaskVectorEnv, *, seed: int | None = None, steps: int = 20) -> list[np.ndarray]:
+    """The observations of the first steps under the same actions."""
+    draws = np.random.default_rng(0)
+    seen = [env.reset(seed=seed)[0]]
+    seen += [env.step(draws.uniform(-1, 1, env.action_space.shape).astype(np.float32))[0] for _ in range(steps)]
+    return [each for each in seen if isinstance(each, np.ndarray)]
+
+
+def test_the_action_space_has_the_limits_to_which_actions_are_clipped_and_none_else() -> None:
+    limited = TaskVectorEnv("tests.support.worker.declared:Sliders", num_envs=1).single_action_space
+    assert isinstance(limited, gymnasium.spaces.Box)
+    assert limited.low.tolist() == [-2.0, -2.0] and limited.high.tolist() == [2.0, 2.0]
+    free = TaskVectorEnv("tests.support.worker.declared:FreeSliders", num_envs=1).single_action_space
+    assert isinstance(free, gymnasium.spaces.Box) and not free.is_bounded("below") and not free.is_bounded("above")
 
 
 def test_same_step_reset_keeps_the_final_observation(env: VectorEnv) -> None:

@@ -43,7 +43,8 @@ class AdaptiveSampling:
 
     The motion is cut into parts. A part's probability is proportional to its failures plus ``even`` divided by the number of parts; each
     part then also counts those of the next ``reach - 1`` parts, each with ``decay`` times the weight of the one before. Failures are
-    averaged over all worlds of a rank: in each step, ``rate`` times the new failures plus ``1 - rate`` times the old ones.
+    summed over all worlds of the gang: in each step, ``rate`` times the new failures plus ``1 - rate`` times the old ones. Those of other
+    ranks are as they were when the training iteration began.
 
     Attributes:
         seconds: Length of a part [s].
@@ -165,13 +166,14 @@ class FrameSampling:
         arrays.likely = wp.zeros(parts, dtype=wp.float32, device=device)
         arrays.evenness = wp.ones(1, dtype=wp.float32, device=device)
         self._sums = wp.zeros(parts, dtype=wp.int64, device=device)
+        self._others = wp.zeros(parts, dtype=wp.int64, device=device)
         self._share()
 
     def advance(self) -> None:
         """Count the failures of the previous step, before the draws of this one. Launches only."""
         if self._declaration is None:
             return
-        self._sums.zero_()
+        wp.copy(self._sums, self._others)
         self._launch(_count, self.arrays.failures.shape, self._declaration.rate)
         self.arrays.failed.fill_(-1)
         self._share()
@@ -181,6 +183,20 @@ class FrameSampling:
         if self._declaration is None:
             return {}
         return {name: wp.to_torch(getattr(self.arrays, name)) for name in ("frames", "failed", "failures")}
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether failures count; else all frames are equally likely."""
+        return self._declaration is not None
+
+    def own_failures(self) -> torch.Tensor:
+        """The failures in each part, of the worlds of this rank, as integer multiples of 1e-9; shape ``(parts,)``, int64."""
+        failures: torch.Tensor = wp.to_torch(self.arrays.failures)
+        return (failures * float(_SCALE)).to(torch.int64).sum(0)
+
+    def take_failures(self, others: torch.Tensor) -> None:
+        """From now on, count these failures of the worlds of other ranks too; as :meth:`own_failures` returns them."""
+        wp.to_torch(self._others).copy_(others)
 
     def _share(self) -> None:
         if self._declaration is not None:

@@ -145,18 +145,18 @@ class RecordedMotion:
     needs_bodies = False
 
     def __init__(self, arrays: MotionArrays, names: tuple[str, ...], sampling: FrameSampling) -> None:
-        self.arrays, self.names, self._sampling = arrays, names, sampling
+        self.arrays, self.names, self.sampling = arrays, names, sampling
 
     def advance(self) -> None:
         """Count the failures. The command of a world is its present frame."""
-        self._sampling.advance()
+        self.sampling.advance()
 
     def settle(self) -> None:
         """No-op: a reset changes nothing."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """State of the sampling."""
-        return self._sampling.state_tensors()
+        return self.sampling.state_tensors()
 
 
 def _read(file: Path, joints: int, bodies: int) -> dict[str, np.ndarray]:

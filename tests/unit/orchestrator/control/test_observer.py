@@ -23,9 +23,10 @@ AWAY = NodeStatus(NodePhase.UNREACHABLE, words="the engine is away")
 
 
 class Gang:
-    """A gang of two nodes, the pool for the store, and the outcomes there."""
+    """A gang of two nodes, the pool for the store, and the outcomes there. Without an ``endpoint`` the bus is off."""
 
-    def __init__(self) -> None:
+    def __init__(self, endpoint: str | None = "tcp/127.0.0.1:7447") -> None:
+        self.presence = Presence()
         self.pool, self.written, self.status = SlowPool(), dict[int, Outcome](), list[NodeStatus]()
         errands = Errands(self.pool, "/store", lambda _: None)
         engine = SimpleNamespace(observe=lambda _: self.status, asked=lambda _: 0.0)
@@ -33,7 +34,7 @@ class Gang:
             engine,  # type: ignore[arg-type]
             SimpleNamespace(outcomes=self._outcomes),  # type: ignore[arg-type]
             errands,
-            SimpleNamespace(presence=Presence(), endpoint="tcp/127.0.0.1:7447"),  # type: ignore[arg-type]
+            SimpleNamespace(presence=self.presence, endpoint=endpoint),  # type: ignore[arg-type]
             SimpleNamespace(now=lambda: 0),  # type: ignore[arg-type]
         )
         self.job = job("job")
@@ -63,6 +64,19 @@ def test_an_outcome_that_was_not_there_before_the_node_ended_is_looked_for_again
     seen = gang.look(*running)
     assert isinstance(seen, Observed) and seen.ends[1] is None
     assert seen.ends[0] is not None and (seen.ends[0].exit_code, seen.ends[0].reason) == (0, "exit 0")
+
+
+@pytest.mark.parametrize("is_on", [True, False])
+def test_outcomes_of_nodes_that_an_earlier_controller_met_are_looked_for_only_where_there_is_a_bus(is_on: bool) -> None:
+    gang, runs = Gang("tcp/127.0.0.1:7447" if is_on else None), NodeStatus(NodePhase.RUNNING)
+    gang.presence.expect("job", 1, 2, met=[0, 1])
+    seen = gang.look(runs, runs)
+    assert isinstance(seen, Observed) and [each is not None for each in seen.silences] == [is_on] * 2
+    assert bool(gang.pool.calls) is is_on and gang.observer.has_silent(("job", 1)) is is_on
+    for node in range(2):
+        gang.presence.came(("job", 1, node))
+    gang.look(runs, runs)
+    assert not gang.observer.has_silent(("job", 1))
 
 
 def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_without_an_outcome() -> None:

@@ -42,7 +42,8 @@ from orchestrator.domain.attempt_instructions import (
     WindUp,
     Withdraw,
 )
-from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
+from orchestrator.domain.excerpts import LONGEST_REASON
+from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.domain.native_options import NativeOptions
 
 T = 1_000_000
@@ -315,6 +316,17 @@ S = Status
 DONE_SO, LAST_SO = "done before it was preempted", "why (attempt 2 of 3)"
 STOPPED_LATE = "done before it was stopped"
 
+FAULT, OTHER = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
+
+
+def faulty(before: str | None, now: str | None = FAULT, **terms: Any) -> State:
+    """The second attempt ends by a fault, and the last spent one ended by ``before``."""
+    state = with_terms(ending(Ending.FAILED, exit_code=1), last_fault=before, **terms)
+    return replace(state, verdict=replace(FAILED, reason="why", fault=now))
+
+
+REPEATED_SO = f"why ({FAULT} ended the attempt before, too: not tried again after 2 of 3 attempts; correct it before you resume or submit again)"
+
 # state, the nodes' ends → whether the attempt is spent, the job's state, and its reason
 CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
@@ -349,6 +361,26 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
     "failed the last time, on AWS": (on_aws(FAILED_LAST), MAIN_FAILED, SPENT, S.FAILED, "why"),
     "failed as no retry mends": (final(4, CODE_4), (end(4), None), SPENT, S.FAILED, LAST_SO),
     "failed for the reason that no retry mends": (final(3, REASON_3), (end(3), None), SPENT, S.FAILED, LAST_SO),
+    "failed by a fault": (faulty(None), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "failed by the same fault twice": (faulty(FAULT), MAIN_FAILED, SPENT, S.FAILED, REPEATED_SO),
+    "failed by two faults": (faulty(OTHER), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "failed for no fault after a fault": (faulty(FAULT, None), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "failed twice for no fault": (faulty(None, None), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "failed by the same fault twice, on AWS": (on_aws(faulty(FAULT)), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
+    "failed by the same fault when it was asked to stop": (
+        asked(faulty(FAULT)),
+        MAIN_FAILED,
+        SPENT,
+        S.FAILED,
+        STOPPED_SO,
+    ),
+    "failed by the same fault the last time": (
+        faulty(FAULT, spent=2),
+        MAIN_FAILED,
+        SPENT,
+        S.FAILED,
+        "why (attempt 3 of 3)",
+    ),
     "not started": (NEVER_STARTED, (), SPENT, S.RUNNABLE, FAILED_SO),
     "not started for a reason that no retry mends": (
         with_terms(NEVER_STARTED, conditions=[WHY]),
@@ -382,6 +414,25 @@ EVENTS = (
     ),
     *(Delayed("why"), Gone(T, MAIN_LAST, "")),
 )
+
+
+def test_a_long_reason_leaves_room_for_the_fault_that_came_again() -> None:
+    state = faulty(FAULT)
+    long = replace(state, verdict=replace(FAILED, reason="y" * 5000, fault=FAULT))
+    (close,) = step(long, Gone(T, MAIN_FAILED, SAVED))
+    assert isinstance(close, Close) and close.reason.endswith(REPEATED_SO.removeprefix("why"))
+    assert len(close.reason) == LONGEST_REASON and close.reason.startswith("yyyy")
+
+
+@pytest.mark.parametrize("policy", ["restart", "ignore", "fail"])
+def test_the_fault_of_the_node_that_was_the_cause_is_the_attempts(policy: str) -> None:
+    main, child = end(1, fault=FAULT), replace(end(1, fault=OTHER), ended=2.0)
+    verdict = judge(policy, 0, (main, child))
+    assert verdict is not None and verdict.fault == FAULT
+    late = judge(policy, 0, (replace(main, ended=3.0), child))
+    assert late is not None and late.fault == (FAULT if policy == "ignore" else OTHER)
+    aws = judge_as_aws(0, (main, child), "host")
+    assert aws is not None and aws.fault is None
 
 
 @pytest.mark.parametrize("event", EVENTS, ids=lambda event: type(event).__name__)

@@ -7,14 +7,15 @@ from typing import Any
 
 import pytest
 
-from orchestrator.control.endings import seen_end
+from orchestrator.control.endings import node_end, seen_end
 from orchestrator.engines.api import Cause, NodePhase, NodeStatus
 from orchestrator.engines.ray.engine import _status as ray_status
 from orchestrator.engines.slurm.commands import SlurmJob
 from orchestrator.engines.slurm.engine import _node as slurm_node
 from orchestrator.engines.slurm.engine import _queued as slurm_queued
 from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
-from shared_store.outcomes import Outcome
+from shared_store.faults import Fault
+from shared_store.outcomes import FirstError, Outcome
 
 ENDED, QUEUED, RUNNING, STARTING = NodePhase.ENDED, NodePhase.QUEUED, NodePhase.RUNNING, NodePhase.STARTING
 MEETING = "muster: meeting " + json.dumps({"addresses": ["10.0.0.1", "10.0.0.2"]}) + "\n"
@@ -172,3 +173,22 @@ def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
         assert end.reason == (told or "the supervisor died without an outcome")
     preempted = seen_end(NodeStatus(ENDED, "", "preempted by Slurm", Cause.PREEMPTED, 75), False, 5.0)
     assert (preempted.lost, preempted.exit_code) == (True, 137), "a job of the Batch API has lost its host"
+
+
+@pytest.mark.parametrize(
+    ("cause", "asked", "is_told"),
+    [
+        (Cause.EXIT, False, True),
+        (None, False, True),
+        (Cause.EXIT, True, False),
+        *((each, False, False) for each in Cause if each is not Cause.EXIT),
+    ],
+)
+def test_the_fault_of_an_outcome_counts_unless_the_node_was_ended_from_outside(
+    cause: Cause | None, asked: bool, is_told: bool
+) -> None:
+    error = FirstError(0, "ValueError: bad", "", 1.0, Fault("ValueError", "reward.py", 3))
+    outcome = Outcome(0, 1, 1, None, "rank 0 exited with code 1", error, 1.0, 2.0, asked)
+    end, _ = node_end(outcome, NodeStatus(ENDED, cause=cause, exit_code=1), True, 3000)
+    assert end.fault == ("ValueError in reward.py, line 3" if is_told else None)
+    assert node_end(Outcome(0, 1, 1, None, "why", None, 1.0, 2.0), NodeStatus(ENDED), True, 3000)[0].fault is None

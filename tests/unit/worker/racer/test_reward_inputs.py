@@ -208,7 +208,7 @@ def test_a_world_whose_function_fails_is_reset_and_counted(prefix: str) -> None:
     assert line.startswith("reward.py:") and "ZeroDivisionError" in line and found == (2, 0) and not others
     assert task.statistics[task.statistic_names.index("nan_worlds")] == 2
     mishap = task.read_mishap(int(task.mishap))
-    assert mishap == (0, f"its reward was not finite: {line}")
+    assert mishap == (0, f"its reward term reward was not finite: {line}")
 
 
 def test_a_function_that_never_returns_ends_the_task_with_one_line() -> None:

@@ -1,0 +1,127 @@
+"""Faults: the Python exceptions that would end the next attempt of a job as they ended this one, known by type, file and line.
+
+Memory, signals, hosts, volumes, networks, GPUs and collectives fail by chance or because something else did: their exceptions are no faults.
+"""
+
+from __future__ import annotations
+
+import builtins
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+_LONGEST_NAME, _LONGEST_FILE = 128, 512
+"""Characters that are kept of a type's name and of a file's path, the ends of both."""
+_CHAINED = re.compile(
+    r"^(?:During handling of the above exception, another exception occurred|"
+    r"The above exception was the direct cause of the following exception):$",
+    re.MULTILINE,
+)
+_START = "Traceback (most recent call last):"
+_FRAME = re.compile(r'  File "(.+)", line ([0-9]{1,9})(?:, in .+)?')
+_EXCEPTION = re.compile(r"([A-Za-z_][\w.]*)(?:: (.*))?")
+_OUTSIDE = (
+    "GangError",
+    "StaleEpoch",
+    "DamagedCheckpoint",
+    "DamagedFile",
+    "StoreError",
+    "KeyboardInterrupt",
+    "SystemExit",
+)
+"""Names of types, without their modules, of what ends a rank from outside."""
+_OUTSIDE_TYPES = (OSError, MemoryError, EOFError)
+_OUTSIDE_NAMES = re.compile(
+    r"Memory|Connect|Timeout|TimedOut|Network|Socket|HTTP|SSL|URL|Unavailable|Retry|gaierror|Dist[A-Z]\w*Error|DistError|Accelerator|"
+    r"Subprocess|CalledProcess|BrokenProcess|BrokenExecutor"
+)
+_OUTSIDE_WORDS = re.compile(
+    r"out of memory|failed to allocate|can't allocate memory|cannot allocate memory|CUDA (?:error|driver)|cuDNN|cuBLAS|NCCL|gloo|by peer|"
+    r"connection (?:closed|reset|refused|aborted)|timed out|broken pipe|no space left|input/output error|stale file handle|"
+    r"DataLoader worker",
+    re.IGNORECASE,
+)
+_COLLECTIVES = "torch/distributed/"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A Python exception that ended a rank, without its message."""
+
+    type: str
+    """Its class, with the module unless that is ``builtins``."""
+    file: str
+    """Path of the file that raised it, relative to the rank's directory if it lies there."""
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.type} in {self.file}, line {self.line}"
+
+
+def fault_in(text: str, directory: Path | None = None) -> Fault | None:
+    """The fault in a traceback, as Python prints it; None for an exception that another attempt may not meet, or without a traceback.
+
+    Args:
+        text: Ends with the traceback. Exceptions that led to it, also printed, must be faults too.
+        directory: The rank's working directory; None: that of this process.
+    """
+    fault, above = None, f"{directory or _here()}/"
+    for part in reversed(_CHAINED.split(text)):
+        if (found := _last(part)) is None:
+            return None
+        name, message, file, line = found
+        if _is_from_outside(name, message, file):
+            return None
+        fault = fault or _bounded(Fault(name, file.removeprefix(above), line))
+    return fault
+
+
+def fault_from(value: object) -> Fault | None:
+    """The fault of its ``asdict`` form, which a job can write itself, with bounded texts; None for None. Raises TypeError if it is damaged."""
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise TypeError("a fault is a mapping")
+    fault = Fault(**value)
+    if not isinstance(fault.type, str) or not isinstance(fault.file, str) or type(fault.line) is not int:
+        raise TypeError("a field of a fault is of the wrong type")
+    if not 0 <= fault.line < 2**31:
+        raise TypeError("a fault is in a line that no file has")
+    return _bounded(fault)
+
+
+def _bounded(fault: Fault) -> Fault:
+    return Fault(fault.type[-_LONGEST_NAME:], fault.file[-_LONGEST_FILE:], fault.line)
+
+
+def _here() -> str:
+    """This process's working directory; empty where it is deleted."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
+def _last(text: str) -> tuple[str, str, str, int] | None:
+    """Type, message, file and line of the last traceback in a text; the message's first line alone."""
+    lines = text.rpartition(_START)[2].split("\n")[1:] if _START in text else []
+    frame = None
+    for line in lines:
+        if not line.startswith(" "):
+            found = _EXCEPTION.fullmatch(line)
+            return (found[1], found[2] or "", frame[1], int(frame[2])) if found and frame else None
+        frame = _FRAME.fullmatch(line) or frame
+    return None
+
+
+def _is_from_outside(name: str, message: str, file: str) -> bool:
+    short = name.rpartition(".")[2]
+    known = getattr(builtins, name, None)
+    return (
+        short in _OUTSIDE
+        or (isinstance(known, type) and issubclass(known, _OUTSIDE_TYPES))
+        or _OUTSIDE_NAMES.search(short) is not None
+        or _OUTSIDE_WORDS.search(message) is not None
+        or _COLLECTIVES in file
+    )
