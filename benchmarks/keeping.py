@@ -6,7 +6,7 @@
 Each training is a process of its own; ``keeping.jsonl`` gets a line whenever one has made a two-hundredth of its iterations. Trainings
 that the file already holds whole are left out, so a run that was cut off goes on where it stopped. Every spec is trained ``default``, with
 the settings that a new job gets; and on request as ``then``, with those of runs that began before limits existed, by ``stock`` rsl_rl, or
-with settings of your own: ``--by 'name={"min_std": 0.05}'``.
+with settings of your own: ``--by 'name={"min_std": 0.05}'``. Where matplotlib is missing there is no picture.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ PLAN: dict[str, tuple[int, float]] = {
     **dict.fromkeys(("cartpole", "racer", "my-task"), (10, 10)),
     **dict.fromkeys(("cartpole-pixels", "ant", "humanoid"), (3, 5)),
     **dict.fromkeys(("quadruped", "go1-flat", "g1-flat"), (2, 2)),
-    **dict.fromkeys(("racer-pixels", "lift-cube", "lift-cubes", "go1-rough", "g1-rough", "g1-walk", "g1-rough-walk"), (1, 1)),
+    **dict.fromkeys(
+        ("racer-pixels", "lift-cube", "lift-cubes", "go1-rough", "g1-rough", "g1-walk", "g1-rough-walk"), (1, 1)
+    ),
 }
 """By spec: seeds, and how many times its iterations."""
 ON_CPU = ("cartpole", "racer", "my-task")
@@ -42,7 +44,16 @@ WORLDS = {"ant": 4096}
 """Instead of a spec's worlds: with these the ant learns to run, as its spec says."""
 POINTS = 200
 """Points of a curve."""
-SHOWN = ("kl", "learning_rate", "action_std", "explained_variance", "clip_fraction", "gradient_norm", "saturation", "v_max_mass")
+SHOWN = (
+    "kl",
+    "learning_rate",
+    "action_std",
+    "explained_variance",
+    "clip_fraction",
+    "gradient_norm",
+    "saturation",
+    "v_max_mass",
+)
 COUNTED = ("nan_worlds", "solver_overflows")
 THEN = {"learning_rate_horizon": None, "min_std": 1e-6, "max_std": 1e6, "normalizer_horizon": None}
 
@@ -161,7 +172,9 @@ class Trainer:
                 for line in process.stdout:
                     if line.startswith("{"):
                         warm.set()
-                        self._append({**dict(zip(("spec", "by", "seed"), training.key, strict=False)), **json.loads(line)})
+                        self._append(
+                            {**dict(zip(("spec", "by", "seed"), training.key, strict=False)), **json.loads(line)}
+                        )
             print(*training.key, "done" if process.returncode == 0 else f"failed: {process.returncode}", flush=True)
         finally:
             warm.set()
@@ -211,8 +224,10 @@ class Outcome:
 
     @property
     def kept(self) -> float:
-        """The last mean as a share of the best one."""
-        return self.end / self.best if self.best > 0 else float("nan")
+        """The last mean as a share of the best one, of returns below 0 as a share of the gain."""
+        if self.best > 0:
+            return self.end / self.best
+        return (self.end - self.first) / (self.best - self.first) if self.best > self.first else 1.0
 
     @classmethod
     def of(cls, curve: Curve) -> Outcome:
@@ -225,7 +240,11 @@ class Outcome:
 def weighted(points: Curve) -> float | None:
     """Mean return of the episodes of some points; None without any."""
     episodes = sum(point["episodes"] for point in points)
-    return sum(point["episodes"] * point["reward"] for point in points if point["episodes"]) / episodes if episodes else None
+    return (
+        sum(point["episodes"] * point["reward"] for point in points if point["episodes"]) / episodes
+        if episodes
+        else None
+    )
 
 
 def reached(curve: Curve, goal: float) -> int | None:
@@ -261,7 +280,11 @@ def table(curves: Mapping[Key, Curve]) -> str:
             outcomes = [Outcome.of(curve) for curve in its]
             kept = [outcome.kept for outcome in outcomes]
             times = [at for curve in its if goal is not None and (at := reached(curve, goal)) is not None]
-            soon = f"{median([float(at) for at in times]):.0f} ({max(times)})" if len(times) == len(its) else f"{len(times)} of {len(its)}"
+            soon = (
+                f"{median([float(at) for at in times]):.0f} ({max(times)})"
+                if len(times) == len(its)
+                else f"{len(times)} of {len(its)}"
+            )
             deviations = [curve[-1]["action_std"] for curve in its if "action_std" in curve[-1]]
             deviation = f"{min(deviations):.2g} to {max(deviations):.2g}" if deviations else "–"
             lines.append(
@@ -328,9 +351,11 @@ def main() -> None:
     if not options.table:
         Trainer(path, options.gpus).train_all(planned(options), options.at_once)
     curves = curves_of(path)
-    (options.out / "keeping.md").write_text(table(curves))
-    with contextlib.suppress(ImportError):
-        draw(curves, options.out / "keeping.png")
+    print(table(curves))
+    if options.table:
+        (options.out / "keeping.md").write_text(table(curves))
+        with contextlib.suppress(ImportError):
+            draw(curves, options.out / "keeping.png")
 
 
 if __name__ == "__main__":

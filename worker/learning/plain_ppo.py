@@ -162,7 +162,9 @@ class PlainPPO:
             sums += told
             if config.schedule == "adaptive":
                 self.rate = self._adapted_rate(kl=float(told[3]))
-            found = [nn.utils.clip_grad_norm_(each.parameters(), config.max_grad_norm) for each in (self.actor, self.critic)]
+            found = [
+                nn.utils.clip_grad_norm_(each.parameters(), config.max_grad_norm) for each in (self.actor, self.critic)
+            ]
             norms += torch.stack(found).norm()
             self.optimizer.param_groups[0]["lr"] = self.rate
             self.optimizer.step()
@@ -170,8 +172,22 @@ class PlainPPO:
         if self._normalizer_learns:
             self.actor.update_normalizer(samples["seen"], self.setting)
             self.critic.update_normalizer(samples["judged"], self.setting)
-        numbers = (*(sums / len(orders)), torch.tensor(self.rate, device=device), old_deviation.mean(), norms / len(orders))
-        names = ("surrogate_loss", "value_loss", "entropy", "kl", "clip_fraction", "learning_rate", "action_std", "gradient_norm")
+        numbers = (
+            *(sums / len(orders)),
+            torch.tensor(self.rate, device=device),
+            old_deviation.mean(),
+            norms / len(orders),
+        )
+        names = (
+            "surrogate_loss",
+            "value_loss",
+            "entropy",
+            "kl",
+            "clip_fraction",
+            "learning_rate",
+            "action_std",
+            "gradient_norm",
+        )
         return {**dict(zip(names, numbers, strict=True)), **self._describe(samples)}
 
     @torch.no_grad()
