@@ -140,6 +140,8 @@ class PPO:
         self._rows = torch.zeros(share * worlds, dtype=torch.long, device=self.device)
         self._ones = torch.ones(share * worlds, device=self.device)
         self._loss_sums = torch.zeros(len(LOSSES), device=self.device)
+        self._squares = torch.zeros(2, device=self.device)
+        """Squared norms of the gradients of actor and critic."""
         self._norm_sum = torch.zeros((), device=self.device)
         self._metrics = torch.zeros(len(METRICS), device=self.device)
 
@@ -256,10 +258,12 @@ class PPO:
         """One step of the optimizer with the gradients and losses of all ranks."""
         self._loss_sums.add_(self._losses)
         self._adapt_learning_rate(self._losses[LOSSES.index("kl")])
-        actor, critic = (torch.dot(gradient, gradient) for gradient in self._gradients)
-        self._norm_sum.add_((actor + critic).sqrt())
-        for gradient, square in zip(self._gradients, (actor, critic), strict=True):
-            gradient.mul_((self.config.max_grad_norm / (square.sqrt() + 1e-6)).clamp(max=1.0))
+        for gradient, square in zip(self._gradients, self._squares, strict=True):
+            torch.dot(gradient, gradient, out=square)
+        scales = (self.config.max_grad_norm / (self._squares.sqrt() + 1e-6)).clamp(max=1.0)
+        self._norm_sum.add_(self._squares.sum().sqrt())
+        for gradient, scale in zip(self._gradients, scales, strict=True):
+            gradient.mul_(scale)
         self.optimizer.step()
         self._head.project()
 
@@ -271,8 +275,8 @@ class PPO:
         figures["squared_returns"].copy_(rollout.returns.double().square().sum())
         figures["clipped"].copy_(self._head.clipped.sum(dtype=torch.float64))
         if self._ranged:
-            least, greatest = self._ranges
-            figures["saturated"].copy_(((rollout.actions < least) | (rollout.actions > greatest)).sum())
+            within = torch.clamp(rollout.actions, *self._ranges)
+            figures["saturated"].copy_(torch.count_nonzero(within != rollout.actions))
 
     @torch.no_grad()
     def _close(self) -> None:

@@ -49,7 +49,7 @@ class PPOConfig:
     """Learning rate of the optimizer (the initial one of an adaptive schedule)."""
     learning_rate_limits: Annotated[tuple[Positive, Positive], Field(strict=False)] = (1.0e-5, 1.0e-2)
     """Least and greatest learning rate of the adaptive schedule."""
-    learning_rate_horizon: Count | None = None
+    learning_rate_horizon: Count | None = 100
     """Iterations for which the adaptive rate may reach its greatest value; that value then falls in inverse proportion to the iteration,
     so that a policy that has learnt is no longer changed by large steps. None: it never falls."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
