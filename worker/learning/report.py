@@ -96,7 +96,7 @@ class Report:
             directory.stat()  # it would be made where another volume is
             return SummaryWriter(str(directory), purge_step=first, filename_suffix=f".e{job.epoch}", flush_secs=10)
 
-        self._watch = Watch(job.run.name, training.iterations, training.settings)
+        self._watch = Watch(job.run.name, self._iterations, getattr(training, "settings", None))
         with suppress(OSError):  # without them it begins anew
             earlier = sampled(job.run, HISTORY) if resumed_from else []
             self._watch.follow(record for record in earlier if record["iteration"] <= resumed_from)
