@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -198,17 +199,16 @@ class PlainPPO:
     def _describe(self, samples: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """How much of the returns' variance the critic explained, and how many actions were beyond their range, over all ranks."""
         returns, errors = samples["returns"].double(), (samples["returns"] - samples["values"]).double()
-        sums = torch.stack((returns.sum(), returns.square().sum(), errors.sum(), errors.square().sum()))
+        ranges = [each or (-math.inf, math.inf) for each in self.setting.action_ranges] or [(-math.inf, math.inf)]
+        least, greatest = torch.tensor(ranges, device=returns.device).t()
+        beyond = (samples["actions"] < least) | (samples["actions"] > greatest)
+        squares = returns.square().sum(), errors.square().sum()
+        sums = self.gang.sum(torch.stack((returns.sum(), errors.sum(), *squares, beyond.sum().double())))
         count = self.setting.share.total * self.steps
-        of_returns, returns_squared, of_errors, errors_squared = self.gang.sum(sums)
-        spread = returns_squared - of_returns.square() / count
-        figures = {"explained_variance": 1 - (errors_squared - of_errors.square() / count) / spread.clamp(min=1e-12)}
-        ranges = dict(item for item in enumerate(self.setting.action_ranges) if item[1])
-        if ranges:
-            taken = samples["actions"][:, list(ranges)]
-            least, greatest = torch.tensor([*ranges.values()], device=taken.device).t()
-            beyond = self.gang.sum(((taken < least) | (taken > greatest)).sum().double())
-            figures["saturation"] = beyond / (count * len(ranges))
+        of_returns, of_errors = sums[2:4] - sums[:2].square() / count  # count · variance
+        figures = {"explained_variance": 1 - of_errors / of_returns.clamp(min=1e-12)}
+        if limited := sum(each is not None for each in self.setting.action_ranges):
+            figures["saturation"] = sums[4] / (count * limited)
         return figures
 
     @torch.no_grad()
