@@ -1,10 +1,10 @@
 """Whether trainings keep what they learnt: many seeds, several times as long as the specs in ``job_specs`` train.
 
     python -m benchmarks.keeping [cartpole ant ...] [--by default then stock] [--at-once 8] [--out DIRECTORY]
-    python -m benchmarks.keeping --table                        # writes keeping.md and keeping.png from keeping.jsonl
+    python -m benchmarks.keeping --table                        # writes keeping.md, keeping.json and keeping.png
 
 Each training is a process of its own; ``keeping.jsonl`` gets a line whenever one has made a two-hundredth of its iterations. Trainings
-that the file already holds whole are left out, so a run that was cut off goes on where it stopped. Every spec is trained ``default``, with
+that it or ``keeping.json`` already holds whole are left out, so a run that was cut off goes on where it stopped. Every spec is trained ``default``, with
 the settings that a new job gets; and on request as ``then``, with those of runs that began before limits existed, by ``stock`` rsl_rl, or
 with settings of your own: ``--by 'name={"min_std": 0.05}'``. Where matplotlib is missing there is no picture.
 """
@@ -28,6 +28,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from worker.learning.ppo.settings import PPOConfig
 
 SPECS = Path(__file__).parents[1] / "job_specs"
 PLAN: dict[str, tuple[int, float]] = {
@@ -54,8 +56,10 @@ SHOWN = (
     "saturation",
     "v_max_mass",
 )
+KINDS = ("default", "then", "stock")
+KEPT_COLUMNS = ("iteration", "episodes", "reward", "action_std")
+"""Those that ``keeping.json`` keeps of a point."""
 COUNTED = ("nan_worlds", "solver_overflows")
-THEN = {"learning_rate_horizon": None, "min_std": 1e-6, "max_std": 1e6, "normalizer_horizon": None}
 
 
 @dataclass
@@ -148,7 +152,7 @@ class Trainer:
 
     def train_all(self, plan: list[Training], at_once: int) -> None:
         """``at_once``: processes at the same time. The first of each spec compiles kernels, for which the others wait."""
-        done = {key for key, points in curves_of(self._path).items() if points[-1]["iteration"] == key[3]}
+        done = {key for key, points in curves_of(self._path.parent).items() if is_whole(key, points)}
         plan = [training for training in plan if training.key not in done]
         first = {training.spec: training for training in reversed(plan)}
         plan.sort(key=lambda training: training is not first[training.spec])
@@ -193,17 +197,41 @@ Key = tuple[str, str, int, int]
 """Spec, settings, seed, iterations."""
 
 
-def curves_of(path: Path) -> dict[Key, Curve]:
-    """The points of each training in the file; of a training that was begun twice, those of the last time."""
+def curves_of(directory: Path) -> dict[Key, Curve]:
+    """The points of each training in ``keeping.json`` and ``keeping.jsonl``; of a training that was begun twice, those of the last time."""
     found: dict[Key, Curve] = {}
-    for line in path.read_text().splitlines() if path.exists() else ():
+    kept, new = directory / "keeping.json", directory / "keeping.jsonl"
+    for curve in json.loads(kept.read_text()) if kept.exists() else ():
+        key = curve["spec"], curve["by"], curve["seed"], curve["iterations"]
+        found[key] = [dict(zip(KEPT_COLUMNS, point, strict=True)) for point in curve["points"]]
+    for line in new.read_text().splitlines() if new.exists() else ():
         point = json.loads(line)
         key = point["spec"], point["by"], point["seed"], point["iterations"]
-        curve = found.setdefault(key, [])
-        if curve and point["iteration"] <= curve[-1]["iteration"]:
-            curve.clear()
-        curve.append(point)
+        points = found.setdefault(key, [])
+        if points and point["iteration"] <= points[-1]["iteration"]:
+            points.clear()
+        points.append(point)
     return found
+
+
+def keep(curves: Mapping[Key, Curve], path: Path) -> None:
+    """Write the finished trainings, with the columns that the table needs; one a line."""
+    lines = []
+    for key, points in sorted(curves.items()):
+        if is_whole(key, points):
+            rows = [[short(point.get(name)) for name in KEPT_COLUMNS] for point in points]
+            head = dict(zip(("spec", "by", "seed", "iterations"), key, strict=True))
+            lines.append(json.dumps({**head, "points": rows}, separators=(",", ":")))
+    path.write_text("[\n" + ",\n".join(lines) + "\n]\n")
+
+
+def short(value: Any) -> Any:
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def is_whole(key: Key, curve: Curve) -> bool:
+    """Whether a training came to its end."""
+    return bool(curve[-1]["iteration"] >= key[3] - key[3] // POINTS)
 
 
 # -- the table ----------------------------------------------------------------------------------------------------------
@@ -252,6 +280,15 @@ def reached(curve: Curve, goal: float) -> int | None:
     return next((point["iteration"] for point in curve if point["episodes"] and point["reward"] >= goal), None)
 
 
+def dipped(curve: Curve) -> bool:
+    """Whether a mean over :data:`WIDTH` fell below :data:`KEPT` of the best one after another had reached that."""
+    width = max(1, round(WIDTH * len(curve)))
+    means = [mean for at in range(len(curve) - width + 1) if (mean := weighted(curve[at : at + width])) is not None]
+    goal = KEPT * max(means)
+    reached = next(at for at, mean in enumerate(means) if mean >= goal)
+    return min(means[reached:]) < goal
+
+
 def median(values: list[float]) -> float:
     ordered = sorted(values)
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
@@ -259,23 +296,28 @@ def median(values: list[float]) -> float:
 
 def table(curves: Mapping[Key, Curve]) -> str:
     """Markdown: a row for each spec and kind of settings, over its seeds."""
-    whole = {key: curve for key, curve in curves.items() if curve[-1]["iteration"] >= key[3] - key[3] // POINTS}
+    whole = {key: curve for key, curve in curves.items() if is_whole(key, curve)}
     lines = [
         "# Do trainings keep what they learnt?",
         "",
         f"`python -m benchmarks.keeping`. Mean returns are over {WIDTH:.0%} of a training, weighted by episodes; *kept* is the last of "
-        f"these means as a share of the best one. The goal of the column *to 90 %* is 90 % of the median best mean of today's settings.",
+        "these means as a share of the best one. *Dipped*: seeds whose mean fell below 90 % of the best one at any time after it had been "
+        "there. *To 90 %*: iterations until a two-hundredth of the training had 90 % of the median best mean of the default settings.",
+        "",
+        "`default` are the settings of a new job; `then` those of runs that began before deviations and rates had limits; `stock` is "
+        "rsl_rl's own runner with the settings of `then`. The other rows are what the defaults were chosen from: *floor* is `min_std` (0.1 "
+        "where not named), *horizon* `learning_rate_horizon`, *normaliser* `normalizer_horizon`.",
         "",
         "![mean return of every seed](keeping.png)",
         "",
-        f"| spec | by | seeds | iterations | seeds that kept {KEPT:.0%} | worst | median best | median end | to 90 % (worst) | deviation at the end |",
-        "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|",
+        f"| spec | by | seeds | iterations | seeds that kept {KEPT:.0%} | worst | dipped | median best | median end | to 90 % (worst) | deviation at the end |",
+        "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    for spec in dict.fromkeys(key[0] for key in whole):
+    for spec in (spec for spec in PLAN if any(key[0] == spec for key in whole)):
         of_spec = {key: curve for key, curve in whole.items() if key[0] == spec}
         usual = [Outcome.of(curve).best for key, curve in of_spec.items() if key[1] == "default"]
         goal = KEPT * median(usual) if usual else None
-        for by, iterations in dict.fromkeys((key[1], key[3]) for key in of_spec):
+        for by, iterations in dict.fromkeys((key[1], key[3]) for key in sorted(of_spec, key=_rank)):
             its = [curve for key, curve in of_spec.items() if (key[1], key[3]) == (by, iterations)]
             outcomes = [Outcome.of(curve) for curve in its]
             kept = [outcome.kept for outcome in outcomes]
@@ -285,23 +327,30 @@ def table(curves: Mapping[Key, Curve]) -> str:
                 if len(times) == len(its)
                 else f"{len(times)} of {len(its)}"
             )
-            deviations = [curve[-1]["action_std"] for curve in its if "action_std" in curve[-1]]
+            deviations = [curve[-1]["action_std"] for curve in its if curve[-1].get("action_std") is not None]
             deviation = f"{min(deviations):.2g} to {max(deviations):.2g}" if deviations else "–"
             lines.append(
-                f"| {spec} | {by} | {len(its)} | {iterations:,} | {sum(each >= KEPT for each in kept)} | {min(kept):.0%} | "
+                f"| {spec} | {by} | {len(its)} | {iterations:,} | {sum(each >= KEPT for each in kept)} | {min(kept):.0%} | {sum(map(dipped, its))} | "
                 f"{median([each.best for each in outcomes]):,.1f} | {median([each.end for each in outcomes]):,.1f} | {soon} | {deviation} |"
             )
     return "\n".join(lines) + "\n"
 
 
+def _rank(key: Key) -> int:
+    return KINDS.index(key[1]) if key[1] in KINDS else len(KINDS)
+
+
 def draw(curves: Mapping[Key, Curve], path: Path) -> None:
-    """Plot the mean return of every seed, a panel for each spec and kind of settings."""
+    """Plot the mean return of every seed, a panel for each spec and each of :data:`KINDS`."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    panels = list(dict.fromkeys(key[:2] for key in curves))
+    curves = {key: curve for key, curve in curves.items() if key[1] in KINDS}
+    panels = list(
+        dict.fromkeys(key[:2] for key in sorted(curves, key=lambda key: (list(PLAN).index(key[0]), _rank(key))))
+    )
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
     figure, places = pyplot.subplots(rows, columns, figsize=(4 * columns, 2.6 * rows), squeeze=False)
@@ -318,7 +367,7 @@ def draw(curves: Mapping[Key, Curve], path: Path) -> None:
 
 def planned(options: argparse.Namespace) -> list[Training]:
     """The trainings that the command asks for."""
-    kinds: dict[str, Mapping[str, Any] | None] = {"default": {}, "then": THEN, "stock": None}
+    kinds: dict[str, Mapping[str, Any] | None] = {"default": {}, "then": PPOConfig.before, "stock": None}
     for given in options.by:
         name, equals, settings = given.partition("=")
         kinds |= {name: json.loads(settings)} if equals else {}
@@ -350,9 +399,10 @@ def main() -> None:
     path = options.out / "keeping.jsonl"
     if not options.table:
         Trainer(path, options.gpus).train_all(planned(options), options.at_once)
-    curves = curves_of(path)
+    curves = curves_of(options.out)
     print(table(curves))
     if options.table:
+        keep(curves, options.out / "keeping.json")
         (options.out / "keeping.md").write_text(table(curves))
         with contextlib.suppress(ImportError):
             draw(curves, options.out / "keeping.png")
