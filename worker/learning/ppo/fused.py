@@ -259,7 +259,7 @@ class PPO:
         self._loss_sums.add_(self._losses)
         self._adapt_learning_rate(self._losses[LOSSES.index("kl")])
         for gradient, square in zip(self._gradients, self._squares, strict=True):
-            torch.dot(gradient, gradient, out=square)
+            square.copy_(torch.dot(gradient, gradient))
         scales = (self.config.max_grad_norm / (self._squares.sqrt() + 1e-6)).clamp(max=1.0)
         self._norm_sum.add_(self._squares.sum().sqrt())
         for gradient, scale in zip(self._gradients, scales, strict=True):
@@ -276,7 +276,7 @@ class PPO:
         figures["clipped"].copy_(self._head.clipped.sum(dtype=torch.float64))
         if self._ranged:
             within = torch.clamp(rollout.actions, *self._ranges)
-            figures["saturated"].copy_(torch.count_nonzero(within != rollout.actions))
+            figures["saturated"].copy_((within != rollout.actions).sum())
 
     @torch.no_grad()
     def _close(self) -> None:

@@ -115,7 +115,7 @@ class RslRl:
 
     def _describe_rollout(self) -> dict[str, torch.Tensor]:
         """Figures of this rank's rollout, each of shape (1,), float64; none without a critic."""
-        storage = getattr(self.algorithm, "storage", None)
+        storage: Any = getattr(self.algorithm, "storage", None)
         if self._distils or not all(hasattr(storage, name) for name in ("returns", "values", "actions")):
             return {}
         returns, errors = storage.returns.double(), (storage.returns - storage.values).double()
