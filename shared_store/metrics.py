@@ -98,6 +98,12 @@ def finite(value: Any) -> float | None:
     return float(value) if is_number else None
 
 
+def warnings_of(record: Mapping[str, Any]) -> list[str]:
+    """What a record says against its training; a job may have written anything into it."""
+    found = record.get("warnings")
+    return [text for text in found if isinstance(text, str)] if isinstance(found, list) else []
+
+
 def scalars(record: Mapping[str, Any]) -> dict[str, float]:
     """A record's numbers by their names in TensorBoard, W&B and MLflow; without the iteration, which is the step, and the time."""
     numbers = {name: value for name, value in record.items() if isinstance(value, int | float)}

@@ -23,6 +23,7 @@ from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
 from shared_store.evaluations import in_one_line
+from shared_store.metrics import finite, warnings_of
 from shared_store.wording import counted, nearest
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -231,6 +232,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["progress"] = (
             f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
         )
+        facts["learning"] = _learning(progress)
+        facts["warning"] = "; ".join(map(one_line, warnings_of(progress)))
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = in_one_line(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))
@@ -265,6 +268,24 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             if node["log"]:  # not before the attempt has its run
                 console.print(f"      {node['log']}", markup=False, style="dim")
+
+
+_LEARNING = {
+    "action_std": "deviation",
+    "kl": "KL",
+    "explained_variance": "explained variance",
+    "saturation": "saturation",
+    "clip_fraction": "clip fraction",
+    "gradient_norm": "gradient norm",
+    "v_max_mass": "mass at v_max",
+}
+"""Metrics that show how a training learns, and their names."""
+
+
+def _learning(record: Mapping[str, Any]) -> str:
+    """How a training learns, in one line."""
+    known = {word: value for name, word in _LEARNING.items() if (value := finite(record.get(name))) is not None}
+    return ", ".join(f"{word} {value:.3g}" for word, value in known.items())
 
 
 def _source(detail: Mapping[str, Any]) -> str:

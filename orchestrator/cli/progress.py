@@ -15,6 +15,7 @@ from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL
 from shared_store.evaluations import in_one_line
+from shared_store.metrics import warnings_of
 from shared_store.wording import counted
 
 _POLL = 0.3
@@ -274,7 +275,7 @@ class _Bar(_Display):
             text = (
                 f"{iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
                 f"{values['rate']} steps/s  ETA {self.eta(record)}  {counted(self.nodes, 'node')}"
-            )
+            ) + "".join(f"  warning: {one_line(each)}" for each in warnings_of(record))
             self._progress.update(self._task, completed=iteration, text=text)
         elif task.completed == 0 or job["status"] not in ("RUNNING", *TERMINAL):
             self._progress.update(self._task, text=self.state(job))
@@ -316,4 +317,6 @@ class _Lines(_Display):
             f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
             f"steps/s {values['rate']}  ETA {self.eta(self._latest)}  nodes {self.nodes}"
         )
+        for each in warnings_of(self._latest):
+            echo(f"warning: {one_line(each)}")
         self._latest, self._printed = None, time.monotonic()

@@ -18,7 +18,7 @@ from orchestrator.persistence.ownership import born_at
 from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
 from shared_store.evaluations import by_checkpoint
 from shared_store.layout import Run
-from shared_store.metrics import finite
+from shared_store.metrics import finite, warnings_of
 from shared_store.wording import counted
 
 CHECKPOINTS = 30
@@ -56,6 +56,7 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "reward": words.count(last.get("reward")),
         "score": _with_error(last.get("score"), last.get("score_error")),
         "straggler": _straggler(last),
+        "warning": "; ".join(warnings_of(last)),
         "reported": words.moment(last["time"] * 1000)
         if not is_over and isinstance(last.get("time"), int | float)
         else "",

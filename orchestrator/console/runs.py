@@ -37,6 +37,11 @@ METRICS = (
     "entropy",
     "learning_rate",
     "action_std",
+    "explained_variance",
+    "saturation",
+    "clip_fraction",
+    "gradient_norm",
+    "v_max_mass",
 )
 """Metrics that the page of a run draws, where the run has them; the page of its job has all."""
 _listed = Recent(_INTERVAL * 0.9)

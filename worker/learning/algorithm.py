@@ -70,6 +70,8 @@ class Setting:
     """Seed of all random numbers of the algorithm. Weights come from torch's own generator, which has the same seed on all ranks."""
     control_seconds: float = 1.0
     """Length of a control step [s]."""
+    action_ranges: Sequence[tuple[float, float] | None] = ()
+    """Range of each number of an action, beyond which the task clips it; None: it has no range. Empty: the task does not say."""
     rehearsal: bool = False
     """Whether the only purpose is to measure the memory of one iteration: it must learn as if its preconditions (a full replay, a
     teacher's weights) were met."""

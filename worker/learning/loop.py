@@ -15,6 +15,7 @@ from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.beacon import Beacon
+from worker.learning.begun import as_begun
 from worker.learning.cadence import Cadence
 from worker.learning.completion import complete
 from worker.learning.cuda_graph import CudaGraphFunction
@@ -61,6 +62,7 @@ class Loop:
 
         Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
         """
+        training, self._begun = as_begun(training, gang)
         job = training.job
         self.training, self.job, self.config, self.gang, self.stop = training, job, training.config, gang, stop
         self.share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
@@ -124,7 +126,7 @@ class Loop:
         progress = self.state.progress
         report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
         attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
-        self.say("\n".join([*self.task.notes(), self._beginning()]))
+        self.say("\n".join(filter(None, [*self.task.notes(), self._beginning(), self._begun])))
         self._stopwatch.begin()
         try:
             while progress.iteration < self.training.iterations:

@@ -22,19 +22,20 @@ def gather(observations: torch.Tensor, normalizer: Any, sums: torch.Tensor) -> N
     sums[size:] = offsets.square_().sum(0, dtype=torch.float64)
 
 
-def merge(normalizer: Any, count: torch.Tensor, sums: torch.Tensor) -> None:
+def merge(normalizer: Any, count: torch.Tensor, sums: torch.Tensor, learns: torch.Tensor | float = 1.0) -> None:
     """Merge an iteration's observations of all ranks into the running moments (Chan et al. 1979), as rsl-rl does.
 
     Args:
         normalizer: Changed in place.
         count: Number of observations, shape (), float64.
         sums: From :func:`gather`, summed over all ranks.
+        learns: 1, or 0 to leave the running moments as they are, shape ().
     """
     size = len(sums) // 2
     offset = sums[:size] / count
     variance = (sums[size:] / count - offset.square()).clamp(min=0.0)
-    normalizer.count.add_(count.long())
-    rate = count / normalizer.count
+    normalizer.count.add_((learns * count).long())
+    rate = learns * count / normalizer.count
     # with δ the batch mean less the running one: var += rate · (batch var − var + (1 − rate) · δ²)
     normalizer._var.add_(rate * (variance - normalizer._var + (1.0 - rate) * offset.square()))
     normalizer._mean.add_(rate * offset)

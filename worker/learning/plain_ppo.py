@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -71,10 +72,6 @@ class Actor(Network):
         super().__init__(spaces.observations[POLICY][0], config.hidden_sizes, spaces.actions, config)
         self.std = nn.Parameter(torch.full((spaces.actions,), config.init_std))
 
-    def deviation(self) -> torch.Tensor:
-        """Shape (actions,)."""
-        return self.std.clamp(1e-6, 1e6)
-
     @torch.no_grad()
     def act(self, observations: TensorDict) -> torch.Tensor:
         """The best action is the mean: shape (worlds, actions)."""
@@ -120,8 +117,12 @@ class PlainPPO:
         self._rollout: list[dict[str, torch.Tensor]] = []
 
     def begin(self, iteration: int) -> None:
-        """Seed the random numbers, which depend only on the seed, the iteration and the world."""
+        """Seed the random numbers, which depend only on the seed, the iteration and the world; apply what settles with time."""
         self._draws.begin(iteration)
+        self._greatest_rate = self.config.greatest_rate(iteration)
+        if self.config.schedule == "adaptive" and self.config.learning_rate_horizon is not None:
+            self.rate = min(self.rate, self._greatest_rate)
+        self._normalizer_learns = self.config.normalize_observations and self.config.normalizer_learns(iteration)
         self._rollout.clear()
 
     @torch.no_grad()
@@ -129,7 +130,7 @@ class PlainPPO:
         """Draw actions around the policy's mean: shape (W, actions)."""
         seen, judged = observations[POLICY].clone(), observations[self.config.critic_observations].clone()
         means = self.actor(seen)
-        actions = self._draws.normal(len(self._rollout), means, self.actor.deviation(), torch.empty_like(means))
+        actions = self._draws.normal(len(self._rollout), means, self.actor.std.detach(), torch.empty_like(means))
         self._rollout.append({"seen": seen, "judged": judged, "means": means, "actions": actions})
         return actions
 
@@ -142,7 +143,7 @@ class PlainPPO:
     def learn(self, observations: TensorDict) -> dict[str, torch.Tensor]:
         """Several passes over the rollout, each in minibatches of its own. ``observations`` are those after the last step."""
         config, worlds, device = self.config, self.setting.share.count, self.gang.device
-        samples, old_deviation = self._estimate(observations), self.actor.deviation().detach().clone()
+        samples, old_deviation = self._estimate(observations), self.actor.std.detach().clone()
         # samples of each minibatch: the same number of steps of every world, shape (epochs · minibatches, steps, W)
         shape = config.epochs * config.minibatches, self.steps // config.minibatches, worlds
         orders = torch.zeros(shape, dtype=torch.long, device=device)
@@ -150,7 +151,7 @@ class PlainPPO:
         self._draws.order(orders, scratch)
         # each rank's mean is weighted by its share of worlds, so that the sum over the ranks is the mean over all samples
         weight = worlds / self.setting.share.total
-        sums = torch.zeros(4, device=device)
+        sums, norms = torch.zeros(5, device=device), torch.zeros((), device=device)
         for rows in orders.flatten(1):
             loss, told = self._loss({name: tensor[rows] for name, tensor in samples.items()}, old_deviation)
             self.optimizer.zero_grad()
@@ -162,16 +163,53 @@ class PlainPPO:
             sums += told
             if config.schedule == "adaptive":
                 self.rate = self._adapted_rate(kl=float(told[3]))
-            for network in (self.actor, self.critic):
-                nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm)
+            found = [
+                nn.utils.clip_grad_norm_(each.parameters(), config.max_grad_norm) for each in (self.actor, self.critic)
+            ]
+            norms += torch.stack(found).norm()
             self.optimizer.param_groups[0]["lr"] = self.rate
             self.optimizer.step()
-        if config.normalize_observations:
+            self._limit_deviation()
+        if self._normalizer_learns:
             self.actor.update_normalizer(samples["seen"], self.setting)
             self.critic.update_normalizer(samples["judged"], self.setting)
-        numbers = (*(sums / len(orders)), torch.tensor(self.rate, device=device), old_deviation.mean())
-        names = ("surrogate_loss", "value_loss", "entropy", "kl", "learning_rate", "action_std")
-        return dict(zip(names, numbers, strict=True))
+        numbers = (
+            *(sums / len(orders)),
+            torch.tensor(self.rate, device=device),
+            old_deviation.mean(),
+            norms / len(orders),
+        )
+        names = (
+            "surrogate_loss",
+            "value_loss",
+            "entropy",
+            "kl",
+            "clip_fraction",
+            "learning_rate",
+            "action_std",
+            "gradient_norm",
+        )
+        return {**dict(zip(names, numbers, strict=True)), **self._describe(samples)}
+
+    @torch.no_grad()
+    def _limit_deviation(self) -> None:
+        """Bring the standard deviation back into its limits. A clamp in the loss would have no gradient beyond them."""
+        self.actor.std.clamp_(*self.config.std_limits)
+
+    def _describe(self, samples: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """How much of the returns' variance the critic explained, and how many actions were beyond their range, over all ranks."""
+        returns, errors = samples["returns"].double(), (samples["returns"] - samples["values"]).double()
+        ranges = [each or (-math.inf, math.inf) for each in self.setting.action_ranges] or [(-math.inf, math.inf)]
+        least, greatest = torch.tensor(ranges, device=returns.device).t()
+        beyond = (samples["actions"] < least) | (samples["actions"] > greatest)
+        squares = returns.square().sum(), errors.square().sum()
+        sums = self.gang.sum(torch.stack((returns.sum(), errors.sum(), *squares, beyond.sum().double())))
+        count = self.setting.share.total * self.steps
+        of_returns, of_errors = sums[2:4] - sums[:2].square() / count  # count · variance
+        figures = {"explained_variance": 1 - of_errors / of_returns.clamp(min=1e-12)}
+        if limited := sum(each is not None for each in self.setting.action_ranges):
+            figures["saturation"] = sums[4] / (count * limited)
+        return figures
 
     @torch.no_grad()
     def _estimate(self, observations: TensorDict) -> dict[str, torch.Tensor]:
@@ -195,15 +233,15 @@ class PlainPPO:
         mean = self.gang.sum(advantages.double().sum()) / count
         variance = self.gang.sum((advantages - mean).square().sum()) / (count - 1)
         advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
-        policy = Normal(rollout["means"], self.actor.deviation(), validate_args=False)
+        policy = Normal(rollout["means"], self.actor.std, validate_args=False)
         log_probs = policy.log_prob(rollout["actions"]).sum(-1)
         known = {**rollout, "values": values, "returns": returns, "advantages": advantages, "log_probs": log_probs}
         return {name: tensor.flatten(0, 1) for name, tensor in known.items()}
 
     def _loss(self, batch: dict[str, torch.Tensor], old_deviation: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and its metrics, shape (4,)."""
+        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and its metrics, shape (5,)."""
         config, clip = self.config, self.config.clip
-        policy = Normal(self.actor(batch["seen"]), self.actor.deviation(), validate_args=False)
+        policy = Normal(self.actor(batch["seen"]), self.actor.std, validate_args=False)
         # probability ratio of the action, new over old policy; no gradient beyond the clip range
         ratio = (policy.log_prob(batch["actions"]).sum(-1) - batch["log_probs"]).exp()
         gain, clipped_gain = batch["advantages"] * ratio, batch["advantages"] * ratio.clamp(1.0 - clip, 1.0 + clip)
@@ -216,11 +254,12 @@ class PlainPPO:
         entropy = policy.entropy().sum(-1).mean()
         kl = kl_divergence(Normal(batch["means"], old_deviation, validate_args=False), policy).sum(-1).mean()
         loss = surrogate + config.value_loss_coef * error.mean() - config.entropy_coef * entropy
-        return loss, torch.stack((surrogate, error.mean(), entropy, kl)).detach()
+        clipped = ((ratio - 1.0).abs() > clip).float().mean()
+        return loss, torch.stack((surrogate, error.mean(), entropy, kl, clipped)).detach()
 
     def _adapted_rate(self, kl: float) -> float:
         """A smaller rate if the policy has moved too far from the old one, a greater one if it has hardly moved (rsl-rl's rule)."""
-        (least, greatest), desired = self.config.learning_rate_limits, self.config.desired_kl
+        least, greatest, desired = self.config.learning_rate_limits[0], self._greatest_rate, self.config.desired_kl
         if kl > 2.0 * desired:
             return max(self.rate / 1.5, least)
         return min(self.rate * 1.5, greatest) if 0.0 < kl < desired / 2.0 else self.rate
@@ -241,6 +280,7 @@ class PlainPPO:
     def load_state_dict(self, state: Any, *, weights_only: bool = False, changed: Collection[str] = ()) -> list[str]:
         """Continue from :meth:`state_dict`; an adaptive schedule keeps the saved learning rate, unless the job sets another one."""
         self.actor.load_state_dict(state["policy"])
+        self._limit_deviation()
         self.critic.load_state_dict(state["critic"])
         if weights_only:
             return []

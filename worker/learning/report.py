@@ -7,12 +7,14 @@ import statistics
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from shared_store.metrics import MetricsWriter, scalars
+from shared_store.metrics import MetricsWriter, sampled, scalars
+from worker.learning.watch import HISTORY, Watch
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -94,6 +96,11 @@ class Report:
             directory.stat()  # it would be made where another volume is
             return SummaryWriter(str(directory), purge_step=first, filename_suffix=f".e{job.epoch}", flush_secs=10)
 
+        self._watch = Watch(job.run.name, self._iterations, getattr(training, "settings", None))
+        with suppress(OSError):  # without them it begins anew
+            earlier = sampled(job.run, HISTORY) if resumed_from else []
+            self._watch.follow(record for record in earlier if record["iteration"] <= resumed_from)
+        self._warned_of: list[str] = []
         threading.excepthook = partial(_thread_failed, threading.excepthook)
         self._new_events = events
         self._events: SummaryWriter | None = None
@@ -116,6 +123,9 @@ class Report:
             key: value if not isinstance(value, float) or math.isfinite(value) else None
             for key, value in record.items()
         }
+        if warnings := self._watch.look(finite):
+            finite["warnings"] = warnings
+        self._warn(warnings)
         failures = list[OSError]()
         for write in (self._write_record, self._write_events):
             try:
@@ -127,6 +137,14 @@ class Report:
         if failures and not self._warned:
             print(f"warning: metrics can't be written ({failures[0]}); training continues and retries", flush=True)
         self._warned = bool(failures)
+
+    def _warn(self, warnings: Sequence[str]) -> None:
+        """Print the warnings where one begins; their numbers change in every iteration."""
+        kinds = [text.partition(":")[0] for text in warnings]
+        for kind, text in zip(kinds, warnings, strict=True):
+            if kind not in self._warned_of:
+                print(f"warning: {text}", flush=True)
+        self._warned_of = kinds
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         self._metrics.write({**record, "time": time.time()})
@@ -200,6 +218,12 @@ def _learnt(record: dict[str, float | int | None]) -> str:
         "kl": ("kl", ".3f"),
         "temperature": ("temperature", ".1e"),
         "q_mean": ("q", ".2f"),
+        "v_max_mass": ("at v_max", ".2f"),
+        "action_std": ("std", ".2g"),
+        "explained_variance": ("explained", ".2f"),
+        "saturation": ("saturated", ".2f"),
+        "clip_fraction": ("clipped", ".2f"),
+        "gradient_norm": ("gradient", ".2g"),
     }
     return "  ".join(f"{word} {_text(record[name], form)}" for name, (word, form) in shown.items() if name in record)
 

@@ -71,6 +71,12 @@ def spaces_of(task: Task) -> Spaces:
     return Spaces(shapes, task.action_size, task.discrete)
 
 
+def action_ranges(task: Task) -> tuple[tuple[float, float] | None, ...]:
+    """See :attr:`Setting.action_ranges`."""
+    interface = None if task.discrete else task.interface()
+    return tuple(action.clip for action in interface.actions) if interface else ()
+
+
 def spaces_from(policy: dict[str, Any]) -> Spaces:
     """The spaces that :func:`describe` wrote into a manifest."""
     groups = {name: tuple(shape) for name, shape in policy["groups"].items()}
@@ -95,7 +101,7 @@ def build_algorithm(
     """
     load_kernels(algorithm, gang)
     control_seconds = 1.0 / task.config.control_hz
-    setting = Setting(spaces_of(task), share, gang, seed, control_seconds, rehearsal)
+    setting = Setting(spaces_of(task), share, gang, seed, control_seconds, action_ranges(task), rehearsal)
     with user_errors("train"):
         built = algorithm(settings, setting)
     refuse_incomplete(built, algorithm.__name__, ("steps", "graphs"))

@@ -15,6 +15,13 @@ const GROUPS = [
   { label: "Learning rate", fits: (name) => name === "learning_rate" },
   { label: "Entropy", fits: (name) => name === "entropy" },
   { label: "Standard deviation of actions", fits: (name) => name === "action_std" },
+  {
+    label: "Shares of actions beyond their range, and of clipped ratios",
+    fits: (name) => name === "saturation" || name === "clip_fraction",
+  },
+  { label: "Explained variance of the returns", fits: (name) => name === "explained_variance" },
+  { label: "Norm of the gradients", fits: (name) => name === "gradient_norm" },
+  { label: "Probability of v_max in the targets", fits: (name) => name === "v_max_mass" },
   { label: "Environment steps a second", fits: (name) => name === "steps_per_second" },
   {
     label: "Simulation, learning and saving [s of an iteration]",

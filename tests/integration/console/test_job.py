@@ -38,7 +38,8 @@ def store(console: Console) -> Store:
         add_checkpoint(store, "taught", iteration, score=float(iteration), score_error=0.5)
     with MetricsWriter(store.run("taught"), 1, 0) as metrics:
         for iteration in range(1, 10):
-            metrics.write({"iteration": iteration, "reward": iteration / 2, "reward_alive": 1.0, "kl": None})
+            last = {"warnings": ["it unlearns: mean return 1.00 (taught@best)"]} if iteration == 9 else {}
+            metrics.write({"iteration": iteration, "reward": iteration / 2, "reward_alive": 1.0, "kl": None, **last})
     return store
 
 
@@ -87,7 +88,7 @@ def test_a_job_that_waits_says_why_and_shows_what_it_will_do(console: Console, t
     page = console.visitor().page(f"/jobs/{training}")
     assert "RUNNABLE" in page.text and "CPU" in page.text and "It has not started yet" in page.text
     assert "iterations: 20" in page.text and "Cartpole" in page.text and "muster view" in page.text
-    assert page.is_inert
+    assert page.is_inert and "it unlearns: mean return 1.00 (taught@best)" in page.text
     (place,) = [each for tag, each in page.elements if tag == "div" and "data-job" in each]
     assert place["data-curves"] == "/runs/taught/curves"
 

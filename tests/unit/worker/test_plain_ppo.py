@@ -84,6 +84,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "near steps": {"learning_rate": 1e-4, "max_grad_norm": 0.1},
     "steps left over": {"minibatches": 3},
     "critic's own": {"critic_observations": "critic", "critic_hidden_sizes": (24,), "activation": "tanh"},
+    "limits of the deviation": {"min_std": 0.98, "max_std": 0.99, "init_std": 0.985, "entropy_coef": 0.3},
+    "settled": {"learning_rate": 1e-2, "desired_kl": 1.0, "learning_rate_horizon": 1, "normalizer_horizon": 2},
     "not normalised": {"normalize_observations": False, "init_std": 0.5},
 }
 
@@ -93,7 +95,7 @@ def test_both_implementations_learn_the_same_on_random_data(settings: dict[str, 
     """Three observations and two actions, of sizes far from 1; a quarter of the steps end an episode, half of those by the clock."""
     torch.manual_seed(8)
     spaces = Spaces({"policy": (3,), "critic": (5,)}, 2)
-    setting = Setting(spaces, Share(0, WORLDS, WORLDS), alone(), seed=4)
+    setting = Setting(spaces, Share(0, WORLDS, WORLDS), alone(), seed=4, action_ranges=((-1.0, 1.0), None))
     fused, plain = twins(setting, **{"epochs": 3, "minibatches": 4, "gamma": 0.95, "lam": 0.9, **settings})
     scale = {"policy": torch.tensor([1.0, 30.0, 0.1]), "critic": torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])}
 

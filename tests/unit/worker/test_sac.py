@@ -81,6 +81,7 @@ def test_it_is_an_algorithm() -> None:
     policy: Policy = algorithm.policy()
     assert algorithm.captures_rollout and algorithm.steps == 4 and policy.act(groups(point())).shape == (6, 1)
     names = {"actor_loss", "entropy", "critic_loss", "q_mean", "temperature", "learning_rate"}
+    names |= {"action_std", "gradient_norm", "v_max_mass"}
     task = point()
     for iteration in range(3):
         metrics = iterate(algorithm, task, iteration, iteration + 1)

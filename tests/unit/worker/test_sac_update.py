@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
-from tests.support.worker.loop import alone
+from tests.support.worker.loop import alone, iterate
 from tests.support.worker.sac import SMALL, make, point, same
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.sac import kernels
@@ -236,3 +236,17 @@ def test_critics_may_have_observations_that_the_policy_lacks() -> None:
     stacked = torch.stack([each["critic"] for each in seen[:4]]).flatten(0, 1)
     torch.testing.assert_close(sac.learner.normalizers[1].mean, stacked.mean(0))
     assert set(sac.policy().state_dict()) == set(SAC.build_policy(sac.config, setting.spaces, "cpu").state_dict())
+
+
+@pytest.mark.parametrize(("least", "greatest", "mass"), [(-200.0, -199.0, 1.0), (-20.0, 20.0, 0.0)])
+def test_the_mass_at_v_max_shows_returns_that_the_critics_cannot_tell_apart(
+    least: float, greatest: float, mass: float
+) -> None:
+    """Each step costs the point a few units at most, so that returns are above −199, where the first range ends."""
+    algorithm = make(point(), v_min=least, v_max=greatest)
+    metrics = iterate(algorithm, point(), 0, 4)
+    assert float(metrics["v_max_mass"]) == pytest.approx(mass, abs=0.1)
+    assert float(metrics["gradient_norm"]) > 0.0
+    spread = algorithm.learner.actor(point().observations)[1].exp().mean()
+    assert float(metrics["action_std"]) == pytest.approx(float(spread), rel=0.1)
+    assert "v_max_mass" not in iterate(make(point(), atoms=1), point(), 0, 1)

@@ -17,6 +17,7 @@ Networks are rsl-rl's. Differences from rsl-rl 5.5.1, with reasons:
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from types import ModuleType
 from typing import Any, ClassVar
@@ -39,7 +40,8 @@ from worker.learning.totals import Totals
 
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within its limits."""
-METRICS = (*LOSSES, "learning_rate", "action_std")
+METRICS = (*LOSSES, "learning_rate", "action_std", "explained_variance", "clip_fraction", "gradient_norm", "saturation")
+"""Names of an update's metrics; ``saturation`` only if some action has a range."""
 
 
 class PPO:
@@ -76,7 +78,11 @@ class PPO:
         else:
             samples = self._orders.shape[1] * worlds
             self._head = Gaussian(
-                *(self.actor, spaces.actions, samples, self.device), weight=weight, settings=clipping, plain=plain
+                *(self.actor, spaces.actions, samples, self.device),
+                weight=weight,
+                settings=clipping,
+                limits=config.std_limits,
+                plain=plain,
             )
         self.graphs = self._record()
         for parameter in self._parameters:
@@ -88,6 +94,13 @@ class PPO:
         sizes = {view.group: 2 * view.latents.shape[-1] if self._is_normalised(view) else 0 for view in views}
         self._sums = Totals({"count": 1, "advantages": 1, "squared_advantages": 1, **sizes}, self.device)
         self._observation_sums = [self._sums[view.group] for view in views]
+        figures = ("returns", "squared_returns", "clipped", "saturated")
+        self._figures = Totals(dict.fromkeys(figures, 1), self.device)
+        """Summed over the ranks after the minibatches, apart from the sums before: so their bits do not depend on the metrics."""
+        ranges = [each or (-math.inf, math.inf) for each in self.setting.action_ranges]
+        self._ranges = torch.tensor(ranges, device=self.device).view(-1, 2).t()
+        self._ranged = sum(each is not None for each in self.setting.action_ranges)
+        """Number of an action's components that have a range."""
 
     def _allocate_gradients(self) -> None:
         """One flat buffer: all gradients, then the other shared numbers of a minibatch. The parameters' gradients are views of it.
@@ -107,6 +120,8 @@ class PPO:
         self._gradients = self._shared[: sizes[0]], self._shared[sizes[0] : sum(sizes)]
         self._losses = self._shared[sum(sizes) :]
         self._rate = torch.tensor(self.config.learning_rate, device=self.device)
+        self._greatest_rate = torch.tensor(self.config.greatest_rate(0), device=self.device)
+        self._normalizer_learns = torch.ones((), dtype=torch.float64, device=self.device)
         options: dict[str, Any] = {"capturable": True} if self._side is not None else {}
         if self.config.optimizer == "adamw":
             kind: type[torch.optim.Adam] = torch.optim.AdamW
@@ -125,6 +140,9 @@ class PPO:
         self._rows = torch.zeros(share * worlds, dtype=torch.long, device=self.device)
         self._ones = torch.ones(share * worlds, device=self.device)
         self._loss_sums = torch.zeros(len(LOSSES), device=self.device)
+        self._squares = torch.zeros(2, device=self.device)
+        """Squared norms of the gradients of actor and critic."""
+        self._norm_sum = torch.zeros((), device=self.device)
         self._metrics = torch.zeros(len(METRICS), device=self.device)
 
     def _record(self) -> list[CudaGraphFunction]:
@@ -140,9 +158,15 @@ class PPO:
     # -- collecting ---------------------------------------------------------------------------------------------------
 
     def begin(self, iteration: int) -> None:
-        """Set the iteration of all further draws."""
+        """Set the iteration of all further draws, and what depends on it: the limit of the rate, and whether the normalisers learn."""
         self._draws.begin(iteration)
         self.rollout.step = 0
+        config = self.config
+        self._normalizer_learns.fill_(config.normalizer_learns(iteration))
+        if config.schedule == "adaptive" and config.learning_rate_horizon is not None:
+            greatest = config.greatest_rate(iteration)
+            self._greatest_rate.fill_(greatest)
+            self._rate.clamp_(max=greatest)
 
     @torch.no_grad()
     def act(self, observations: TensorDict) -> torch.Tensor:
@@ -170,7 +194,10 @@ class PPO:
             self.graphs[0]()
         else:
             self._learn()
-        return dict(zip(METRICS, self._metrics, strict=True))
+        metrics = dict(zip(METRICS, self._metrics, strict=True))
+        if not self._ranged:
+            del metrics["saturation"]
+        return metrics
 
     def _learn(self) -> None:
         estimate, normalize, compute, apply, close = self._parts
@@ -182,6 +209,8 @@ class PPO:
             compute()
             self.gang.sum(self._shared)
             apply()
+        self._gather_figures()
+        self.gang.sum(self._figures.values)
         close()
 
     @torch.no_grad()
@@ -210,7 +239,8 @@ class PPO:
         mean = total / count
         deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
         self.rollout.advantages.sub_(mean).div_(deviation + 1e-8)
-        self._loss_sums.zero_()
+        for buffer in (self._loss_sums, self._norm_sum, self._head.clipped):
+            buffer.zero_()
 
     def _compute_gradients(self) -> None:
         """Gradients and losses of one minibatch, weighted by this rank's share of the samples."""
@@ -228,20 +258,48 @@ class PPO:
         """One step of the optimizer with the gradients and losses of all ranks."""
         self._loss_sums.add_(self._losses)
         self._adapt_learning_rate(self._losses[LOSSES.index("kl")])
-        for gradient in self._gradients:
-            norm = torch.dot(gradient, gradient).sqrt()
-            gradient.mul_((self.config.max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+        for gradient, square in zip(self._gradients, self._squares, strict=True):
+            square.copy_(torch.dot(gradient, gradient))
+        scales = (self.config.max_grad_norm / (self._squares.sqrt() + 1e-6)).clamp(max=1.0)
+        self._norm_sum.add_(self._squares.sum().sqrt())
+        for gradient, scale in zip(self._gradients, scales, strict=True):
+            gradient.mul_(scale)
         self.optimizer.step()
+        self._head.project()
+
+    @torch.no_grad()
+    def _gather_figures(self) -> None:
+        """This rank's sums over the whole rollout, which only metrics need."""
+        figures, rollout = self._figures, self.rollout
+        figures["returns"].copy_(rollout.returns.sum(dtype=torch.float64))
+        figures["squared_returns"].copy_(rollout.returns.double().square().sum())
+        figures["clipped"].copy_(self._head.clipped.sum(dtype=torch.float64))
+        if self._ranged:
+            within = torch.clamp(rollout.actions, *self._ranges)
+            figures["saturated"].copy_((within != rollout.actions).sum())
 
     @torch.no_grad()
     def _close(self) -> None:
         """After the last minibatch: update the normalisers and gather the metrics."""
         for view, sums in zip(self.rollout.views, self._observation_sums, strict=True):
             if len(sums):
-                moments.merge(view.model.obs_normalizer, self._sums["count"][0], sums)
+                moments.merge(view.model.obs_normalizer, self._sums["count"][0], sums, self._normalizer_learns)
         torch.div(self._loss_sums, len(self._orders), out=self._metrics[: len(LOSSES)])
-        self._metrics[len(LOSSES)].copy_(self._rate)
-        self._metrics[len(LOSSES) + 1].copy_(self._head.spread())
+        count, total, squares = (self._sums[name][0] for name in ("count", "advantages", "squared_advantages"))
+        figures, updates = self._figures, len(self._orders)
+        spread = figures["squared_returns"][0] - figures["returns"][0].square() / count
+        unexplained = squares - total.square() / count  # a return less its value is the advantage
+        trained = updates * self._orders[0].numel() / self.rollout.advantages.numel() * count
+        found = (
+            self._rate,
+            self._head.spread(),
+            1.0 - unexplained / spread.clamp(min=1e-12),
+            figures["clipped"][0] / trained,
+            self._norm_sum / updates,
+            figures["saturated"][0] / (count * max(1, self._ranged)),
+        )
+        for metric, value in zip(self._metrics[len(LOSSES) :], found, strict=True):
+            metric.copy_(value)
 
     def _is_normalised(self, view: View) -> bool:
         return not isinstance(view.model, PixelModel) and bool(view.model.obs_normalization)
@@ -263,9 +321,9 @@ class PPO:
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
         if self.config.schedule != "adaptive":
             return
-        least, greatest = self.config.learning_rate_limits
+        least, _ = self.config.learning_rate_limits
         lower = (self._rate / RATE_STEP).clamp(min=least)
-        higher = (self._rate * RATE_STEP).clamp(max=greatest)
+        higher = torch.minimum(self._rate * RATE_STEP, self._greatest_rate)
         small = (kl < self.config.desired_kl / 2.0) & (kl > 0.0)
         self._rate.copy_(torch.where(kl > self.config.desired_kl * 2.0, lower, torch.where(small, higher, self._rate)))
 
@@ -293,6 +351,7 @@ class PPO:
         continues as if it had never stopped.
         """
         self._policy.load_state_dict(state["policy"])
+        self._head.project()
         self.critic.load_state_dict(state["critic"])
         if weights_only:
             return []

@@ -9,7 +9,7 @@ from rsl_rl.models.mlp_model import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 
 from worker.learning.ppo.draws import Draws
-from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
+from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms, is_clipped
 from worker.learning.ppo.models import PixelModel
 from worker.learning.ppo.objective import Objective
 from worker.learning.ppo.rollout import Rollout
@@ -41,8 +41,15 @@ class Head(Protocol):
             The weighted means of :data:`worker.learning.ppo.loss.LOSSES`, shape (4,).
         """
 
+    @property
+    def clipped(self) -> torch.Tensor:
+        """Numbers whose sum is that of the ratios beyond the clip range, since they were last set to 0."""
+
     def spread(self) -> torch.Tensor:
         """Mean standard deviation of the actions of the last rollout, shape (); 0 for choices."""
+
+    def project(self) -> None:
+        """After a step of the optimizer: bring the standard deviation back into its limits."""
 
 
 class Gaussian:
@@ -60,17 +67,20 @@ class Gaussian:
         *,
         weight: float,
         settings: Clipping,
+        limits: tuple[float, float],
         plain: bool = False,
     ) -> None:
+        """``limits``: least and greatest standard deviation."""
         assert isinstance(actor.distribution, GaussianDistribution)
-        self._distribution, self._weight, self._settings = actor.distribution, weight, settings
+        self._learnt, self._weight, self._settings = actor.distribution.std_param, weight, settings
+        self._limits = limits
         self.std = torch.zeros(actions, device=device)
         """The standard deviation of the rollout."""
         self._objective = None if plain else Objective(samples, actions, device, weight=weight, settings=settings)
+        self.clipped = self._objective.clipped if self._objective else torch.zeros(1, device=device)
 
     def begin(self) -> None:
-        with torch.no_grad():
-            self.std.copy_(self._std())
+        self.std.copy_(self._learnt.detach())
 
     def draw(self, draws: Draws, step: int, outputs: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         return draws.normal(step, outputs, self.std, out)
@@ -86,16 +96,17 @@ class Gaussian:
         if self._objective is not None:
             told = (rollout.log_prob, rollout.advantages, rollout.returns, rollout.values)
             flat = (actions, means, *(each.flatten() for each in told))
-            return self._objective.backward(rows, flat, self.std, outputs, self._std(), values)
-        terms = gaussian_terms(actions[rows], means[rows], self.std, outputs, self._std())
-        return _backward(self._settings, self._weight, rows, rollout, terms, values)
+            return self._objective.backward(rows, flat, self.std, outputs, self._learnt, values)
+        terms = gaussian_terms(actions[rows], means[rows], self.std, outputs, self._learnt)
+        return _backward(self, rows, rollout, terms, values)
 
     def spread(self) -> torch.Tensor:
         return self.std.mean()
 
-    def _std(self) -> torch.Tensor:
-        least, greatest = self._distribution.std_range
-        return self._distribution.std_param.clamp(least, greatest)
+    @torch.no_grad()
+    def project(self) -> None:
+        # not a clamp in the forward pass: beyond its limits that has no gradient, and the deviation would stay there for ever
+        self._learnt.clamp_(*self._limits)
 
 
 class Categorical:
@@ -104,6 +115,7 @@ class Categorical:
     def __init__(self, *, weight: float, settings: Clipping, device: str) -> None:
         self._weight, self._settings = weight, settings
         self._none = torch.zeros((), device=device)
+        self.clipped = torch.zeros(1, device=device)
 
     def begin(self) -> None:
         pass
@@ -120,15 +132,17 @@ class Categorical:
     ) -> torch.Tensor:
         actions, logits = rollout.actions.flatten(0, 1), rollout.outputs.flatten(0, 1)
         terms = categorical_terms(actions[rows], logits[rows], outputs)
-        return _backward(self._settings, self._weight, rows, rollout, terms, values)
+        return _backward(self, rows, rollout, terms, values)
 
     def spread(self) -> torch.Tensor:
         return self._none
 
+    def project(self) -> None:
+        pass
+
 
 def _backward(
-    settings: Clipping,
-    weight: float,
+    head: Gaussian | Categorical,
     rows: torch.Tensor,
     rollout: Rollout,
     terms: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
@@ -136,6 +150,7 @@ def _backward(
 ) -> torch.Tensor:
     told = (rollout.log_prob, rollout.advantages, rollout.returns, rollout.values)
     samples = Samples(*(each.flatten()[rows] for each in told))
-    loss, losses = clipped_loss(settings, samples, *terms, values.squeeze(1))
-    (weight * loss).backward()
-    return weight * losses
+    loss, losses = clipped_loss(head._settings, samples, *terms, values.squeeze(1))
+    head.clipped.add_(is_clipped(head._settings, samples, terms[0].detach()).sum())
+    (head._weight * loss).backward()
+    return head._weight * losses

@@ -61,6 +61,11 @@ def clipped_loss(
     return loss, torch.stack((surrogate, value, spread, kl.mean())).detach()
 
 
+def is_clipped(settings: Clipping, samples: Samples, log_prob: torch.Tensor) -> torch.Tensor:
+    """Whether the probability ratio of each sample is beyond the clip range; shape (samples,), bool."""
+    return ((log_prob - samples.log_prob).exp() - 1.0).abs() > settings.clip
+
+
 def gaussian_terms(
     actions: torch.Tensor, old_mean: torch.Tensor, old_std: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -32,8 +32,10 @@ def _objective(
     mean_gradient: wp.array2d[wp.float32],
     value_gradient: wp.array[wp.float32],
     terms: wp.array2d[wp.float32],
+    clip_counts: wp.array[wp.float32],
 ):
-    """One sample; columns of ``terms`` are :data:`LOSSES`, then the gradient of each component of the deviation. Comparisons are such that NaN, which none of them holds for, goes on into losses and gradients."""
+    """One sample; columns of ``terms`` are :data:`LOSSES`, then the gradient of each component of the deviation. Ratios beyond the clip
+    range are counted. Comparisons are such that NaN, which none of them holds for, goes on into losses and gradients."""
     i = wp.tid()
     row = rows[i]
     log_prob = wp.float32(0.0)
@@ -52,6 +54,7 @@ def _objective(
     surrogate = -advantage * ratio
     slope = surrogate  # d surrogate / d log_prob
     if ratio < 1.0 - clip or ratio > 1.0 + clip:
+        clip_counts[i] += 1.0
         clipped = -advantage * wp.clamp(ratio, 1.0 - clip, 1.0 + clip)
         if clipped >= surrogate:
             surrogate = clipped
@@ -98,6 +101,8 @@ class Objective:
         self._value_gradient = torch.zeros(samples, 1, device=device)
         self._terms = torch.zeros(samples, len(LOSSES) + actions, device=device)
         self._ones = torch.ones(samples, device=device)
+        self.clipped = torch.zeros(samples, device=device)
+        """Number of minibatches in which the ratio of the sample at this place was beyond the clip range; shape (samples,)."""
 
     def backward(
         self,
@@ -123,7 +128,7 @@ class Objective:
             The weighted means of :data:`worker.learning.ppo.loss.LOSSES`, shape (4,).
         """
         read = (rows, *rollout, old_std, mean.detach(), std.detach(), values.detach().view(-1))
-        written = (self._mean_gradient, self._value_gradient.view(-1), self._terms)
+        written = (self._mean_gradient, self._value_gradient.view(-1), self._terms, self.clipped)
         with on_torch_stream(self._device):
             wp.launch(
                 _objective,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
@@ -49,6 +49,9 @@ class PPOConfig:
     """Learning rate of the optimizer (the initial one of an adaptive schedule)."""
     learning_rate_limits: Annotated[tuple[Positive, Positive], Field(strict=False)] = (1.0e-5, 1.0e-2)
     """Least and greatest learning rate of the adaptive schedule."""
+    learning_rate_horizon: Count | None = 100
+    """Iterations for which the adaptive rate may reach its greatest value; that value then falls in inverse proportion to the iteration,
+    so that a policy that has learnt is no longer changed by large steps. None: it never falls."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``"adaptive"``: the learning rate follows the KL divergence; ``"fixed"``: it stays constant."""
     desired_kl: Positive = 0.01
@@ -73,8 +76,16 @@ class PPOConfig:
     """Norm to which the gradients of actor and critic are clipped, each separately."""
     init_std: Positive = 1.0
     """Initial standard deviation of the actions [unit of the action]; unused for choices."""
+    min_std: Positive = 0.1
+    """Least standard deviation of the actions [unit of the action], or :attr:`init_std` if that is smaller. Without it the deviation of an
+    easy task falls until the policy explores nothing, and can't follow when its observations or their statistics change."""
+    max_std: Positive = 1.0
+    """Greatest standard deviation of the actions [unit of the action], or :attr:`init_std` if that is greater. Without it an entropy bonus
+    raises the deviation of actions that are clipped at the ends of their range, where more noise costs nothing."""
     normalize_observations: bool = True
     """Whether observations are normalised by their running mean and variance; images never are."""
+    normalizer_horizon: Count | None = None
+    """Iterations after which the mean and variance of the observations stay as they are; None: they are always updated."""
 
     fixed: ClassVar[tuple[str, ...]] = (
         *("hidden_sizes", "critic_hidden_sizes", "critic_observations", "activation", "normalize_observations"),
@@ -83,6 +94,13 @@ class PPOConfig:
     """Settings that a resumed run can't change, since its checkpoints depend on them."""
     clone_may_change: ClassVar[tuple[str, ...]] = ("optimizer",)
     """Those of :attr:`fixed` that a clone can change, since it takes over only weights and normalisers."""
+    before: ClassVar[dict[str, Any]] = {
+        "learning_rate_horizon": None,
+        "min_std": 1.0e-6,
+        "max_std": 1.0e6,
+        "normalizer_horizon": None,
+    }
+    """What runs computed that began before these settings existed."""
     elsewhere: ClassVar[dict[str, str]] = {
         **dict.fromkeys(
             ("rnd_cfg", "symmetry_cfg", "rnn_type", "rnn_hidden_dim", "class_name", "distribution_cfg"),
@@ -102,6 +120,24 @@ class PPOConfig:
             )
         if self.learning_rate_limits[0] > self.learning_rate_limits[1]:
             raise ValueError("learning_rate_limits: expected the least, then the greatest")
+        if self.min_std > self.max_std:
+            raise ValueError(f"min_std: expected at most max_std ({self.max_std:g}), got {self.min_std:g}")
         if self.weight_decay and self.optimizer != "adamw":
             raise ValueError("weight_decay: adam has none; set optimizer: adamw")
         return self
+
+    @property
+    def std_limits(self) -> tuple[float, float]:
+        """Least and greatest standard deviation of the actions."""
+        return min(self.min_std, self.init_std), max(self.max_std, self.init_std)
+
+    def greatest_rate(self, iteration: int) -> float:
+        """The upper limit of the adaptive learning rate in an iteration, counted from 0."""
+        least, greatest = self.learning_rate_limits
+        if self.learning_rate_horizon is None or iteration < self.learning_rate_horizon:
+            return greatest
+        return max(least, greatest * self.learning_rate_horizon / (iteration + 1))
+
+    def normalizer_learns(self, iteration: int) -> bool:
+        """Whether the iteration's observations, counted from 0, enter the normalisers."""
+        return self.normalizer_horizon is None or iteration < self.normalizer_horizon

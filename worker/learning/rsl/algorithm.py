@@ -41,7 +41,7 @@ class RslRl:
         self.teacher_checkpoint = config.teacher_checkpoint
         self.graphs: Sequence[CudaGraphFunction] = ()
         self.algorithm, seen, self._groups = building.build_algorithm(config, setting)
-        self._gang, self._worlds = setting.gang, setting.share.count
+        self._gang, self._worlds, self._ranges = setting.gang, setting.share.count, setting.action_ranges
         self._networks = {
             name: getattr(self.algorithm, f"_raw_{name}", getattr(self.algorithm, name))
             for name in NETWORKS
@@ -89,14 +89,16 @@ class RslRl:
     def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
         """The metrics of rsl_rl's ``update``, as means over the ranks, ``learning_rate``, and for a stochastic policy ``action_std``.
 
-        With RND also ``intrinsic_reward``, a mean over the steps, and ``rnd_weight``.
+        With a critic also ``explained_variance``, for a task whose actions have ranges ``saturation``; with RND ``intrinsic_reward``, a
+        mean over the steps, and ``rnd_weight``.
         """
         with torch.no_grad():
             self.algorithm.compute_returns(as_floats(observations, self._groups))
+            described = self._describe_rollout()
         losses = {name: float(value) for name, value in self.algorithm.update().items()}
         device = self._gang.device
         numbers = torch.tensor(list(losses.values()), device=device, dtype=torch.float64)
-        names, parts = list(losses), [numbers]
+        names, parts = [*losses, *described], [numbers, *described.values()]
         if self._curiosity:
             names.append("intrinsic_reward")
             parts.append(self._intrinsic.double().view(1) / self.steps)
@@ -110,6 +112,20 @@ class RslRl:
             metrics["rnd_weight"] = torch.tensor(self._curiosity.weight, device=device, dtype=torch.float64)
         metrics["learning_rate"] = torch.tensor(self.learning_rate, device=device, dtype=torch.float64)
         return metrics
+
+    def _describe_rollout(self) -> dict[str, torch.Tensor]:
+        """Figures of this rank's rollout, each of shape (1,), float64; none without a critic."""
+        storage: Any = getattr(self.algorithm, "storage", None)
+        if self._distils or not all(hasattr(storage, name) for name in ("returns", "values", "actions")):
+            return {}
+        returns, errors = storage.returns.double(), (storage.returns - storage.values).double()
+        figures = {"explained_variance": 1.0 - errors.var() / returns.var().clamp(min=1e-12)}
+        ranges = dict(item for item in enumerate(self._ranges) if item[1])
+        if ranges:
+            taken = storage.actions[..., list(ranges)]
+            within = torch.clamp(taken, *torch.tensor([*ranges.values()], device=taken.device).t())
+            figures["saturation"] = (within != taken).double().mean()
+        return {name: value.view(1) for name, value in figures.items()}
 
     def _share_statistics(self) -> None:
         """Give all ranks the same running statistics.

@@ -56,6 +56,10 @@ class Learner:
         self.samples = Share.of(gang.rank, gang.size, config.batch_size).count
         """This rank's share of a batch."""
         self._projected = torch.zeros(self.samples, config.atoms, device=device)
+        self.mass = torch.zeros((), device=device)
+        """This rank's sum, over the updates since it was set to 0, of the targets' mean probability of ``v_max``."""
+        self.norm = torch.zeros((), device=device)
+        """Sum of the norms of the critics' gradients, before they are clipped, over the same updates."""
         self._allocate_gradients(device)
         self._make_optimizers(device.startswith("cuda"))
 
@@ -122,6 +126,8 @@ class Learner:
         with torch.no_grad():
             following, log_prob = self.actor.sample(seen_after, noise[0])
             target = self.target(self.targets(known_after, following), batch, -temperature * log_prob)
+            if self.config.atoms > 1:
+                self.mass.add_(target[:, -1].sum(), alpha=share)
         outputs = self.critics(known, taken)
         critic_loss = self._critic_loss(outputs, target) * share
         torch._foreach_copy_(self._critic_gradients, torch.autograd.grad(critic_loss, self._critic_parameters))
@@ -172,6 +178,7 @@ class Learner:
         if improves:
             self._clip(self._policy_gradient)
             self._policy_optimizer.step()
+        self.norm.add_(torch.linalg.vector_norm(self._critic_gradient))
         self._clip(self._critic_gradient)
         self._critic_optimizer.step()
         torch._foreach_lerp_([*self.targets.parameters()], [*self.critics.parameters()], self.config.tau)

@@ -99,6 +99,9 @@ class SAC:
         counts = {"actor_loss": config.updates // config.policy_delay, "entropy": config.updates // config.policy_delay}
         self._counts = torch.tensor([counts.get(name, config.updates) for name in LOSSES], device=device)
         self._means = torch.zeros(len(LOSSES), device=device)
+        self._spread = torch.zeros((), device=device)
+        self._figures = torch.zeros(2, device=device)
+        self._norm = torch.zeros((), device=device)
         self._rate = torch.tensor(config.critic_learning_rate, device=device)
 
     def _make_graphs(self) -> None:
@@ -142,6 +145,8 @@ class SAC:
         for group, columns in zip(self._groups, self.learner.columns, strict=True):
             self._before[:, columns].copy_(observations[group])
         mean, log_std = self.learner.actor(self._before[:, self.learner.columns[0]])
+        if self._step == 0:
+            self._spread.copy_(log_std.exp().mean())
         first, limit = self.share.first, self.config.action_limit
         kernels.explore(self._keys, self._step, first, self._uniform, limit, mean, log_std, self._actions)
         return self._actions
@@ -167,8 +172,9 @@ class SAC:
             observations: Unused; those after the last step were recorded with it.
 
         Returns:
-            Means over the updates of :data:`LOSSES`, the temperature, and the critics' learning rate. Until the first update, losses
-            are 0.
+            Means over the updates of :data:`LOSSES`, of the norm of the critics' gradients and, with several atoms, of the targets'
+            probability of ``v_max``; the deviation of the actions before squashing in the first step; the temperature, and the critics'
+            learning rate. Until the first update, all but the last two are 0.
         """
         self.replay.advance(self.steps)
         if self.config.normalize_observations:
@@ -177,6 +183,9 @@ class SAC:
             self._run["updates"]()
             self._updates += self.config.updates
         figures = dict(zip(LOSSES, self._means, strict=True))
+        figures |= {"action_std": self._figures[0], "gradient_norm": self._norm}
+        if self.config.atoms > 1:
+            figures["v_max_mass"] = self._figures[1]
         return {**figures, "temperature": self.learner.temperature, "learning_rate": self._rate}
 
     def _observe(self) -> None:
@@ -205,7 +214,9 @@ class SAC:
 
     def _update(self) -> None:
         """All updates of an iteration."""
-        self._loss_sums.zero_()
+        learner, updates = self.learner, self.config.updates
+        for sums in (self._loss_sums, learner.mass, learner.norm):
+            sums.zero_()
         for number, (rows, noise) in enumerate(zip(self._all_rows, self._all_noise, strict=True), start=1):
             improves = number % self.config.policy_delay == 0
             self._rows.copy_(rows)
@@ -214,6 +225,10 @@ class SAC:
             self.gang.sum(self.learner.shared(improves))
             self._run["all steps" if improves else "critic step"]()
         torch.div(self._loss_sums, self._counts, out=self._means)
+        torch.div(learner.norm, updates, out=self._norm)
+        self._figures[0].copy_(self._spread * (self.share.count / self.share.total))
+        self._figures[1].copy_(learner.mass / updates)
+        self.gang.sum(self._figures)  # apart from the gradients, whose bits so do not depend on the metrics
 
     def _compute(self, improves: bool) -> None:
         self.learner.compute(self.replay.sample(self._rows), self._noise, improves)

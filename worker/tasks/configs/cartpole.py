@@ -48,7 +48,13 @@ class CartpoleConfig(TaskConfig):
     - ``fall``: leaving the rail or dropping the pole, once."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
-            steps=16, hidden_sizes=(32, 32), epochs=4, minibatches=2, learning_rate=1.0e-3, desired_kl=0.01
+            steps=16,
+            hidden_sizes=(32, 32),
+            epochs=4,
+            minibatches=2,
+            learning_rate=1.0e-3,
+            learning_rate_horizon=60,  # by then it balances; the few samples of an iteration allow no large steps afterwards
+            desired_kl=0.01,
         )
     )
     """Settings of the task's training: a small network, since the task is easy and often runs on a CPU."""

@@ -1,0 +1,131 @@
+"""What the records of a training say against it: it unlearns, it no longer explores, or its learning rate can't follow."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+WINDOW = 20
+"""Iterations over which returns are averaged."""
+FALLEN = 0.7
+"""Share of the gain, from the first mean to the best, below which a training counts as fallen."""
+ENDS_BELOW = 0.9
+"""Share of the gain below which its end is compared with its best."""
+PATIENCE = 50
+"""Iterations for which it must stay fallen."""
+STUCK = 20
+"""Iterations for which the learning rate must stay on its floor."""
+DEAD = 0.01
+"""Standard deviation of the actions below which nothing is explored."""
+HISTORY = 2000
+"""Records of earlier attempts that are looked at, spread evenly."""
+
+
+class Watch:
+    """Looks at the records of a run in order.
+
+    Args:
+        run: Name of the run.
+        iterations: Iteration at which the training ends.
+        settings: The algorithm's settings; the target and the limits of an adaptive rate are read from them, where they have these.
+    """
+
+    def __init__(self, run: str, iterations: int, settings: Any) -> None:
+        self._run, self._iterations, self._settings = run, iterations, settings
+        self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW)
+        self._first: float | None = None
+        self._best, self._best_at = -math.inf, 0
+        self._checks = [_Check(PATIENCE, self._fallen), _Check(0, self._dead), _Check(STUCK, self._stuck)]
+
+    def follow(self, history: Iterable[Mapping[str, Any]]) -> None:
+        """Take in the records of earlier attempts."""
+        for record in history:
+            self.look(record)
+
+    def look(self, record: Mapping[str, Any]) -> list[str]:
+        """What is wrong after the iteration of ``record``, a line each; empty as a rule."""
+        reward, episodes = record.get("reward"), record.get("episodes") or 0
+        if episodes and _is_finite(reward):
+            self._window.append((float(episodes), float(reward or 0.0)))
+        mean = self._mean()
+        if mean is not None:
+            self._first = mean if self._first is None else self._first
+            if mean > self._best:
+                self._best, self._best_at = mean, record["iteration"]
+        found = [check.after(record) for check in self._checks]
+        if record["iteration"] == self._iterations:
+            found[0] = self._ended()
+        return [text for text in found if text]
+
+    def _mean(self) -> float | None:
+        """Mean return of the window, weighted by episodes; None until it is full."""
+        if len(self._window) < WINDOW:
+            return None
+        return sum(count * reward for count, reward in self._window) / sum(count for count, _ in self._window)
+
+    def _lost(self, share: float) -> float | None:
+        """The present mean, if it has less than ``share`` of the gain and the difference to the best is no noise."""
+        mean = self._mean()
+        if mean is None or self._first is None:
+            return None
+        noise = statistics.stdev(reward for _, reward in self._window) / math.sqrt(WINDOW)
+        is_lost = mean - self._first < share * (self._best - self._first) and self._best - mean > 3.0 * noise
+        return mean if is_lost else None
+
+    def _fallen(self, record: Mapping[str, Any]) -> str:
+        mean = self._lost(FALLEN)
+        if mean is None:
+            return ""
+        return (
+            f"it unlearns: mean return {mean:.2f}, below {FALLEN:.0%} of its gain for {PATIENCE} iterations; the best was "
+            f"{self._best:.2f} at iteration {self._best_at} ({self._run}@best)"
+        )
+
+    def _ended(self) -> str:
+        mean = self._lost(ENDS_BELOW)
+        if mean is None:
+            return ""
+        return (
+            f"it ended below its best: mean return {mean:.2f}, and {self._best:.2f} at iteration {self._best_at}; "
+            f"try its best checkpoint: muster evaluate {self._run}@best"
+        )
+
+    def _dead(self, record: Mapping[str, Any]) -> str:
+        deviation = record.get("action_std")
+        if not _is_finite(deviation) or not 0.0 < float(deviation or 0.0) < DEAD:  # 0: the actions are choices
+            return ""
+        return f"it no longer explores: the standard deviation of the actions is {deviation:.1g}; raise min_std, or the weight of the entropy"
+
+    def _stuck(self, record: Mapping[str, Any]) -> str:
+        settings, kl, rate = self._settings, record.get("kl"), record.get("learning_rate")
+        if getattr(settings, "schedule", "") != "adaptive" or not (_is_finite(kl) and _is_finite(rate)):
+            return ""
+        least, target = settings.learning_rate_limits[0], settings.desired_kl
+        if float(rate or 0.0) > 1.001 * least or float(kl or 0.0) <= target:
+            return ""
+        return (
+            f"its steps are too large: KL {kl:.3f} is over desired_kl {target:g} with the learning rate on its floor of {least:g}; "
+            "lower learning_rate_limits, or raise min_std"
+        )
+
+
+@dataclass
+class _Check:
+    """A condition that must hold for some iterations."""
+
+    patience: int
+    check: Callable[[Mapping[str, Any]], str]
+    since: int | None = None
+
+    def after(self, record: Mapping[str, Any]) -> str:
+        text, iteration = self.check(record), record["iteration"]
+        self.since = None if not text else iteration if self.since is None else self.since
+        return text if self.since is not None and iteration - self.since >= self.patience else ""
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
