@@ -21,7 +21,8 @@ from orchestrator.domain.errors import UsageError
 from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
 from shared_store.evaluations import in_one_line, told_changes
-from shared_store.policy_contract import differences, read
+from shared_store.policy_changes import differences
+from shared_store.policy_contract import read
 from shared_store.wording import counted
 
 ModelArgument = Annotated[str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version by default.")]

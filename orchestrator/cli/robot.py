@@ -41,9 +41,10 @@ def robot(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show a robot as a task would load it: joints, masses, actuators, a picture, and what its file would be read otherwise.
+    """Show a robot's file as a task would load it, beside MuJoCo's own reading.
 
-    MuJoCo's compiled model judges the file. What Newton's importer reads otherwise is corrected; what can't be held is refused by name.
+    It lists joints, limits, masses, actuators and sensors, and draws the default pose. MuJoCo's compiled model judges the file: what Newton's
+    importer reads otherwise is corrected, and what can't be held is refused by name.
     """
     drawn = _picture(file, output, overwrite) if picture else None
     if sys.stderr.isatty():

@@ -17,7 +17,8 @@ import torch
 import warp
 
 from shared_store.bundles import DamagedBundle, read_contract, verify
-from shared_store.policy_contract import Contract, brief, differences
+from shared_store.policy_changes import brief, differences
+from shared_store.policy_contract import Contract
 from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import configure, run_command, user_errors

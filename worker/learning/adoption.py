@@ -11,7 +11,7 @@ import torch
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.files import DamagedFile
 from shared_store.parent import parent_checkpoint
-from shared_store.policy_contract import brief, differences
+from shared_store.policy_changes import brief, differences
 from shared_store.settings import first_difference, fixed_settings, innermost
 from worker.distributed import Gang
 from worker.errors import UserError

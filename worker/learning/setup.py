@@ -15,7 +15,8 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.documents import DocumentError
 from shared_store.epoch import check_epoch
 from shared_store.files import read_json, write_json
-from shared_store.policy_contract import Contract, brief, differences, read, robot_changes
+from shared_store.policy_changes import brief, differences, robot_changes
+from shared_store.policy_contract import Contract, read
 from worker.distributed import Gang, warm_marker
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition

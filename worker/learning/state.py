@@ -25,7 +25,7 @@ from shared_store.checkpoints import (
     sweep,
 )
 from shared_store.epoch import check_epoch
-from shared_store.policy_contract import brief, differences
+from shared_store.policy_changes import brief, differences
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 from shared_store.wording import counted
 from worker.distributed import Gang

@@ -81,6 +81,16 @@ class Reading:
     notes: tuple[str, ...]
     identity: RobotModel
 
+    def lines(self) -> list[str]:
+        """What a user should know of the robot, one sentence each."""
+        if not self.corrected:
+            return list(self.notes)
+        count, first = len(self.corrected), self.corrected[0]
+        return [
+            f"built as MuJoCo reads its file; Newton's importer differs in {count} values, first in {first.field} of {first.element}",
+            *self.notes,
+        ]
+
 
 def shown(file: str | Path) -> str:
     """A file's name, for errors."""

@@ -132,16 +132,8 @@ class DeclaredTask(Task):
 
     def notes(self) -> Sequence[str]:
         """What a user should know of its robots, one sentence each."""
-        lines = []
-        for name, reading in self.readings.items():
-            if reading.corrected:
-                count, first = len(reading.corrected), reading.corrected[0]
-                lines.append(
-                    f"{name}: built as MuJoCo reads its file; Newton's importer differs in {count} values, first in {first.field} of "
-                    f"{first.element}"
-                )
-            lines += [f"{name}: {note}" for note in (*reading.notes, *self.views[name].beyond_limits())]
-        return lines
+        read = self.readings.items()
+        return [f"{name}: {line}" for name, each in read for line in (*each.lines(), *self.views[name].beyond_limits())]
 
     def stands_on(self) -> bool | Terrain:
         """The result of :meth:`terrain`, or whether there is a plane."""

@@ -210,6 +210,7 @@ TESTS = {
         "a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop": {"learning/completion.py": "_save"},
         "a_loss_that_is_not_finite_ends_all_ranks_after_their_saves": {"learning/loop.py": "Loop._failure"},
         "too_many_resets_on_one_rank_end_all_after_it_has_written_why": {"learning/loop.py": "Loop._judge_resets"},
+        "start_frames_follow_the_failures_of_all_ranks": {"learning/loop.py": "Loop._begin_iteration"},
         "plain_ppo_learns_on_two_ranks_what_it_learns_on_one": {
             "learning/plain_ppo.py": "Network.update_normalizer PlainPPO.__init__ PlainPPO._estimate PlainPPO.learn"
         },

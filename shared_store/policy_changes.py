@@ -1,0 +1,178 @@
+"""What a policy would misunderstand: the differences between two policy contracts, one line each."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from shared_store.policy_contract import LARGEST, Action, Contract, Group
+
+CLOSE = 1e-6
+"""Relative difference up to which two numbers count as equal: recompiling a model rounds."""
+
+
+def differences(before: Contract, now: Contract, *, ranges: bool = False) -> list[str]:
+    """The points in which a policy of ``before`` would misunderstand ``now``, one line each; empty if both mean the same.
+
+    Args:
+        before: The contract of the policy's training.
+        now: The contract that it would meet.
+        ranges: Also compare properties of the training: ranges and durations of commands, delays.
+    """
+    lines = []
+    if before.control_hz != now.control_hz:
+        lines.append(f"the control rate {before.control_hz:g} Hz became {now.control_hz:g} Hz")
+    for group in before.groups:
+        there = now.group(group.name)
+        if there is None:
+            lines.append(f"the observation group {group.name} is gone")
+        else:
+            lines += _group_differences(group, there, ranges)
+    lines += [f"the observation group {group.name} is new" for group in now.groups if not before.group(group.name)]
+    lines += _named(_actions(before), _actions(now), "action")
+    lines += _command_differences(before, now, ranges)
+    old, new = ({state.name: state.shape for state in each.states} for each in (before, now))
+    if old != new:
+        lines.append(f"the recurrent state {_states(old)} became {_states(new)}")
+    return lines
+
+
+def robot_changes(before: Contract, now: Contract) -> list[str]:
+    """The robots that load otherwise than in a policy's training, one line each; empty if the contract of then knows none."""
+    there = {robot.name: robot for robot in before.robots}
+    lines = []
+    for robot in now.robots:
+        then = there.get(robot.name)
+        if then is None or then.digest == robot.digest:
+            continue
+        pairs = (
+            ("mass [kg]", then.mass, robot.mass),
+            ("joints", then.joints, robot.joints),
+            ("actuators", then.actuators, robot.actuators),
+        )
+        changed = [f"{what} {old:g} became {new:g}" for what, old, new in pairs if old != new]
+        lines.append(f"{robot.name}: {', '.join(changed) or 'the values of its compiled model changed'}")
+    return lines
+
+
+def brief(lines: Sequence[str], most: int = 5) -> str:
+    """The first differences in one line, and the number of further ones."""
+    more = f"; and {len(lines) - most} more" if len(lines) > most else ""
+    return "; ".join(lines[:most]) + more
+
+
+def _group_differences(before: Group, now: Group, ranges: bool) -> list[str]:
+    of = "" if before.name == "policy" else f" of {before.name}"
+    lines = []
+    if before.terms and now.terms:
+        lines = _named(_columns(before, ranges), _columns(now, ranges), f"observation{of}")
+    if before.image and now.image:
+        old, new = (_flat(dataclasses.asdict(each)) for each in (before.image, now.image))
+        lines += [f"image{of}: {line}" for line in _changed(old, new)]
+    if not lines and (before.shape, before.dtype) != (now.shape, now.dtype):
+        lines.append(
+            f"the observations{of} of shape {list(before.shape)}, {before.dtype}, became {list(now.shape)}, {now.dtype}"
+        )
+    return lines
+
+
+def _columns(group: Group, ranges: bool) -> dict[str, dict[str, Any]]:
+    """The meaning of each number of a group, by its label, in order."""
+    found = {}
+    for term in group.terms:
+        common: dict[str, Any] = {
+            "kind": term.kind,
+            "clip": term.clip,
+            "quantity": term.quantity,
+            "robot": term.robot,
+            "command": term.command,
+            **{f"parameter {name}": value for name, value in term.parameters.items()},
+            **{f"sensor {name}": value for name, value in term.sensors.items()},
+            "frame": term.frame and (term.frame.body, *term.frame.position, *term.frame.rotation),
+        }
+        if ranges:
+            common["delay"] = term.delay
+        each = len(term.names) // len(term.elements) if term.elements else 0
+        for back in range(term.history - 1, -1, -1):
+            for index, name in enumerate(term.names):
+                label = name if name == term.name else f"{term.name}/{name}"
+                found[f"{label} ({back} steps ago)" if back else label] = {
+                    **common,
+                    "unit": term.units[index],
+                    "scale": term.scale[index],
+                    "offset": term.offset[index],
+                    **({"element": term.elements[index // each]} if each else {}),
+                    **({"range": term.ranges[index]} if ranges and term.ranges else {}),
+                }
+    return found
+
+
+def _actions(contract: Contract) -> dict[str, dict[str, Any]]:
+    if not contract.actions:
+        return {name: {} for name in contract.action_names}
+    fields = [field.name for field in dataclasses.fields(Action) if field.name not in ("name", "range")]
+    return {action.name: {name: getattr(action, name) for name in fields} for action in contract.actions}
+
+
+def _command_differences(before: Contract, now: Contract, ranges: bool) -> list[str]:
+    old, new = ({each.name: each for each in contract.commands} for contract in (before, now))
+    lines = [f"the command {name} is gone" for name in old.keys() - new.keys()]
+    lines += [f"the command {name} is new" for name in new.keys() - old.keys()]
+    for name in sorted(old.keys() & new.keys()):
+        compared = ["names", "units", *(["ranges", "seconds"] if ranges else [])]
+        pairs = [{each: getattr(command, each) for each in compared} for command in (old[name], new[name])]
+        lines += [f"command {name}: {line}" for line in _changed(*pairs)]
+    return sorted(lines)
+
+
+def _named(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]], what: str) -> list[str]:
+    """The changes of ordered, named items: ``observation 12: joint_pos/left_knee scale 1 became 0.5``."""
+    old, new = list(before), list(now)
+    lines = [f"{what} {old.index(name)}: {name} is gone" for name in old if name not in now]
+    lines += [f"{what} {new.index(name)}: {name} is new" for name in new if name not in before]
+    if not lines:  # otherwise all later items have moved
+        moved = [(name, new.index(name)) for index, name in enumerate(old) if new[index] != name]
+        lines = [f"{what} {old.index(name)}: {name} became {what} {place}" for name, place in moved]
+    for index, name in enumerate(old):
+        if name in now:
+            lines += [f"{what} {index}: {name} {line}" for line in _changed(before[name], now[name])]
+    return lines
+
+
+def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    for name in {**before, **now}:
+        old, new = before.get(name), now.get(name)
+        if (name in before) != (name in now):
+            yield f"{name} {_value(new if name in now else old)} is {'new' if name in now else 'gone'}"
+        elif (name == "frame" and None in (old, new)) or (name == "targets" and () in (old, new)):
+            continue  # a contract of format 1, or 2, lacks it
+        elif not _same(old, new):
+            yield f"{name} {_value(old)} became {_value(new)}"
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if isinstance(one, float | int) and isinstance(other, float | int):
+        one, other = (min(max(each, -LARGEST), LARGEST) for each in (one, other))
+        return math.isclose(one, other, rel_tol=CLOSE, abs_tol=CLOSE * 1e-3)
+    return bool(one == other)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if value is None or value == "":
+        return "none"
+    return str(value)
+
+
+def _states(states: Mapping[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{name} {list(shape)}" for name, shape in states.items()) or "none"
+
+
+def _flat(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The mapping, with the entries of ``camera`` beside the others."""
+    return {**{name: each for name, each in value.items() if name != "camera"}, **value["camera"]}
