@@ -100,7 +100,7 @@ class Report:
         with suppress(OSError):  # without them it begins anew
             earlier = sampled(job.run, HISTORY) if resumed_from else []
             self._watch.follow(record for record in earlier if record["iteration"] <= resumed_from)
-        self._warned_of: list[str] = []
+        self._warned_of = set[str]()
         threading.excepthook = partial(_thread_failed, threading.excepthook)
         self._new_events = events
         self._events: SummaryWriter | None = None
@@ -139,12 +139,12 @@ class Report:
         self._warned = bool(failures)
 
     def _warn(self, warnings: Sequence[str]) -> None:
-        """Print the warnings where one begins; their numbers change in every iteration."""
-        kinds = [text.partition(":")[0] for text in warnings]
-        for kind, text in zip(kinds, warnings, strict=True):
+        """Print each kind of warning once: some come and go, and their numbers change in every iteration."""
+        for text in warnings:
+            kind = text.partition(":")[0]
             if kind not in self._warned_of:
+                self._warned_of.add(kind)
                 print(f"warning: {text}", flush=True)
-        self._warned_of = kinds
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         self._metrics.write({**record, "time": time.time()})
