@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -120,7 +121,7 @@ def measure(name: str, path: Path) -> Row:
     state = "corrected" if reading.corrected else "as it is"
     twins = Twins(reading.reference.model, reading.builder)
     there, here = twins.free_of_contacts()
-    row = Row(name, state, "; ".join(map(str, reading.corrected[:1])), there.nv)
+    row = Row(name, state, _short("".join(map(str, reading.corrected[:1])), path), there.nv)
     controls = np.random.default_rng(1).uniform(-0.3, 0.3, there.nu)
     last, row.engine = in_engine(twins, there, here, controls)
     try:
@@ -128,6 +129,11 @@ def measure(name: str, path: Path) -> Row:
     except (ValueError, NotImplementedError) as error:
         row.detail = f"{row.detail}; not stepped by Muster: {error}".strip("; ")
     return row
+
+
+def _short(text: object, path: Path) -> str:
+    """A sentence for the table, without the folder of the file and what to do."""
+    return re.split(r"[;.] (?:change|Change|Give|Declare|Leave)", str(text).replace(str(path), path.name))[0]
 
 
 def in_engine(twins: Twins, there: Any, here: Any, controls: Any) -> tuple[Any, float]:

@@ -186,6 +186,7 @@ TESTS = {
         "a_training_is_the_same_on_all_ranks_to_its_end": {
             "distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
             "evaluation/evaluation.py": "evaluate",
+            "learning/begun.py": "as_begun",
             "learning/completion.py": "complete",
             "learning/exchange.py": "Exchange.gather",
             "learning/leaving.py": "train",
@@ -212,7 +213,7 @@ TESTS = {
         "too_many_resets_on_one_rank_end_all_after_it_has_written_why": {"learning/loop.py": "Loop._judge_resets"},
         "start_frames_follow_the_failures_of_all_ranks": {"learning/loop.py": "Loop._begin_iteration"},
         "plain_ppo_learns_on_two_ranks_what_it_learns_on_one": {
-            "learning/plain_ppo.py": "Network.update_normalizer PlainPPO.__init__ PlainPPO._estimate PlainPPO.learn"
+            "learning/plain_ppo.py": "Network.update_normalizer PlainPPO.__init__ PlainPPO._describe PlainPPO._estimate PlainPPO.learn"
         },
         "sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds": {
             "learning/sac/learner.py": "Learner.__init__",

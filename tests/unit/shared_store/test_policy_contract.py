@@ -13,19 +13,8 @@ import pytest
 
 from orchestrator.spec.json_schema import contract_schema
 from shared_store.documents import DocumentError
-from shared_store.policy_contract import (
-    Action,
-    Command,
-    Contract,
-    Frame,
-    Group,
-    Image,
-    State,
-    Term,
-    brief,
-    differences,
-    read,
-)
+from shared_store.policy_changes import brief, differences
+from shared_store.policy_contract import Action, Command, Contract, Frame, Group, Image, State, Term, read
 from tests.conftest import REPOSITORY
 
 ANGLES = Term(

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from shared_store.documents import DocumentError
+from shared_store.policy_changes import brief, differences
 from shared_store.policy_contract import (
     LARGEST,
     Action,
@@ -20,8 +21,6 @@ from shared_store.policy_contract import (
     State,
     Target,
     Term,
-    brief,
-    differences,
     read,
 )
 
