@@ -82,7 +82,7 @@ def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schem
 
 
 MALFORMED = {
-    "has format 4, this Muster reads up to 3; upgrade Muster": lambda found: found.update(format=4),
+    "has format 5, this Muster reads up to 4; upgrade Muster": lambda found: found.update(format=5),
     "task is missing": lambda found: found.pop("task"),
     "actions.1: unknown key 'scal'; did you mean scale?": lambda found: found["actions"][1].update(scal=1.0),
     "actions.0.kind: expected one of 'effort', 'position', 'velocity', 'choice', found 'postion'": lambda found: found[

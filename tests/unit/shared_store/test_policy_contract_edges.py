@@ -135,7 +135,7 @@ def test_what_only_training_is_about_is_compared_on_request() -> None:
         (with_term(ranges=(None,)), "have different lengths"),
         (with_group(CONTRACT, shape=(2, 1)), "its terms have 2 numbers, its shape is [2, 1]"),
         (with_choice(name="x"), "action_names are not the names of actions, in order"),
-        (replace(CONTRACT, format=4), "has format 4, this Muster reads up to 3; upgrade Muster"),
+        (replace(CONTRACT, format=5), "has format 5, this Muster reads up to 4; upgrade Muster"),
     ],
 )
 def test_a_contract_that_contradicts_itself_is_refused(contract: Contract, said: str) -> None:
