@@ -46,7 +46,7 @@ WORLDS = {"ant": 4096}
 """Instead of a spec's worlds: with these the ant learns to run, as its spec says."""
 POINTS = 200
 """Points of a curve."""
-SHOWN = (
+SHOWN = [
     "kl",
     "learning_rate",
     "action_std",
@@ -55,7 +55,7 @@ SHOWN = (
     "gradient_norm",
     "saturation",
     "v_max_mass",
-)
+]
 KINDS = ("default", "then", "stock")
 KEPT_COLUMNS = ("iteration", "episodes", "reward", "action_std")
 """Those that ``keeping.json`` keeps of a point."""

@@ -71,8 +71,10 @@ class LiftCubeConfig(TaskConfig):
             epochs=5,
             minibatches=4,
             learning_rate=1.0e-3,
+            learning_rate_horizon=500,  # it takes as long to lift
             desired_kl=0.01,
             entropy_coef=0.005,
+            max_std=10.0,  # as of the robots that walk
         )
     )
     """Settings of the task's training."""
