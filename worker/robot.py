@@ -8,19 +8,23 @@ import math
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mujoco
 import newton
 import numpy as np
 import warp as wp
 
 from worker.simulation.robot import Robot
+from worker.simulation.robot_elements import kind_of, name_of, word_of
+from worker.simulation.robot_judge import Difference
 from worker.simulation.robot_reading import AnotherRobot, Reading
+from worker.simulation.robot_values import shown_value
 from worker.simulation.robot_view import RobotView
+from worker.tasks.config import TaskConfig
 from worker.tasks.task import Task
-
-if TYPE_CHECKING:
-    from worker.simulation.robot_judge import Difference
+from worker.telemetry import picture
+from worker.telemetry.stage import Stage
 
 PICTURE = (960, 720)
 """Width and height [px]."""
@@ -77,10 +81,6 @@ def _is_linear(builder: newton.ModelBuilder, dof: int) -> bool:
 
 
 def _actuators(model: Any) -> list[dict[str, Any]]:
-    import mujoco
-
-    from worker.simulation.robot_elements import kind_of, name_of, word_of
-
     found = []
     for actuator in range(model.nu):
         kind = word_of(mujoco.mjtTrn, model.actuator_trntype[actuator])
@@ -101,8 +101,6 @@ def _actuators(model: Any) -> list[dict[str, Any]]:
 
 
 def _difference(difference: Difference) -> dict[str, str]:
-    from worker.simulation.robot_values import shown_value
-
     return {
         "element": difference.element,
         "field": difference.field,
@@ -113,9 +111,6 @@ def _difference(difference: Difference) -> dict[str, str]:
 
 def draw(robot: Robot, path: Path) -> None:
     """Draw a robot in its default pose. Raises UserError if the file can't be written."""
-    from worker.tasks.config import TaskConfig
-    from worker.telemetry import picture
-    from worker.telemetry.stage import Stage
 
     class Alone(Task):
         def build(self, builder: newton.ModelBuilder) -> None:

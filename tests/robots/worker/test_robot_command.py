@@ -1,0 +1,53 @@
+"""``muster robot``: a robot's file as a task would load it, and what Newton's importer reads otherwise."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+MUSTER = str(Path(sys.executable).parent / "muster")
+CHEETAH = """<mujoco><compiler settotalmass="14"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
+<body name="torso" pos="0 0 .7"><joint name="x" type="slide" axis="1 0 0"/><joint name="turn" axis="0 1 0" pos="0 0 .1" range="-60 60"/>
+<geom type="capsule" fromto="-.5 0 0 .5 0 0" size=".05"/></body></worldbody>
+<actuator><motor name="motor" joint="turn" gear="120" ctrlrange="-1 1"/></actuator><sensor><gyro name="spin" site="s"/></sensor></mujoco>"""
+
+
+def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    (folder / "cheetah.xml").write_text(CHEETAH.replace("<geom type", '<site name="s"/><geom type'))
+    (folder / "late.xml").write_text(
+        CHEETAH.replace("ctrlrange", 'nsample="4" delay=".01" ctrlrange').replace('site="s"', 'site="t"')
+    )
+    return subprocess.run([MUSTER, "robot", *arguments], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_it_describes_a_robot_and_draws_it(tmp_path: Path) -> None:
+    found = command(tmp_path, "cheetah.xml", "--json")
+    assert found.returncode == 0, found.stderr
+    told = json.loads(found.stdout)
+    assert told["mass"] == 14.0 and [body["name"] for body in told["bodies"]] == ["torso"]
+    slide, hinge = told["joints"]
+    assert (slide["name"], slide["kind"], slide["lower"]) == ("x", "slide", None)
+    assert (hinge["name"], hinge["kind"], round(hinge["upper"], 4)) == ("turn", "hinge", 1.0472)
+    assert told["actuators"][0]["drives"] == "joint turn" and told["actuators"][0]["gear"] == 120.0
+    assert told["sensors"] == [{"name": "spin", "kind": "gyro"}]
+    assert {each["field"] for each in told["corrected"]} >= {"mass", "pos"}
+    assert (tmp_path / "cheetah.png").read_bytes().startswith(b"\x89PNG") and told["picture"] == "cheetah.png"
+    again = command(tmp_path, "cheetah.xml")
+    assert again.returncode == 2 and "cheetah.png exists; name another with -o, or add --overwrite" in again.stderr
+
+
+def test_it_lists_what_newton_reads_otherwise(tmp_path: Path) -> None:
+    found = command(tmp_path, "cheetah.xml", "--compare", "--no-picture")
+    assert found.returncode == 0 and "JOINTS" in found.stdout and "MASS [kg]" in found.stdout
+    assert "body torso  mass" in found.stdout and "14" in found.stdout and not (tmp_path / "cheetah.png").exists()
+
+
+def test_it_lists_what_can_t_be_held(tmp_path: Path) -> None:
+    found = command(tmp_path, "late.xml", "--compare", "--no-picture")
+    assert found.returncode == 2 and "actuator motor  delay" in found.stdout
+    assert found.stderr.startswith(
+        "muster: late.xml would be another robot here: actuator motor: delay is 0, in the file 0.01"
+    )
+    assert found.stderr.count("\n") == 1
