@@ -145,7 +145,7 @@ def mean(values: list[float]) -> float:
 class Trainer:
     """Trains a plan, several at once, and appends their points to a file."""
 
-    def __init__(self, path: Path, gpus: int) -> None:
+    def __init__(self, path: Path, gpus: list[str]) -> None:
         self._path, self._gpus, self._lock = path, gpus, threading.Lock()
         self._warm: dict[str, threading.Event] = {}
         self._started = 0
@@ -167,7 +167,7 @@ class Trainer:
             warm.wait()
         command = [sys.executable, "-m", "benchmarks.keeping", "--train", json.dumps(vars(training))]
         with self._lock:
-            device = "" if training.spec in ON_CPU or not self._gpus else str(self._started % self._gpus)
+            device = "" if training.spec in ON_CPU or not self._gpus else self._gpus[self._started % len(self._gpus)]
             self._started += device != ""
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": device}
         try:
@@ -387,7 +387,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="instead of the plan's number")
     parser.add_argument("--times", type=float, help="instead of the plan's multiple of the spec's iterations")
     parser.add_argument("--at-once", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--gpus", type=int, default=0, help="number of GPUs among which the trainings are divided")
+    parser.add_argument("--gpus", nargs="*", default=[], help="GPUs among which the trainings are divided, by number")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     parser.add_argument("--table", action="store_true", help="only write the table and the picture")
     parser.add_argument("--train", help=argparse.SUPPRESS)  # one training, in this process
