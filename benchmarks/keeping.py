@@ -396,6 +396,7 @@ def main() -> None:
         for point in train(Training(**json.loads(options.train))):
             print(json.dumps(point), flush=True)
         os._exit(0)  # not joining the threads of the loop
+    options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "keeping.jsonl"
     if not options.table:
         Trainer(path, options.gpus).train_all(planned(options), options.at_once)
