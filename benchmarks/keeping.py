@@ -368,14 +368,14 @@ def draw(curves: Mapping[Key, Curve], path: Path) -> None:
 def planned(options: argparse.Namespace) -> list[Training]:
     """The trainings that the command asks for."""
     kinds: dict[str, Mapping[str, Any] | None] = {"default": {}, "then": PPOConfig.before, "stock": None}
-    for given in options.by:
-        name, equals, settings = given.partition("=")
+    for asked in options.by:
+        name, equals, settings = asked.partition("=")
         kinds |= {name: json.loads(settings)} if equals else {}
     plan = []
     for spec in options.specs or PLAN:
         seeds, times = PLAN[spec]
         iterations = round(section_of(spec)[0]["iterations"] * (options.times or times))
-        for by in (given.partition("=")[0] for given in options.by):
+        for by in (asked.partition("=")[0] for asked in options.by):
             plan += [Training(spec, by, seed, iterations, kinds[by]) for seed in range(options.seeds or seeds)]
     return plan
 
