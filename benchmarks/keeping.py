@@ -145,7 +145,7 @@ def mean(values: list[float]) -> float:
 class Trainer:
     """Trains a plan, several at once, and appends their points to a file."""
 
-    def __init__(self, path: Path, gpus: int) -> None:
+    def __init__(self, path: Path, gpus: list[str]) -> None:
         self._path, self._gpus, self._lock = path, gpus, threading.Lock()
         self._warm: dict[str, threading.Event] = {}
         self._started = 0
@@ -167,7 +167,7 @@ class Trainer:
             warm.wait()
         command = [sys.executable, "-m", "benchmarks.keeping", "--train", json.dumps(vars(training))]
         with self._lock:
-            device = "" if training.spec in ON_CPU or not self._gpus else str(self._started % self._gpus)
+            device = "" if training.spec in ON_CPU or not self._gpus else self._gpus[self._started % len(self._gpus)]
             self._started += device != ""
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": device}
         try:
@@ -300,7 +300,7 @@ def table(curves: Mapping[Key, Curve]) -> str:
     lines = [
         "# Do trainings keep what they learnt?",
         "",
-        f"`python -m benchmarks.keeping`. Mean returns are over {WIDTH:.0%} of a training, weighted by episodes; *kept* is the last of "
+        f"`python -m benchmarks.keeping`, {', '.join(ON_CPU)} on one core each, the others on a GPU, ant with {WORLDS['ant']:,} worlds. Mean returns are over {WIDTH:.0%} of a training, weighted by episodes; *kept* is the last of "
         "these means as a share of the best one. *Dipped*: seeds whose mean fell below 90 % of the best one at any time after it had been "
         "there. *To 90 %*: iterations until a two-hundredth of the training had 90 % of the median best mean of the default settings.",
         "",
@@ -368,14 +368,14 @@ def draw(curves: Mapping[Key, Curve], path: Path) -> None:
 def planned(options: argparse.Namespace) -> list[Training]:
     """The trainings that the command asks for."""
     kinds: dict[str, Mapping[str, Any] | None] = {"default": {}, "then": PPOConfig.before, "stock": None}
-    for given in options.by:
-        name, equals, settings = given.partition("=")
+    for asked in options.by:
+        name, equals, settings = asked.partition("=")
         kinds |= {name: json.loads(settings)} if equals else {}
     plan = []
     for spec in options.specs or PLAN:
         seeds, times = PLAN[spec]
         iterations = round(section_of(spec)[0]["iterations"] * (options.times or times))
-        for by in (given.partition("=")[0] for given in options.by):
+        for by in (asked.partition("=")[0] for asked in options.by):
             plan += [Training(spec, by, seed, iterations, kinds[by]) for seed in range(options.seeds or seeds)]
     return plan
 
@@ -387,7 +387,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="instead of the plan's number")
     parser.add_argument("--times", type=float, help="instead of the plan's multiple of the spec's iterations")
     parser.add_argument("--at-once", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--gpus", type=int, default=0, help="number of GPUs among which the trainings are divided")
+    parser.add_argument("--gpus", nargs="*", default=[], help="GPUs among which the trainings are divided, by number")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     parser.add_argument("--table", action="store_true", help="only write the table and the picture")
     parser.add_argument("--train", help=argparse.SUPPRESS)  # one training, in this process
@@ -396,6 +396,7 @@ def main() -> None:
         for point in train(Training(**json.loads(options.train))):
             print(json.dumps(point), flush=True)
         os._exit(0)  # not joining the threads of the loop
+    options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "keeping.jsonl"
     if not options.table:
         Trainer(path, options.gpus).train_all(planned(options), options.at_once)

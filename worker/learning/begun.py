@@ -35,10 +35,10 @@ def as_begun(training: Training, gang: Gang) -> tuple[Training, str]:
         settings = type(training.settings)(**{**_fields(training.settings), **kept})
     except (TypeError, ValueError) as error:
         raise UserError(refusal(section_of(training.algorithm), error)) from error
-    told = ", ".join(f"{name} {_shown(value)} (now {_shown(now[name])})" for name, value in kept.items())
+    listed = ", ".join(f"{name} {_shown(value)} (now {_shown(now[name])})" for name, value in kept.items())
     return (
         dataclasses.replace(training, settings=settings),
-        f"settings as when the run began, since the job sets no others: {told}",
+        f"settings as when the run began, since the job sets no others: {listed}",
     )
 
 

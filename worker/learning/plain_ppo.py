@@ -151,9 +151,13 @@ class PlainPPO:
         self._draws.order(orders, scratch)
         # each rank's mean is weighted by its share of worlds, so that the sum over the ranks is the mean over all samples
         weight = worlds / self.setting.share.total
-        sums, norms = torch.zeros(5, device=device), torch.zeros((), device=device)
+        sums, clipped, norms = (
+            torch.zeros(4, device=device),
+            torch.zeros((), device=device),
+            torch.zeros((), device=device),
+        )
         for rows in orders.flatten(1):
-            loss, told = self._loss({name: tensor[rows] for name, tensor in samples.items()}, old_deviation)
+            loss, told, beyond = self._loss({name: tensor[rows] for name, tensor in samples.items()}, old_deviation)
             self.optimizer.zero_grad()
             (weight * loss).backward()
             for parameter in self.parameters:
@@ -161,6 +165,7 @@ class PlainPPO:
                 self.gang.sum(parameter.grad)
             told = self.gang.sum(weight * told)
             sums += told
+            clipped += weight * beyond
             if config.schedule == "adaptive":
                 self.rate = self._adapted_rate(kl=float(told[3]))
             found = [
@@ -173,40 +178,30 @@ class PlainPPO:
         if self._normalizer_learns:
             self.actor.update_normalizer(samples["seen"], self.setting)
             self.critic.update_normalizer(samples["judged"], self.setting)
-        numbers = (
-            *(sums / len(orders)),
-            torch.tensor(self.rate, device=device),
-            old_deviation.mean(),
-            norms / len(orders),
-        )
-        names = (
-            "surrogate_loss",
-            "value_loss",
-            "entropy",
-            "kl",
-            "clip_fraction",
-            "learning_rate",
-            "action_std",
-            "gradient_norm",
-        )
-        return {**dict(zip(names, numbers, strict=True)), **self._describe(samples)}
+        losses = dict(zip(("surrogate_loss", "value_loss", "entropy", "kl"), sums / len(orders), strict=True))
+        rate, norm = torch.tensor(self.rate, device=device), norms / len(orders)
+        figures = {"learning_rate": rate, "action_std": old_deviation.mean(), "gradient_norm": norm}
+        return {**losses, **figures, **self._describe(samples, clipped / len(orders))}
 
     @torch.no_grad()
     def _limit_deviation(self) -> None:
         """Bring the standard deviation back into its limits. A clamp in the loss would have no gradient beyond them."""
         self.actor.std.clamp_(*self.config.std_limits)
 
-    def _describe(self, samples: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """How much of the returns' variance the critic explained, and how many actions were beyond their range, over all ranks."""
+    def _describe(self, samples: dict[str, torch.Tensor], clipped: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Shares over all ranks: of the returns' variance that the critic explained, of ratios that were clipped, and of actions beyond
+        their range. ``clipped``: this rank's part of the second."""
         returns, errors = samples["returns"].double(), (samples["returns"] - samples["values"]).double()
         ranges = [each or (-math.inf, math.inf) for each in self.setting.action_ranges] or [(-math.inf, math.inf)]
         least, greatest = torch.tensor(ranges, device=returns.device).t()
         beyond = (samples["actions"] < least) | (samples["actions"] > greatest)
         squares = returns.square().sum(), errors.square().sum()
-        sums = self.gang.sum(torch.stack((returns.sum(), errors.sum(), *squares, beyond.sum().double())))
+        sums = self.gang.sum(
+            torch.stack((returns.sum(), errors.sum(), *squares, beyond.sum().double(), clipped.double()))
+        )
         count = self.setting.share.total * self.steps
         of_returns, of_errors = sums[2:4] - sums[:2].square() / count  # count · variance
-        figures = {"explained_variance": 1 - of_errors / of_returns.clamp(min=1e-12)}
+        figures = {"explained_variance": 1 - of_errors / of_returns.clamp(min=1e-12), "clip_fraction": sums[5]}
         if limited := sum(each is not None for each in self.setting.action_ranges):
             figures["saturation"] = sums[4] / (count * limited)
         return figures
@@ -239,7 +234,7 @@ class PlainPPO:
         return {name: tensor.flatten(0, 1) for name, tensor in known.items()}
 
     def _loss(self, batch: dict[str, torch.Tensor], old_deviation: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and its metrics, shape (5,)."""
+        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and its metrics, shape (4,), and the share of clipped ratios."""
         config, clip = self.config, self.config.clip
         policy = Normal(self.actor(batch["seen"]), self.actor.std, validate_args=False)
         # probability ratio of the action, new over old policy; no gradient beyond the clip range
@@ -255,7 +250,7 @@ class PlainPPO:
         kl = kl_divergence(Normal(batch["means"], old_deviation, validate_args=False), policy).sum(-1).mean()
         loss = surrogate + config.value_loss_coef * error.mean() - config.entropy_coef * entropy
         clipped = ((ratio - 1.0).abs() > clip).float().mean()
-        return loss, torch.stack((surrogate, error.mean(), entropy, kl, clipped)).detach()
+        return loss, torch.stack((surrogate, error.mean(), entropy, kl)).detach(), clipped
 
     def _adapted_rate(self, kl: float) -> float:
         """A smaller rate if the policy has moved too far from the old one, a greater one if it has hardly moved (rsl-rl's rule)."""

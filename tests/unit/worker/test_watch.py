@@ -34,13 +34,13 @@ RISE = [*([1.0] * 20), *([21.0] * 20)]
 """The first mean is 1, the best 21: a gain of 20, of which 70 % are left at 15."""
 
 
-@pytest.mark.parametrize(("fallen", "heard"), [(14.0, True), (15.5, False)])
-def test_a_fall_below_the_share_of_the_gain_is_reported_after_fifty_iterations(fallen: float, heard: bool) -> None:
+@pytest.mark.parametrize(("fallen", "reported"), [(14.0, True), (15.5, False)])
+def test_a_fall_below_the_share_of_the_gain_is_reported_after_fifty_iterations(fallen: float, reported: bool) -> None:
     found = begun(watch(), [*RISE, *([fallen] * 100)])
     first = next((i for i, texts in enumerate(found, 1) if texts), None)
     # the mean of 20 iterations is below 15 from the twentieth of 14.0 on, that is after iteration 58 (19 of 14 and one of 21 are 14.35)
-    assert (first is not None) == heard and (not heard or 40 + 50 < first <= 60 + 50)
-    if heard:
+    assert (first is not None) == reported and (not reported or 40 + 50 < first <= 60 + 50)
+    if reported:
         assert found[-1] == [
             "it unlearns: mean return 14.00, below 70% of its gain for 50 iterations; the best was 21.00 at iteration 40 (cart@best)"
         ]
@@ -67,14 +67,14 @@ def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
     assert not any(begun(watch(60), [*RISE, *([20.0] * 20)]))
 
 
-@pytest.mark.parametrize(("deviation", "heard"), [(0.003, True), (0.05, False), (0.0, False), (None, False)])
-def test_a_dead_deviation_is_reported_at_once_and_choices_have_none(deviation: float | None, heard: bool) -> None:
+@pytest.mark.parametrize(("deviation", "reported"), [(0.003, True), (0.05, False), (0.0, False), (None, False)])
+def test_a_dead_deviation_is_reported_at_once_and_choices_have_none(deviation: float | None, reported: bool) -> None:
     found = watch().look(record(3, action_std=deviation))
-    assert bool(found) == heard and all("0.003" in text and "min_std" in text for text in found)
+    assert bool(found) == reported and all("0.003" in text and "min_std" in text for text in found)
 
 
 @pytest.mark.parametrize(
-    ("rate", "kl", "schedule", "heard"),
+    ("rate", "kl", "schedule", "reported"),
     [
         (1e-5, 0.02, "adaptive", True),
         (1e-5, 0.009, "adaptive", False),
@@ -83,11 +83,11 @@ def test_a_dead_deviation_is_reported_at_once_and_choices_have_none(deviation: f
     ],
 )
 def test_steps_that_stay_too_large_on_the_floor_of_the_rate_are_reported(
-    rate: float, kl: float, schedule: str, heard: bool
+    rate: float, kl: float, schedule: str, reported: bool
 ) -> None:
     of = watch(schedule=schedule)
     found = [of.look(record(i, learning_rate=rate, kl=kl)) for i in range(1, 30)]
-    assert [bool(texts) for texts in found] == [heard and i > 20 for i in range(1, 30)]
+    assert [bool(texts) for texts in found] == [reported and i > 20 for i in range(1, 30)]
 
 
 def test_a_resumed_training_remembers_its_best_and_warns_once(
@@ -104,8 +104,8 @@ def test_a_resumed_training_remembers_its_best_and_warns_once(
         for iteration in range(first + 1, last + 1):
             report.iteration({**record(iteration, returns[iteration - 1], action_std=0.4), **usual})
         report.close()
-    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
-    assert len(said) == 1 and "the best was 21.00 at iteration 40 (cart@best)" in said[0]
+    printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert len(printed) == 1 and "the best was 21.00 at iteration 40 (cart@best)" in printed[0]
     (kept,) = warnings_of(read_metrics(run)[-1])
     assert kept.startswith("it unlearns: mean return 2.00, ")
 
