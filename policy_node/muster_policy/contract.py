@@ -11,7 +11,7 @@ import numpy as np
 
 from muster_policy.errors import Refused
 
-FORMAT = 3
+FORMAT = 4
 """The newest version of the document that the node reads."""
 Pair = tuple[float, float]
 

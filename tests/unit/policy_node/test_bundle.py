@@ -110,7 +110,7 @@ def test_a_policy_that_acts_otherwise_than_it_was_trained_is_refused(tmp_path: P
 
 
 UNREADABLE = {
-    "has format 9, this node reads up to 3; upgrade muster-policy": lambda found: found.update(format=9),
+    "has format 9, this node reads up to 4; upgrade muster-policy": lambda found: found.update(format=9),
     "actions is missing; export the policy again": lambda found: found.pop("actions"),
     "control_hz is 0; export the policy again": lambda found: found.update(control_hz=0),
     "it is no policy contract": lambda found: found.update(groups=7),

@@ -120,7 +120,7 @@ FILES: dict[str, str] = {
     "name: a\ntrain: {worlds: 4, iterations: 2}\n": ":2: train.task: is required",
     "name: a\nevaluate: {}\n": ":2: evaluate.run: is required",
     "name: a\nrace: {laps: 3}\n": (
-        ":2: race.laps: unknown key; valid here: run, checkpoint, trials, continuous, off_track_penalty, "
+        ":2: race.laps: unknown key; valid here: run, checkpoint, accept_changed_robot, trials, continuous, off_track_penalty, "
         "crash_penalty, max_resets, seconds, track, seed, config, keep (and 1 more)"
     ),
     "name: a\nrace: {run: x, trials: 101}\n": ":2: race.trials: expected a value less than or equal to 100, found 101",

@@ -82,14 +82,14 @@ secrets: {KEY: name}
 track:
   wandb: {project: a, entity: a, group: a, tags: [a], mode: offline}
   mlflow: {uri: 'sqlite:///a', experiment: a, tags: {a: b}}
-train: {iterations: 9}
-evaluate: {run: ant, checkpoint: 3, episodes: 3, worlds: 3, seed: 3, config: {x: 1}, keep: false}
+train: {iterations: 9, accept_changed_robot: true}
+evaluate: {run: ant, checkpoint: 3, accept_changed_robot: true, episodes: 3, worlds: 3, seed: 3, config: {x: 1}, keep: false}
 race:
-  {run: ant, checkpoint: 3, trials: 5, continuous: true, off_track_penalty: 5.0, crash_penalty: 5.0, max_resets: 3,
+  {run: ant, checkpoint: 3, accept_changed_robot: true, trials: 5, continuous: true, off_track_penalty: 5.0, crash_penalty: 5.0, max_resets: 3,
    seconds: 60.0, track: chicane, seed: 3, config: {x: 1}, keep: false}
-export: {run: ant, checkpoint: 3, episodes: 3, worlds: 3}
-record: {run: ant, checkpoint: 3, worlds: 3, episodes: 3, seed: 3}
-render: {run: ant, checkpoint: 3, format: png, worlds: 3, seconds: 2.5, width: 128, height: 128}
+export: {run: ant, checkpoint: 3, accept_changed_robot: true, episodes: 3, worlds: 3}
+record: {run: ant, checkpoint: 3, accept_changed_robot: true, worlds: 3, episodes: 3, seed: 3}
+render: {run: ant, checkpoint: 3, accept_changed_robot: true, format: png, worlds: 3, seconds: 2.5, width: 128, height: 128}
 checkpoint: {every: auto, keep: 3}
 evaluation:
   {every: 3, episodes: 7, worlds: 7, queue: idle, share: mine, resources: {cpus: 2.5, gpus: 1, memory: 2048},
