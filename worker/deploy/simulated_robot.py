@@ -20,6 +20,7 @@ from shared_store.bundles import DamagedBundle, read_contract, verify
 from shared_store.policy_changes import brief, differences
 from shared_store.policy_contract import Contract
 from shared_store.wording import counted
+from worker.accepting import CHANGED_ROBOTS
 from worker.errors import UserError
 from worker.learning.job import configure, run_command, user_errors
 
@@ -273,6 +274,7 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
         raise UserError(str(error)) from error
     with user_errors("task"):
         task_type = find_task(contract.task)
+    CHANGED_ROBOTS.set(accept)
     with user_errors():
         task = task_type(configure(task_type, manifest["train"]), 1, seed=seed, device="cpu")
     if not isinstance(task, DeclaredTask) or "robot" not in task.views:

@@ -22,6 +22,7 @@ from shared_store.epoch import StaleEpoch
 from shared_store.faults import fault_in
 from shared_store.layout import Run, Store, StoreError
 from shared_store.wording import kind_of
+from worker.accepting import CHANGED_ROBOTS
 from worker.errors import GangError, TrainingError, UserError
 
 if TYPE_CHECKING:
@@ -99,7 +100,11 @@ class Job:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str], kind: str) -> Job:
-        """Read the job for command ``kind``. Raises UserError naming the variable that is missing or malformed."""
+        """Read the job for command ``kind``, and keep what it accepts (:mod:`worker.accepting`).
+
+        Raises:
+            UserError: A variable is missing or malformed; the message names it.
+        """
         for name in ("MUSTER_STORE", "MUSTER_RUN", "MUSTER_SPEC"):
             if not env.get(name):
                 raise UserError(
@@ -116,6 +121,7 @@ class Job:
                 f"MUSTER_SPEC, MUSTER_EPOCH or MUSTER_JOB_EPOCH is malformed for `{kind}`: {error!r}"
             ) from error
         _check_kinds(spec, kind)
+        CHANGED_ROBOTS.set(bool(section.get("accept_changed_robot")))
         store = Store(env["MUSTER_STORE"])
         run = store.run(env["MUSTER_RUN"])
         chosen = env.get("MUSTER_CHECKPOINT") or None

@@ -18,6 +18,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.policy_contract import RobotModel
+from worker.accepting import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference, robot_usd, robot_values
 from worker.simulation.carriers import keep_inertias
@@ -70,7 +71,7 @@ class Reading:
     Attributes:
         builder: Holds the robot alone, with the actuators of its file, whose inputs are the controls.
         reference: MuJoCo's compiled model of the file; None for a USD file.
-        corrected: What Newton's importer had read otherwise, and is right now.
+        corrected: What Newton's importer had read otherwise, and is right now, or is accepted.
         notes: What else a user should know of it, one sentence each.
         identity: By which a policy knows the robot again.
     """
@@ -146,9 +147,16 @@ def read(source: Source) -> Reading:
     if found.differences:
         builder = _imported(source, RobotFile(_rewritten(model, name), "mjcf", {}), None)
         found = _amended(source, builder, model, _compared(source, builder, model))
-    if found.differences:
-        raise AnotherRobot(name, found.differences)
     notes = (*reference.notes, *found.notes)
+    if found.differences:
+        refusal = AnotherRobot(name, found.differences)
+        if not CHANGED_ROBOTS.get():
+            raise refusal
+        builder = _imported(source, file, floating)  # as the training had it
+        notes = (
+            *reference.notes,
+            f"loaded as Newton's importer reads it, since changed robots are accepted: {refusal}",
+        )
     return Reading(builder, reference, corrected, notes, identity(builder, model))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from newton.solvers import SolverMuJoCo
 
+from worker.accepting import CHANGED_ROBOTS
 from worker.simulation.robot import Robot
 from worker.simulation.robot_reading import Reading
 from worker.simulation.robot_twins import Twins
@@ -228,6 +229,17 @@ def test_what_can_t_be_held_is_refused_by_the_name_of_its_element(file: str, wor
 def test_a_difference_may_be_accepted() -> None:
     delayed = mjcf(HINGE + BOX, '<actuator><position joint="j" kp="20" nsample="8" delay=".01"/></actuator>')
     assert read(delayed, accept=("actuator *: delay", "actuator *: history")).reference is not None
+
+
+def test_a_job_that_accepts_changed_robots_has_the_robot_that_newton_reads() -> None:
+    delayed = mjcf(HINGE + BOX, '<actuator><position joint="j" kp="20" nsample="8" delay=".01"/></actuator>')
+    accepted = CHANGED_ROBOTS.set(True)
+    try:
+        (note,) = read(delayed).notes
+    finally:
+        CHANGED_ROBOTS.reset(accepted)
+    assert note.startswith("loaded as Newton's importer reads it, since changed robots are accepted: ")
+    assert "delay is 0, in the file 0.01" in note
 
 
 @pytest.mark.parametrize("name", ["joint_positions", "armature"])
