@@ -114,7 +114,8 @@ class AnotherRobot(ValueError):
         pattern = f"{first.element}: {first.field}"
         super().__init__(
             f"{file} would be another robot here: {first}{more}. {REMEDIES.get(first.field, 'Change the file')}, or accept the "
-            f"difference: Robot(..., accept=({pattern!r},)). All of them: muster robot {file} --compare"
+            f"difference: Robot(..., accept=({pattern!r},)). All of them: muster robot {file} --compare. For a run that was "
+            "trained on it: --accept-changed-robot"
         )
 
 
