@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -16,12 +15,13 @@ from rich.table import Table
 from rich.text import Text
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.recordings import check_output
 from orchestrator.cli.terminal import Console, echo, echo_json
-from orchestrator.domain.errors import ServerError, SpecError, UsageError
+from orchestrator.domain.errors import ServerError, SpecError
 
 _EXAMPLES = """Examples:  muster robot arm.urdf
 muster robot package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml -o go1.png
-muster robot humanoid.xml --compare --no-picture"""
+muster robot humanoid.xml --compare"""
 
 
 def register(app: typer.Typer) -> None:
@@ -35,38 +35,29 @@ def robot(
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Picture of the default pose; NAME.png by default.", show_default=False),
+        typer.Option("--output", "-o", help="Draw its default pose into this PNG file.", show_default=False),
     ] = None,
-    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Whether to draw it.")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show a robot's file as a task would load it, beside MuJoCo's own reading.
 
-    It lists joints, limits, masses, actuators and sensors, and draws the default pose. MuJoCo's compiled model judges the file: what Newton's
+    It lists joints, limits, masses, actuators and sensors, and with -o it draws the default pose. MuJoCo's compiled model judges the file: what Newton's
     importer reads otherwise is corrected, and what can't be held is refused by name.
     """
-    drawn = _picture(file, output, overwrite) if picture else None
+    if output is not None:
+        check_output(output, overwrite, ".png")
     if sys.stderr.isatty():
         echo("importing the simulation, which takes some seconds …", err=True)
-    found = _ask_worker(file, drawn)
+    found = _ask_worker(file, output)
     if as_json:
         echo_json(found, indent=1)
         raise typer.Exit(2 if "error" in found else 0)
     if "error" in found:
-        if compare:
+        if compare and found["differences"]:
             _print_differences("WOULD DIFFER", found["differences"])
         raise SpecError(found["error"])
     _print(found, compare)
-
-
-def _picture(file: str, output: Path | None, overwrite: bool) -> Path:
-    path = output or Path(re.sub(r"\W+", "-", Path(file.rpartition(":")[2]).stem) + ".png")
-    if path.suffix != ".png":
-        raise UsageError(f"-o {path}: a picture of a robot ends in .png")
-    if path.exists() and not overwrite:
-        raise UsageError(f"{path} exists; name another with -o, or add --overwrite or --no-picture")
-    return path
 
 
 def _ask_worker(file: str, picture: Path | None) -> dict[str, Any]:

@@ -12,42 +12,24 @@ from shared_store.policy_contract import RobotModel
 from worker.simulation.robot_values import gravity, inertia
 
 _COMPILED = (
-    *("body_parentid", "body_pos", "body_quat", "body_mass", "body_ipos", "body_gravcomp", "body_mocapid"),
-    *("jnt_type", "jnt_bodyid", "jnt_pos", "jnt_axis", "jnt_limited", "jnt_range", "jnt_stiffness", "jnt_solref"),
-    *("jnt_solimp", "jnt_margin", "jnt_actfrclimited", "jnt_actfrcrange", "qpos0", "qpos_spring"),
-    *(
-        "dof_damping",
-        "dof_armature",
-        "dof_frictionloss",
-        "geom_type",
-        "geom_bodyid",
-        "geom_size",
-        "geom_pos",
-        "geom_quat",
-    ),
-    *("geom_contype", "geom_conaffinity", "geom_condim", "geom_friction", "geom_solref", "geom_solimp"),
-    *(
-        "tendon_num",
-        "tendon_range",
-        "tendon_stiffness",
-        "tendon_damping",
-        "tendon_lengthspring",
-        "wrap_objid",
-        "wrap_prm",
-    ),
-    *("eq_type", "eq_obj1id", "eq_obj2id", "eq_data", "exclude_signature", "actuator_trntype", "actuator_trnid"),
-    *("actuator_dyntype", "actuator_gaintype", "actuator_biastype", "actuator_dynprm", "actuator_gainprm"),
-    *("actuator_biasprm", "actuator_gear", "actuator_ctrlrange", "actuator_forcerange", "actuator_delay"),
+    "body_parentid body_pos body_quat body_mass body_ipos body_gravcomp body_mocapid jnt_type jnt_bodyid jnt_pos jnt_axis "
+    "jnt_limited jnt_range jnt_stiffness jnt_solref jnt_solimp jnt_margin jnt_actfrclimited jnt_actfrcrange qpos0 qpos_spring "
+    "dof_damping dof_armature dof_frictionloss geom_type geom_bodyid geom_size geom_pos geom_quat geom_contype geom_conaffinity "
+    "geom_condim geom_friction geom_solref geom_solimp site_bodyid site_pos site_quat tendon_num tendon_range tendon_stiffness "
+    "tendon_damping tendon_lengthspring wrap_objid wrap_prm eq_type eq_obj1id eq_obj2id eq_data exclude_signature "
+    "actuator_trntype actuator_trnid actuator_dyntype actuator_gaintype actuator_biastype actuator_dynprm actuator_gainprm "
+    "actuator_biasprm actuator_gear actuator_ctrlrange actuator_forcerange actuator_delay"
 )
 """Arrays of ``mujoco.MjModel`` that say what a robot is."""
 _IMPORTED = (
-    *("body_mass", "body_com", "body_inertia", "joint_type", "joint_parent", "joint_child", "joint_X_p", "joint_X_c"),
-    *("joint_axis", "joint_limit_lower", "joint_limit_upper", "joint_armature", "joint_friction", "joint_damping"),
-    *("shape_type", "shape_body", "shape_scale", "shape_transform"),
+    "body_mass body_com body_inertia joint_type joint_parent joint_child joint_X_p joint_X_c joint_axis joint_limit_lower "
+    "joint_limit_upper joint_armature joint_friction joint_damping shape_type shape_body shape_scale shape_transform"
 )
-"""The same of Newton's builder, for a file that MuJoCo doesn't compile."""
+"""The same of Newton's builder, where it holds another robot than the file, or MuJoCo doesn't compile the file."""
 DIGITS = 5
 """Significant digits of a number that count."""
+RESIDUE = 1e-9
+"""Share of an array's greatest number up to which a number is what rounding left of 0, which differs between processors."""
 
 
 def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
@@ -58,11 +40,11 @@ def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
         reference: The file's compiled model, ``mujoco.MjModel``; None for a USD file.
     """
     if reference is None:
-        arrays = {field: getattr(builder, field) for field in _IMPORTED}
+        arrays = {field: getattr(builder, field) for field in _IMPORTED.split()}
         joints, actuators, mass = builder.joint_count, 0, float(sum(builder.body_mass))
     else:
         moments = [inertia(reference, body) for body in range(reference.nbody)]
-        arrays = {field: getattr(reference, field) for field in _COMPILED}
+        arrays = {field: getattr(reference, field) for field in _COMPILED.split()}
         arrays |= {"inertia": moments, "gravity": gravity(reference)}
         joints, actuators, mass = reference.njnt, reference.nu, float(reference.body_mass.sum())
     return RobotModel("", _digest(arrays), float(f"{mass:.6g}"), int(joints), int(actuators))
@@ -71,8 +53,8 @@ def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
 def _digest(arrays: dict[str, Any]) -> str:
     hashed = hashlib.sha256()
     for field, values in sorted(arrays.items()):
-        numbers = (
-            np.array([list(each) if hasattr(each, "__len__") else each for each in values], np.float64).ravel() + 0.0
-        )
+        rows = [list(each) if hasattr(each, "__len__") else each for each in values]
+        numbers = np.array(rows, np.float64).ravel()
+        numbers = np.where(np.abs(numbers) <= RESIDUE * np.abs(numbers).max(initial=0.0), 0.0, numbers)
         hashed.update(f"{field} {' '.join(f'{number:.{DIGITS}g}' for number in numbers)}\n".encode())
     return hashed.hexdigest()

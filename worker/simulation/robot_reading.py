@@ -133,14 +133,14 @@ def read(source: Source) -> Reading:
         robot_usd.check(file.source, imported, name)
         return Reading(imported, None, (), (), identity(imported, None))
     reference = robot_reference.compile_file(file, fixed=source.fixed, ignored=_ignored(source), shown=name)
-    model = reference.model
+    model, is_readable = reference.model, True
     try:
         builder = _imported(source, file, floating)
         found = _compared(source, builder, model)
         corrected = found.differences
     except (ValueError, KeyError, RuntimeError, IndexError) as error:
         corrected = (Difference("file", "reading by Newton's importer", f"refused ({_line(error)})", "possible"),)
-        found = Comparison(corrected, (), {})
+        found, is_readable = Comparison(corrected, (), {}), False
     else:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
@@ -151,13 +151,11 @@ def read(source: Source) -> Reading:
     notes = (*reference.notes, *found.notes)
     if found.differences:
         refusal = AnotherRobot(name, found.differences)
-        if not CHANGED_ROBOTS.get():
+        if not CHANGED_ROBOTS.get() or not is_readable:
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
-        notes = (
-            *reference.notes,
-            f"loaded as Newton's importer reads it, since changed robots are accepted: {refusal}",
-        )
+        note = f"loaded as Newton's importer reads it, since changed robots are accepted: {refusal}"
+        return Reading(builder, reference, corrected, (*reference.notes, note), identity(builder, None))
     return Reading(builder, reference, corrected, notes, identity(builder, model))
 
 

@@ -47,8 +47,8 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     notes: list[str] = []
     spec = _urdf_spec(file, shown, notes) if file.format == "urdf" else robot_files.parse_mjcf(file.source, shown)
     sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
-    for sensor in spec.sensors:
-        spec.delete(sensor)  # some name places that do not exist
+    for element in (*spec.sensors, *spec.keys):
+        spec.delete(element)  # sensors may name places that do not exist, and poses do not fit another root
     for element in (*spec.geoms, *spec.sites):
         if any(re.match(pattern, element.name) for pattern in ignored):
             spec.delete(element)
@@ -82,9 +82,9 @@ def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
         moments = _moments(body)
         if body.explicitinertial and 2.0 * max(moments) > sum(moments) * (1.0 + 1e-9):
             given = " ".join(f"{moment:.4g}" for moment in moments)
-            corrected = " ".join(f"{moment:.4g}" for moment in model.body_inertia[model.body(body.name).id])
+            corrected = " ".join(f"{moment:.4g}" for moment in model.body_inertia[body.id])
             notes.append(
-                f"body {body.name}: no body has the principal moments of inertia {given}, since one is greater than the sum of the "
+                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {given}, since one is greater than the sum of the "
                 f"others; they are {corrected} here (MuJoCo's balanceinertia)"
             )
     return model

@@ -23,7 +23,7 @@ def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_it_describes_a_robot_and_draws_it(tmp_path: Path) -> None:
-    found = command(tmp_path, "cheetah.xml", "--json")
+    found = command(tmp_path, "cheetah.xml", "-o", "cheetah.png", "--json")
     assert found.returncode == 0, found.stderr
     told = json.loads(found.stdout)
     assert told["mass"] == 14.0 and [body["name"] for body in told["bodies"]] == ["torso"]
@@ -34,18 +34,18 @@ def test_it_describes_a_robot_and_draws_it(tmp_path: Path) -> None:
     assert told["sensors"] == [{"name": "spin", "kind": "gyro"}]
     assert {each["field"] for each in told["corrected"]} >= {"mass", "pos"}
     assert (tmp_path / "cheetah.png").read_bytes().startswith(b"\x89PNG") and told["picture"] == "cheetah.png"
-    again = command(tmp_path, "cheetah.xml")
-    assert again.returncode == 2 and "cheetah.png exists; name another with -o, or add --overwrite" in again.stderr
+    again = command(tmp_path, "cheetah.xml", "-o", "cheetah.png")
+    assert again.returncode == 2 and "cheetah.png" in again.stderr and "--overwrite" in again.stderr
 
 
 def test_it_lists_what_newton_reads_otherwise(tmp_path: Path) -> None:
-    found = command(tmp_path, "cheetah.xml", "--compare", "--no-picture")
+    found = command(tmp_path, "cheetah.xml", "--compare")
     assert found.returncode == 0 and "JOINTS" in found.stdout and "MASS [kg]" in found.stdout
     assert "body torso  mass" in found.stdout and "14" in found.stdout and not (tmp_path / "cheetah.png").exists()
 
 
 def test_it_lists_what_can_t_be_held(tmp_path: Path) -> None:
-    found = command(tmp_path, "late.xml", "--compare", "--no-picture")
+    found = command(tmp_path, "late.xml", "--compare")
     assert found.returncode == 2 and "actuator motor  delay" in found.stdout
     assert found.stderr.startswith(
         "muster: late.xml would be another robot here: actuator motor: delay is 0, in the file 0.01"
