@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import DamagedCheckpoint
+from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.epoch import StaleEpoch
 from shared_store.faults import fault_in
 from shared_store.layout import Run, Store, StoreError
@@ -121,9 +121,12 @@ class Job:
                 f"MUSTER_SPEC, MUSTER_EPOCH or MUSTER_JOB_EPOCH is malformed for `{kind}`: {error!r}"
             ) from error
         _check_kinds(spec, kind)
-        CHANGED_ROBOTS.set(bool(section.get("accept_changed_robot")))
         store = Store(env["MUSTER_STORE"])
         run = store.run(env["MUSTER_RUN"])
+        goes_on = kind != "train" or bool(
+            list_checkpoints(run)
+        )  # a new training has nothing that it could have been trained on
+        CHANGED_ROBOTS.set(goes_on and bool(section.get("accept_changed_robot")))
         chosen = env.get("MUSTER_CHECKPOINT") or None
         parent = env.get("MUSTER_PARENT") or None
         return cls(spec, store, run, epoch, job_epoch, env.get("MUSTER_JOB_ID", ""), chosen, parent, section)

@@ -44,9 +44,27 @@ def word_of(kind: Any, value: int) -> str:
     return str(kind(int(value)).name.rpartition("_")[2].lower())
 
 
+COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "equality": "neq"}
+"""Fields of ``mujoco.MjModel`` that count elements, where they are not an n and the kind's word."""
+
+
+def unique_names(model: Any, kind: str) -> list[str]:
+    """Names of all elements of a kind, as Newton's importer keeps them and each once; made ones where the file gives none."""
+    count = range(getattr(model, COUNTS.get(kind, f"n{kind}")))
+    named = {index: bool(mujoco.mj_id2name(model, kind_of(kind), index)) for index in count}
+    names: dict[int, str] = {}
+    for index in sorted(count, key=lambda each: not named[each]):  # the file's own names first
+        name = plain(name_of(model, kind_of(kind), index))
+        while name in names.values():
+            name += "_"
+        names[index] = name
+    return [names[index] for index in count]
+
+
 def names_of(model: Any, kind: str, indices: Iterable[int]) -> dict[int, str]:
-    """Names of elements as Newton's importer keeps them; empty where the file gives none."""
-    return {index: plain(mujoco.mj_id2name(model, kind_of(kind), index) or "") for index in indices}
+    """Names of elements as Newton's importer keeps them, each once; empty where the file gives none."""
+    names = unique_names(model, kind)
+    return {index: names[index] if mujoco.mj_id2name(model, kind_of(kind), index) else "" for index in indices}
 
 
 def paired(there: dict[int, str], here: dict[int, str]) -> Pairs:

@@ -158,6 +158,12 @@ def parse_mjcf(source: str, shown: str) -> Any:
     return spec
 
 
+def names_integrator(source: str) -> bool:
+    """Whether an MJCF file, or the text of one, names its integrator; files that it includes are not looked at."""
+    text = source if source.lstrip().startswith("<") else Path(source).read_text(encoding="utf-8")
+    return any(option.get("integrator") for option in ElementTree.fromstring(text).iter("option"))
+
+
 def _not_a_number(text: str) -> str:
     for element in ElementTree.fromstring(text).iter():
         for name, value in element.attrib.items():

@@ -201,6 +201,34 @@ def _geoms(twins: Twins) -> Iterator[Difference]:
         yield from _unequal(element, "shape and place", extent(built, twin), extent(file, geom), length(file))
 
 
+def _sites(twins: Twins) -> Iterator[Difference]:
+    file = twins.file
+    for site, shape in twins.sites.items():
+        element = twins.name("site", site)
+        if shape is None:
+            yield Difference(element, "existence", "missing", "there")
+            continue
+        position, turn = twins.built_site(shape)
+        yield from _unequal(element, "pos", position, file.site_pos[site], length(file))
+        yield from _unequal(element, "orientation", matrix(turn), matrix(file.site_quat[site]), 1.0)
+
+
+def _pairs(twins: Twins) -> Iterator[Difference]:
+    for pair in range(min(twins.file.npair, twins.built.npair)):
+        element = f"contact pair {pair}"
+        for name in ("dim", "friction", "solref", "solimp", "margin", "gap"):
+            mine, theirs = (getattr(model, f"pair_{name}")[pair] for model in (twins.built, twins.file))
+            yield from _unequal(element, name, mine, theirs)
+        mine, theirs = (_of_friction(model, pair) for model in (twins.built, twins.file))
+        yield from _unequal(element, "solreffriction", mine, theirs)
+
+
+def _of_friction(model: Any, pair: int) -> Any:
+    """A pair's ``solreffriction``, which is its ``solref`` where it is two zeros."""
+    found = model.pair_solreffriction[pair]
+    return found if found.any() else model.pair_solref[pair]
+
+
 def _contacts(twins: Twins) -> Iterator[Difference]:
     words = {True: "can touch", False: "can't touch"}
     for pair, mine in _pairs_of_geoms(twins):
@@ -285,8 +313,10 @@ def _accelerations(twins: Twins) -> Iterator[Difference]:
         mujoco.mj_forward(built, second)
         scale = max(1.0, float(np.abs(first.qacc).max(initial=0.0)))
         for joint, twin in twins.joints.items():
-            theirs, mine = first.qacc[file.jnt_dofadr[joint]], second.qacc[built.jnt_dofadr[twin]]
-            if not abs(theirs - mine) <= ACCELERATION * scale:
+            width = {0: 6, 1: 3}.get(int(file.jnt_type[joint]), 1)
+            theirs = first.qacc[file.jnt_dofadr[joint] :][:width]
+            mine = second.qacc[built.jnt_dofadr[twin] :][:width]
+            if not (np.abs(theirs - mine) <= ACCELERATION * scale).all():
                 yield Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
                 return
 
@@ -320,4 +350,4 @@ def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0
         yield Difference(element, field, built, file)
 
 
-CHECKS = (_counts, _bodies, _joints, _geoms, _contacts, _tendons, _actuators, _equalities)
+CHECKS = (_counts, _bodies, _joints, _geoms, _sites, _contacts, _pairs, _tendons, _actuators, _equalities)

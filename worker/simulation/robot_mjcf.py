@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from worker.simulation import carriers
-from worker.simulation.robot_elements import kind_of, name_of, word_of
+from worker.simulation.robot_elements import unique_names, word_of
 
 Element = ElementTree.Element
 
@@ -47,7 +47,7 @@ _GAINS = _Words(mujoco.mjtGain, "fixed affine muscle user")
 _BIASES = _Words(mujoco.mjtBias, "none affine muscle user")
 
 
-def write(model: Any) -> str:
+def write(model: Any, *, integrator: bool = False) -> str:
     """Write a compiled model as MJCF.
 
     Of several joints of a body all but the last move carriers (:mod:`worker.simulation.carriers`), so that each keeps its own place,
@@ -55,6 +55,8 @@ def write(model: Any) -> str:
 
     Args:
         model: The compiled model, ``mujoco.MjModel``.
+        integrator: Whether the file names its integrator. Where it does not, the compiled model has MuJoCo's default, Euler, and the
+            worlds' default holds.
 
     Returns:
         The XML. Angles are in radians, and each number is written with all its digits.
@@ -62,16 +64,20 @@ def write(model: Any) -> str:
     Raises:
         ValueError: An element is of a kind that Newton's models don't have.
     """
-    return _Writer(model).write()
+    return _Writer(model, integrator).write()
 
 
 class _Writer:
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, integrator: bool) -> None:
         self.model = model
+        self.integrator = integrator
         self.bodies: dict[int, Element] = {}
+        self.names: dict[str, list[str]] = {}
 
     def name(self, kind: str, index: int) -> str:
-        return name_of(self.model, kind_of(kind), int(index))
+        if kind not in self.names:
+            self.names[kind] = unique_names(self.model, kind)
+        return self.names[kind][int(index)]
 
     def word(self, words: _Words, values: Any, kind: str, index: int) -> str:
         """The word for the value of an element of some kind."""
@@ -105,7 +111,7 @@ class _Writer:
 
     def _write_options(self, root: Element) -> None:
         options = self.model.opt
-        chosen = {"integrator": _INTEGRATORS.of(options.integrator, "option")} if options.integrator else {}
+        chosen = {"integrator": _INTEGRATORS.of(options.integrator, "option")} if self.integrator else {}
         if options.solver == int(mujoco.mjtSolver.mjSOL_CG):
             chosen["solver"] = "CG"
         element = _add(

@@ -18,6 +18,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.policy_contract import RobotModel
+from shared_store.wording import counted
 from worker.accepting import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference, robot_usd, robot_values
@@ -37,8 +38,11 @@ REMEDIES = {
     "dampingpoly": "Give damping one number",
     "stiffnesspoly": "Give stiffness one number",
     "fluid": "Leave out fluidshape",
+    "acceleration in the same state": "No single value shows why: leave out parts of the file until it is read",
 }
 """What to do about a value that Newton can't hold, by its field."""
+FILE = "file"
+"""Stands for an element where Newton's importer can't read the file at all."""
 SOLREF_DEFAULT = (0.02, 1.0)
 """MuJoCo's default ``solref``: time constant [s] and damping ratio."""
 
@@ -86,11 +90,10 @@ class Reading:
         """What a user should know of the robot, one sentence each."""
         if not self.corrected:
             return list(self.notes)
-        count, first = len(self.corrected), self.corrected[0]
-        return [
-            f"built as MuJoCo reads its file; Newton's importer differs in {count} values, first in {first.field} of {first.element}",
-            *self.notes,
-        ]
+        first = self.corrected[0]
+        otherwise = f"differs in {counted(len(self.corrected), 'value')}, first in {first.field} of {first.element}"
+        why = "can't read it" if first.element == FILE else otherwise
+        return [f"built as MuJoCo reads its file; Newton's importer {why}", *self.notes]
 
 
 def shown(file: str | Path) -> str:
@@ -114,8 +117,8 @@ class AnotherRobot(ValueError):
         pattern = f"{first.element}: {first.field}"
         super().__init__(
             f"{file} would be another robot here: {first}{more}. {REMEDIES.get(first.field, 'Change the file')}, or accept the "
-            f"difference: Robot(..., accept=({pattern!r},)). All of them: muster robot {file} --compare. For a run that was "
-            "trained on it: --accept-changed-robot"
+            f"difference: Robot(..., accept=({pattern!r},)). For a run that was trained on it: --accept-changed-robot"
+            + (f". All of them: muster robot {file} --compare" if more else "")
         )
 
 
@@ -130,7 +133,7 @@ def read(source: Source) -> Reading:
     floating = None if source.fixed is None else not source.fixed
     if file.format == "usd":
         imported = _imported(source, file, floating)
-        robot_usd.check(file.source, imported, name)
+        robot_usd.check(file.source, imported, _ignored(source), name)
         return Reading(imported, None, (), (), identity(imported, None))
     reference = robot_reference.compile_file(file, fixed=source.fixed, ignored=_ignored(source), shown=name)
     model, is_readable = reference.model, True
@@ -139,14 +142,14 @@ def read(source: Source) -> Reading:
         found = _compared(source, builder, model)
         corrected = found.differences
     except (ValueError, KeyError, RuntimeError, IndexError) as error:
-        corrected = (Difference("file", "reading by Newton's importer", f"refused ({_line(error)})", "possible"),)
+        corrected = (Difference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
         found, is_readable = Comparison(corrected, (), {}), False
     else:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
         found = _amended(source, builder, model, found)
     if found.differences:
-        builder = _imported(source, RobotFile(_rewritten(model, name), "mjcf", {}), None)
+        builder = _imported(source, RobotFile(_rewritten(file, model, name), "mjcf", {}), None)
         found = _amended(source, builder, model, _compared(source, builder, model))
     notes = (*reference.notes, *found.notes)
     if found.differences:
@@ -223,9 +226,9 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _rewritten(model: Any, shown: str) -> str:
+def _rewritten(file: RobotFile, model: Any, shown: str) -> str:
     try:
-        return robot_mjcf.write(model)
+        return robot_mjcf.write(model, integrator=robot_files.names_integrator(file.source))
     except ValueError as error:
         raise ValueError(f"{shown}: {error}") from error
 
@@ -258,7 +261,9 @@ def _take_controls(own: newton.ModelBuilder) -> None:
     for actuator, target in enumerate(rows or ()):
         sources[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
         label = actuator_value(own, "actuator_target_label", actuator)
-        if int(target[0]) < 0 and label in dofs:  # a USD file's: the label would not say of which of two equal robots
+        if (
+            target is None or int(target[0]) < 0
+        ) and label in dofs:  # a USD file's: the label would not say of which of two equal robots
             rows[actuator] = wp.vec2i(dofs[label], 0)
     actuation.register(own)
     for name, (_, default) in actuation.MOTOR_ATTRIBUTES.items():

@@ -60,6 +60,8 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
                 body.add_freejoint()
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         notes.append("the file asks for the solver PGS, which MuJoCo-Warp lacks: worlds use Newton's method")
+    if spec.option.noslip_iterations:
+        notes.append("noslip_iterations of the file are not used: a task's solver_options have none")
     model = _compiled(spec, shown, notes)
     _check_numbers(model, shown)
     return Reference(model, tuple(notes), sensors)

@@ -93,6 +93,29 @@ class Twins:
         return pairs
 
     @cached_property
+    def sites(self) -> dict[int, int | None]:
+        """Index among the builder's shapes of each site of :attr:`file`; None: it is missing."""
+        model, builder = self.file, self._builder
+        found: dict[int, int | None] = {}
+        for body, twin in self.bodies.items():
+            names = {
+                shape: plain(short(builder.shape_label[shape]))
+                for shape in range(builder.shape_count)
+                if builder.shape_flags[shape] & newton.ShapeFlags.SITE
+                and builder.shape_body[shape] == self.body_indices[twin]
+            }
+            mine = names_of(model, "site", [site for site in range(model.nsite) if model.site_bodyid[site] == body])
+            pairs = paired(mine, names)
+            found |= {site: pairs.get(site) for site in mine}
+        return found
+
+    def built_site(self, shape: int) -> tuple[Any, Any]:
+        """Position [m] and quaternion wxyz of a site in its body's frame."""
+        pose: Any = self._builder.shape_transform[shape]
+        numbers = [float(number) for number in pose]
+        return numbers[:3], [numbers[6], *numbers[3:6]]
+
+    @cached_property
     def tendons(self) -> Pairs:
         """The tendons."""
         return self._by_name("tendon", "ntendon")

@@ -14,6 +14,7 @@ from newton.solvers import SolverMuJoCo
 
 from worker.accepting import CHANGED_ROBOTS
 from worker.simulation.robot import Robot
+from worker.simulation.robot_identity import identity
 from worker.simulation.robot_reading import Reading
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_view import RobotView
@@ -71,6 +72,16 @@ OTHERWISE = {
     "another gravity": mjcf(HINGE + BOX, before='<option gravity="0 1 -3"/>'),
     "the solver PGS": mjcf(HINGE + BOX, before='<option solver="PGS"/>'),
     "a very light body": mjcf(f'{HINGE}<geom size=".001" mass="1e-5"/>'),
+    "names that differ in their dashes alone": mjcf(
+        f'{HINGE}{BOX}<body name="a-b" pos="0 0 -.2"><joint name="k-l" pos="0 0 .1"/><joint name="k_l" axis="1 0 0"/>{BOX}</body>'
+        f'<body name="a_b" pos="0 .5 0"><joint axis="0 1 0"/>{BOX}</body>'
+    ),
+    "names with slashes": mjcf(
+        f'<joint name="r/j" axis="0 1 0" springdamper=".1 1"/>{BOX}', '<actuator><motor joint="r/j"/></actuator>'
+    ),
+    "sites by the topmost defaults": mjcf(
+        f'{HINGE}{BOX}<site name="s"/>', before='<default class="main"><site pos=".1 .2 .3"/></default>'
+    ),
 }
 """Files that Newton's importer builds as another robot, or can't read."""
 SAME = {
@@ -226,6 +237,19 @@ def test_what_can_t_be_held_is_refused_by_the_name_of_its_element(file: str, wor
     assert "\n" not in str(caught.value)
 
 
+def test_a_keyframe_does_not_forbid_another_root() -> None:
+    posed = mjcf(f"<freejoint/>{BOX}{SECOND.replace('k', 'j')}", '<keyframe><key qpos="0 0 1 1 0 0 0 .3"/></keyframe>')
+    assert read(posed, fixed=True).reference is not None
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_the_integrator_is_the_file_s_where_it_names_one(named: bool) -> None:
+    option = '<option integrator="Euler"/>' if named else ""
+    for body in (HINGE, '<joint name="j" axis="0 1 0" springdamper=".1 1"/>'):  # read as it is, and rewritten
+        values: Any = read(mjcf(body + BOX, before=option)).builder.custom_attributes["mujoco:integrator"].values
+        assert (values or {}).get(0) == (0 if named else None)
+
+
 def test_a_difference_may_be_accepted() -> None:
     delayed = mjcf(HINGE + BOX, '<actuator><position joint="j" kp="20" nsample="8" delay=".01"/></actuator>')
     assert read(delayed, accept=("actuator *: delay", "actuator *: history")).reference is not None
@@ -256,6 +280,16 @@ def test_a_default_pose_beyond_the_limits_is_noted() -> None:
     assert RobotView(builder).beyond_limits() == [
         "joint j: its default position 3 lies outside its limits, -1.0472 to 1.0472"
     ]
+
+
+def test_the_identity_of_a_robot_is_the_same_where_a_processor_rounds_otherwise() -> None:
+    reading = read(SAME["a plain hinge"])
+    assert reading.reference is not None
+    model, random = reading.reference.model, np.random.default_rng(0)
+    for field in ("body_pos", "body_quat", "body_inertia", "geom_pos", "geom_quat", "jnt_axis"):
+        array = getattr(model, field)
+        array += 1e-16 * random.standard_normal(array.shape)
+    assert identity(reading.builder, model) == reading.identity
 
 
 def test_the_identity_of_a_robot_follows_its_model_and_not_its_notation() -> None:
@@ -312,3 +346,20 @@ def test_a_loop_of_a_usd_file_is_refused_by_its_joint(tmp_path: Path) -> None:
     second = 'def PhysicsRevoluteJoint "k" {\nrel physics:body0 = </robot/base>\nrel physics:body1 = </robot/arm>\n}'
     with pytest.raises(ValueError, match=r"joint k closes a loop"):
         read(str(usd(tmp_path, second)))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("metersPerUnit = 1", "metersPerUnit = 0.01", r"metersPerUnit is 0.01; export the file in metres"),
+        ("float physics:mass = 3", "", r"body arm moves and has no mass"),
+        ("physics:upperLimit = 60", "physics:upperLimit = nan", r"joint j: its limits -30 and nan are no range"),
+        ("physics:upperLimit = 60", "physics:upperLimit = -40", r"joint j: its limits -30 and -40 are no range"),
+        ("def PhysicsRevoluteJoint", "def PhysicsJoint", r"joint j has 0 degrees of freedom, in the file 6"),
+    ],
+)
+def test_what_a_usd_file_says_otherwise_is_refused(tmp_path: Path, before: str, after: str, words: str) -> None:
+    path = usd(tmp_path)
+    path.write_text(path.read_text().replace(before, after))
+    with pytest.raises(ValueError, match=words):
+        read(str(path))
