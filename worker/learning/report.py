@@ -96,7 +96,9 @@ class Report:
             directory.stat()  # it would be made where another volume is
             return SummaryWriter(str(directory), purge_step=first, filename_suffix=f".e{job.epoch}", flush_secs=10)
 
-        self._watch = Watch(job.run.name, self._iterations, getattr(training, "settings", None))
+        self._run = job.run.name
+        # records are the same whatever the run is called
+        self._watch = Watch("RUN", self._iterations, getattr(training, "settings", None))
         with suppress(OSError):  # without them it begins anew
             earlier = sampled(job.run, HISTORY) if resumed_from else []
             self._watch.follow(record for record in earlier if record["iteration"] <= resumed_from)
@@ -144,7 +146,7 @@ class Report:
             kind = text.partition(":")[0]
             if kind not in self._warned_of:
                 self._warned_of.add(kind)
-                print(f"warning: {text}", flush=True)
+                print(f"warning: {text.replace('RUN@', f'{self._run}@')}", flush=True)
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         self._metrics.write({**record, "time": time.time()})

@@ -246,14 +246,14 @@ URDF = """<robot name="arm"><link name="base"><inertial><mass value="1"/><inerti
 </robot>"""
 
 
-def test_limits_given_as_a_stiffness_keep_it_when_masses_change() -> None:
+def test_limits_of_a_urdf_joint_stay_as_stiff_when_masses_change() -> None:
     robot = Robot(URDF, fixed=True, actuators=[EffortActuator("*")])
     worlds, view = build_worlds(robot, njmax=10, nconmax=0, disable_contacts=True)
     own = worlds.solver.mjw_model.jnt_solref.numpy().copy()
     randomize({"mass": Randomize("mass", bodies="tip", range=(3.0, 5.0))}, worlds, view)
     got = worlds.solver.mjw_model.jnt_solref.numpy()
     worlds.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
-    assert not np.allclose(got, own, rtol=0.1)
+    np.testing.assert_allclose(got, own, rtol=1e-6)
     np.testing.assert_allclose(got, worlds.solver.mjw_model.jnt_solref.numpy(), rtol=1e-4)
 
 

@@ -60,6 +60,10 @@ APPLIED: dict[str, tuple[Any, Callable[[PPO], Any]]] = {
     "entropy_coef": (0.01, objective(3)),
     "learning_rate_limits": ((1e-4, 1e-3), lambda ppo: ppo.config.learning_rate_limits),
     "max_grad_norm": (0.5, lambda ppo: ppo.config.max_grad_norm),
+    "learning_rate_horizon": (30, lambda ppo: ppo.config.learning_rate_horizon),
+    "min_std": (0.2, lambda ppo: ppo._head._limits[0]),
+    "max_std": (2.0, lambda ppo: ppo._head._limits[1]),
+    "normalizer_horizon": (5, lambda ppo: ppo.config.normalizer_horizon or 0),
 }
 """Of each setting that a resumed run may change: another value, and where the learner has it."""
 REFUSED: dict[str, Any] = {
@@ -80,7 +84,8 @@ REFUSED: dict[str, Any] = {
 def test_every_setting_is_in_one_of_the_two_tables(unchanged: Loop) -> None:
     refused = {"task", "algorithm", "seed", "config", "worlds"}  # test_refusals.py
     become_settings = {"hyperparameters"}  # of an algorithm, when the job is submitted
-    assert Train.model_fields.keys() == {*refused, *become_settings, "iterations", "settings", *ALGORITHMS}
+    others = {"iterations", "settings", "accept_changed_robot"}
+    assert Train.model_fields.keys() == {*refused, *become_settings, *others, *ALGORITHMS}
     assert unchanged.training.iterations == 4, "the run was started with 2"
     names = {item.name for item in dataclasses.fields(PPOConfig)}
     assert names == {*APPLIED, *REFUSED, "weight_decay"}, "which is AdamW's; a run of Adam can't become one of it"
