@@ -20,7 +20,7 @@ from worker.simulation.robot_elements import kind_of, name_of, word_of
 from worker.simulation.robot_judge import Difference
 from worker.simulation.robot_reading import AnotherRobot, Reading
 from worker.simulation.robot_values import shown_value
-from worker.simulation.robot_view import RobotView
+from worker.simulation.robot_view import RobotView, joint_of
 from worker.tasks.config import TaskConfig
 from worker.tasks.task import Task
 from worker.telemetry import picture
@@ -30,12 +30,11 @@ PICTURE = (960, 720)
 """Width and height [px]."""
 
 
-def describe(file: str, robot: Robot, reading: Reading) -> dict[str, Any]:
+def describe(file: str, reading: Reading) -> dict[str, Any]:
     """A robot in plain values: angles in radians, lengths in metres, masses in kilograms.
 
     Args:
         file: The file's name.
-        robot: The robot.
         reading: How its file was read.
     """
     builder, view = reading.builder, RobotView(reading.builder, "")
@@ -76,7 +75,7 @@ def _joint(builder: newton.ModelBuilder, view: RobotView, joint: int) -> dict[st
 
 
 def _is_linear(builder: newton.ModelBuilder, dof: int) -> bool:
-    joint = max(index for index, start in enumerate(builder.joint_qd_start[: builder.joint_count]) if start <= dof)
+    joint = joint_of(builder, dof)
     return dof - builder.joint_qd_start[joint] < builder.joint_dof_dim[joint][0]
 
 
@@ -122,7 +121,7 @@ def draw(robot: Robot, path: Path) -> None:
 
 
 def main() -> int:
-    """Returns the exit code: 2 for a file that is refused."""
+    """Print the description, or why the file is refused; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m worker.robot", description=__doc__)
     parser.add_argument("file", help="as Robot's: a path, package:NAME/path, newton:NAME")
     parser.add_argument("--picture", type=Path, help="draw the robot in its default pose into this PNG file")
@@ -136,8 +135,8 @@ def main() -> int:
         another = error.__cause__ if isinstance(error.__cause__, AnotherRobot) else None
         refused = [_difference(each) for each in another.differences] if another else []
         print(json.dumps({"file": options.file, "error": str(error).removeprefix("robot: "), "differences": refused}))
-        return 2
-    described = describe(options.file, robot, reading)
+        return 0
+    described = describe(options.file, reading)
     if options.picture:
         draw(robot, options.picture)
         described["picture"] = str(options.picture)

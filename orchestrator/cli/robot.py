@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +13,9 @@ from rich.text import Text
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.recordings import check_output
+from orchestrator.cli.tasks import ask_worker
 from orchestrator.cli.terminal import Console, echo, echo_json
-from orchestrator.domain.errors import ServerError, SpecError
+from orchestrator.domain.errors import SpecError
 
 _EXAMPLES = """Examples:  muster robot arm.urdf
 muster robot package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml -o go1.png
@@ -49,7 +47,8 @@ def robot(
         check_output(output, overwrite, ".png")
     if sys.stderr.isatty():
         echo("importing the simulation, which takes some seconds …", err=True)
-    found = _ask_worker(file, output)
+    drawing = ["--picture", str(output)] if output else []
+    found: dict[str, Any] = ask_worker("worker.robot", [file, *drawing], f"{file} can't be shown")
     if as_json:
         echo_json(found, indent=1)
         raise typer.Exit(2 if "error" in found else 0)
@@ -58,20 +57,6 @@ def robot(
             _print_differences("WOULD DIFFER", found["differences"])
         raise SpecError(found["error"])
     _print(found, compare)
-
-
-def _ask_worker(file: str, picture: Path | None) -> dict[str, Any]:
-    """Ask a subprocess, since this package never imports the simulation. Raises ServerError if it can't answer."""
-    if find_spec("newton") is None:
-        raise ServerError("robots can't be read where no simulation is installed: pip install 'muster[worker]'")
-    command = [sys.executable, "-P", "-m", "worker.robot", file]
-    command += ["--picture", str(picture)] if picture else []
-    asked = subprocess.run(command, capture_output=True, text=True, check=False)
-    if asked.returncode not in (0, 2) or not asked.stdout.strip():
-        reason = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
-        raise ServerError(f"{file} can't be shown: {reason[-1]}")
-    found: dict[str, Any] = json.loads(asked.stdout.splitlines()[-1])
-    return found
 
 
 def _print(found: dict[str, Any], compare: bool) -> None:
@@ -138,11 +123,9 @@ def _print_differences(title: str, differences: list[dict[str, str]]) -> None:
 
 
 def _range(lower: float | None, upper: float | None) -> str:
-    return (
-        ""
-        if lower is None and upper is None
-        else " to ".join("-" if each is None else f"{each:.4g}" for each in (lower, upper))
-    )
+    if lower is None and upper is None:
+        return ""
+    return " to ".join("-" if each is None else f"{each:.4g}" for each in (lower, upper))
 
 
 def _table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

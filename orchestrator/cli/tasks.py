@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Annotated, Any
 
@@ -32,7 +33,7 @@ def tasks(
     """
     if sys.stderr.isatty():
         echo("importing the simulation, which takes some seconds …", err=True)
-    found = _ask_worker([name] if name else [])
+    found = ask_worker("worker.tasks", [name] if name else [], "tasks can't be listed")
     if as_json:
         echo_json(found, indent=1)
         return
@@ -64,26 +65,30 @@ def _print(table: Table) -> None:
     Console(width=max(terminal.width, least)).print(table, soft_wrap=True)
 
 
-def _ask_worker(names: list[str]) -> list[dict[str, Any]]:
-    """Ask a subprocess, since tasks import the simulation and this package never does.
+def ask_worker(module: str, arguments: Sequence[str], failure: str) -> Any:
+    """Ask a subprocess, since modules of the worker import the simulation and this package never does.
+
+    Args:
+        module: Run with ``python -m``; it prints JSON in its last line.
+        arguments: Of the module.
+        failure: What can't be done if it does not answer, for the error.
 
     Raises:
-        SpecError: The task does not exist.
-        ServerError: Tasks can't be listed here.
+        SpecError: The module refuses the arguments.
+        ServerError: It can't answer here.
     """
     if find_spec("newton") is None:
-        raise ServerError("tasks can't be listed where no simulation is installed: pip install 'muster[worker]'")
+        raise ServerError(f"{failure} where no simulation is installed: pip install 'muster[worker]'")
     asked = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.tasks", *names], capture_output=True, text=True, check=False
+        [sys.executable, "-P", "-m", module, *arguments], capture_output=True, text=True, check=False
     )
-    said = asked.stderr.strip().splitlines() or [f"the listing ended with exit code {asked.returncode}"]
+    lines = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
     if asked.returncode == 2:
-        raise SpecError(said[-1])
+        raise SpecError(lines[-1])
     if asked.returncode:
-        raise ServerError(f"tasks can't be listed: {said[-1]}")
+        raise ServerError(f"{failure}: {lines[-1]}")
     # a user's module may print before it while it is imported
-    found: list[dict[str, Any]] = json.loads(asked.stdout.splitlines()[-1])
-    return found
+    return json.loads(asked.stdout.splitlines()[-1])
 
 
 def _terms(section: str, rows: list[dict[str, str]]) -> Table:

@@ -61,7 +61,7 @@ def _algorithm_name(value: str) -> str:
 ACCEPT = Field(
     default=False,
     exclude_if=operator.not_,
-    description="whether to go on where the robot's file loads otherwise than in the training of the checkpoint",
+    description="whether to continue although the robot's file loads differently from the checkpoint's training",
 )
 
 

@@ -123,10 +123,9 @@ class Job:
         _check_kinds(spec, kind)
         store = Store(env["MUSTER_STORE"])
         run = store.run(env["MUSTER_RUN"])
-        goes_on = kind != "train" or bool(
-            list_checkpoints(run)
-        )  # a new training has nothing that it could have been trained on
-        CHANGED_ROBOTS.set(goes_on and bool(section.get("accept_changed_robot")))
+        # a new training has no policy that another robot could have trained
+        continues = kind != "train" or bool(list_checkpoints(run))
+        CHANGED_ROBOTS.set(continues and bool(section.get("accept_changed_robot")))
         chosen = env.get("MUSTER_CHECKPOINT") or None
         parent = env.get("MUSTER_PARENT") or None
         return cls(spec, store, run, epoch, job_epoch, env.get("MUSTER_JOB_ID", ""), chosen, parent, section)

@@ -11,6 +11,8 @@ from typing import Any
 import newton
 from newton.solvers import SolverMuJoCo
 
+from worker.simulation.robot_elements import short
+
 MARK = "__carries_joint_"
 """What stands in the name of such a body."""
 MASS = 1e-9
@@ -21,7 +23,7 @@ INERTIA = 4e-15
 
 def is_carrier(label: str) -> bool:
     """Whether the body with this label only carries a joint."""
-    return MARK in label.rpartition("/")[2]
+    return MARK in short(label)
 
 
 def keep_inertias(builder: newton.ModelBuilder) -> None:

@@ -53,10 +53,12 @@ def unique_names(model: Any, kind: str) -> list[str]:
     count = range(getattr(model, COUNTS.get(kind, f"n{kind}")))
     named = {index: bool(mujoco.mj_id2name(model, kind_of(kind), index)) for index in count}
     names: dict[int, str] = {}
+    taken: set[str] = set()
     for index in sorted(count, key=lambda each: not named[each]):  # the file's own names first
         name = plain(name_of(model, kind_of(kind), index))
-        while name in names.values():
+        while name in taken:
             name += "_"
+        taken.add(name)
         names[index] = name
     return [names[index] for index in count]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import mujoco
 import newton.examples
 
 from shared_store.wording import nearest
+from worker.simulation.robot_elements import plain
 
 FORMATS = {".xml": "", ".mjcf": "mjcf", ".urdf": "urdf", ".usd": "usd", ".usda": "usd", ".usdc": "usd", ".usdz": "usd"}
 """Format of a file by its ending, or of an ``.xml`` file by its first element."""
@@ -242,8 +242,7 @@ def _hinges(spec: Any) -> dict[str, list[str]]:
     one_dof = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
     for body in spec.bodies:
         names = [
-            (joint.type, re.sub(r"[^\w]", "_", joint.name or f"{body.name}_joint_{index}"))
-            for index, joint in enumerate(body.joints)
+            (joint.type, plain(joint.name or f"{body.name}_joint_{index}")) for index, joint in enumerate(body.joints)
         ]
         if len(names) > 1 and all(kind in one_dof for kind, _ in names):
             slides = [name for kind, name in names if kind == one_dof[0]]

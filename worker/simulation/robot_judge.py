@@ -17,6 +17,7 @@ from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import (
     effort,
     extent,
+    freedoms,
     gravity,
     inertia,
     length,
@@ -175,7 +176,7 @@ def _joints(twins: Twins) -> Iterator[Difference]:
         yield from _unequal(element, "actuatorfrcrange", effort(built, twin), effort(file, joint))
         first, second = file.jnt_dofadr[joint], built.jnt_dofadr[twin]
         for name in ("damping", "dampingpoly", "armature", "frictionloss", "solref", "solimp"):
-            count = {"free": 6, "ball": 3}.get(kind, 1)
+            count = freedoms(file, joint)
             if name not in ("solref", "solimp") or file.dof_frictionloss[first]:
                 mine, theirs = getattr(built, f"dof_{name}"), getattr(file, f"dof_{name}")
                 yield from _unequal(element, name, mine[second : second + count], theirs[first : first + count])
@@ -313,7 +314,7 @@ def _accelerations(twins: Twins) -> Iterator[Difference]:
         mujoco.mj_forward(built, second)
         scale = max(1.0, float(np.abs(first.qacc).max(initial=0.0)))
         for joint, twin in twins.joints.items():
-            width = {0: 6, 1: 3}.get(int(file.jnt_type[joint]), 1)
+            width = freedoms(file, joint)
             theirs = first.qacc[file.jnt_dofadr[joint] :][:width]
             mine = second.qacc[built.jnt_dofadr[twin] :][:width]
             if not (np.abs(theirs - mine) <= ACCELERATION * scale).all():

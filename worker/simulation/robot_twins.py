@@ -11,8 +11,8 @@ from newton.solvers import SolverMuJoCo
 
 from worker.simulation import carriers
 from worker.simulation.robot_elements import Pairs, kind_of, name_of, names_of, paired, plain, short
-from worker.simulation.robot_values import gravity, without_contacts
-from worker.simulation.robot_view import dof_names
+from worker.simulation.robot_values import freedoms, gravity, without_contacts
+from worker.simulation.robot_view import dof_names, joint_of
 
 
 class Twins:
@@ -50,11 +50,11 @@ class Twins:
 
     def built_joint(self, index: int) -> str:
         """Name of a joint of the built model."""
-        dof, starts = self._dofs[index], self._builder.joint_qd_start[: self._builder.joint_count]
-        joint = max(index for index, start in enumerate(starts) if start <= dof)
+        dof = self._dofs[index]
+        joint = joint_of(self._builder, dof)
         if self._builder.joint_type[joint] in (newton.JointType.FREE, newton.JointType.BALL):
             return short(self._builder.joint_label[joint])
-        return dof_names(self._builder, joint)[dof - starts[joint]]
+        return dof_names(self._builder, joint)[dof - self._builder.joint_qd_start[joint]]
 
     @cached_property
     def bodies(self) -> Pairs:
@@ -82,6 +82,7 @@ class Twins:
             for geom in range(model.ngeom)
             if model.geom_contype[geom] or model.geom_conaffinity[geom] or geom in explicit
         ]
+        file_names = names_of(model, "geom", able)
         pairs: Pairs = {}
         for body, twin in self.bodies.items():
             names = {
@@ -89,23 +90,20 @@ class Twins:
                 for geom, shape in enumerate(self._shapes)
                 if built.geom_bodyid[geom] == twin and (built.geom_contype[geom] or built.geom_conaffinity[geom])
             }
-            pairs |= paired(names_of(model, "geom", [geom for geom in able if model.geom_bodyid[geom] == body]), names)
+            pairs |= paired({geom: name for geom, name in file_names.items() if model.geom_bodyid[geom] == body}, names)
         return pairs
 
     @cached_property
     def sites(self) -> dict[int, int | None]:
         """Index among the builder's shapes of each site of :attr:`file`; None: it is missing."""
         model, builder = self.file, self._builder
+        file_names = names_of(model, "site", range(model.nsite))
+        shapes = [shape for shape, flags in enumerate(builder.shape_flags) if flags & newton.ShapeFlags.SITE]
         found: dict[int, int | None] = {}
         for body, twin in self.bodies.items():
-            names = {
-                shape: plain(short(builder.shape_label[shape]))
-                for shape in range(builder.shape_count)
-                if builder.shape_flags[shape] & newton.ShapeFlags.SITE
-                and builder.shape_body[shape] == self.body_indices[twin]
-            }
-            mine = names_of(model, "site", [site for site in range(model.nsite) if model.site_bodyid[site] == body])
-            pairs = paired(mine, names)
+            there = [shape for shape in shapes if builder.shape_body[shape] == self.body_indices[twin]]
+            mine = {site: name for site, name in file_names.items() if model.site_bodyid[site] == body}
+            pairs = paired(mine, {shape: plain(short(builder.shape_label[shape])) for shape in there})
             found |= {site: pairs.get(site) for site in mine}
         return found
 
@@ -141,7 +139,8 @@ class Twins:
         file: list[int] = []
         built: list[int] = []
         for joint, twin in self.joints.items():
-            width = {0: 7, 1: 4}.get(int(self.file.jnt_type[joint]), 1)
+            count = freedoms(self.file, joint)
+            width = count + (count > 1)
             file += range(self.file.jnt_qposadr[joint], self.file.jnt_qposadr[joint] + width)
             built += range(self.built.jnt_qposadr[twin], self.built.jnt_qposadr[twin] + width)
         return file, built

@@ -100,6 +100,11 @@ def without_contacts(model: Any) -> Any:
     return copied
 
 
+def freedoms(model: Any, joint: int) -> int:
+    """Number of a joint's degrees of freedom; a joint of several has a quaternion, and so one coordinate more."""
+    return {"free": 6, "ball": 3}.get(word_of(mujoco.mjtJoint, model.jnt_type[joint]), 1)
+
+
 def move_joint(twins: Sequence[tuple[Any, Any, int]], amount: float, random: np.random.Generator) -> None:
     """Move a joint in several models by the same random amount, and let it move on.
 
@@ -109,7 +114,7 @@ def move_joint(twins: Sequence[tuple[Any, Any, int]], amount: float, random: np.
         random: Draws them.
     """
     model, _, joint = twins[0]
-    count = {0: 6, 1: 3}.get(int(model.jnt_type[joint]), 1)
+    count = freedoms(model, joint)
     moved, velocity = random.uniform(-amount, amount, count), 10.0 * random.uniform(-amount, amount, count)
     for model, data, joint in twins:
         coordinate, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from worker.simulation.actuators import Input
 from worker.simulation.carriers import is_carrier
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.robot_elements import short
 from worker.simulation.worlds import Worlds
 
 UNLIMITED_EFFORT = 1e6
@@ -73,7 +75,7 @@ class RobotView:
         if not self.bodies:
             there = sorted({label.partition("/")[0] for label in template.body_label})
             raise ValueError(f"the world has no robot or object {name!r}; {nearest(name, there)}")
-        self.body_names = [_short(template.body_label[body]) for body in self.bodies]
+        self.body_names = [short(template.body_label[body]) for body in self.bodies]
         self._read_joints(template)
         self._read_shapes(template)
 
@@ -125,8 +127,8 @@ class RobotView:
         mine = self._mine(template.shape_label)
         self.sites = [shape for shape in mine if template.shape_flags[shape] & newton.ShapeFlags.SITE]
         self.geoms = [shape for shape in mine if not template.shape_flags[shape] & newton.ShapeFlags.SITE]
-        self.site_names = [_short(template.shape_label[shape]) for shape in self.sites]
-        self.geom_names = [_short(template.shape_label[shape]) for shape in self.geoms]
+        self.site_names = [short(template.shape_label[shape]) for shape in self.sites]
+        self.geom_names = [short(template.shape_label[shape]) for shape in self.geoms]
         self.site_bodies = [template.shape_body[shape] for shape in self.sites]
         self.geom_bodies = [template.shape_body[shape] for shape in self.geoms]
         self.site_poses = [wp.transform(*template.shape_transform[shape]) for shape in self.sites]
@@ -218,17 +220,22 @@ def body_arrays(worlds: Worlds) -> BodyArrays:
     return arrays
 
 
+def joint_of(template: newton.ModelBuilder, dof: int) -> int:
+    """Index of the joint that has a degree of freedom."""
+    return bisect_right(template.joint_qd_start[: template.joint_count], dof) - 1
+
+
 def dof_names(template: newton.ModelBuilder, joint: int) -> list[str]:
     """A name for each degree of freedom of a joint: Newton makes one joint of all hinges between two bodies.
 
     ``Robot.add_to`` writes the names of such hinges to MuJoCo's ``joint_dof_label``; hinges without a name there are numbered.
     """
-    short, count = _short(template.joint_label[joint]), sum(template.joint_dof_dim[joint])
+    name, count = short(template.joint_label[joint]), sum(template.joint_dof_dim[joint])
     if count == 1:
-        return [short]
+        return [name]
     labels: Any = template.custom_attributes["mujoco:joint_dof_label"].values or {}
     first = template.joint_qd_start[joint]
-    return [_short(labels[dof]) if labels.get(dof) else f"{short}_{dof - first}" for dof in range(first, first + count)]
+    return [short(labels[dof]) if labels.get(dof) else f"{name}_{dof - first}" for dof in range(first, first + count)]
 
 
 def actuator_value(template: newton.ModelBuilder, attribute: str, actuator: int) -> Any:
@@ -304,7 +311,3 @@ def _is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool
 
 def _limit(value: float, sign: int) -> float:
     return sign * math.inf if abs(value) >= newton.MAXVAL else float(value)
-
-
-def _short(label: str) -> str:
-    return label.rpartition("/")[2]
