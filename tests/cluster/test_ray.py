@@ -177,6 +177,28 @@ def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: RayBench) -> None
     assert bench.stopped(again) == [143, 143, 143]
 
 
+def test_a_driver_or_an_actor_that_dies_before_anything_was_started_costs_no_attempt(bench: RayBench) -> None:
+    other = bench.ready(bench.gang(hosts=("n2",), suffix="-other", cpus=2.0))
+    waiting = bench.launch(bench.gang(nodes=2))
+    wait_for(lambda: "waits for room" in bench.engine.observe(waiting)[0].words, 30, "it is placed")
+    state = Folder.of(bench.home / "home", bench.job).state(waiting.gang)
+    driver = json.loads(state.read_text())["driver"]
+    os.kill(driver, signal.SIGKILL)
+    await_end(driver)
+    assert bench.engine.observe(waiting)[0].words.startswith("its driver died before it had started anything (")
+    bench.engine.stop(other, 1.0)
+    wait_for(lambda: bench.engine.observe(waiting) and bench.log().count("ready") == 2, 60, "another one starts it")
+    assert bench.stopped(waiting) == [143, 143]
+    # what an actor imports first kills it, once
+    fake = bench.cluster.modules / "shared_store"
+    fake.mkdir(parents=True)
+    (fake / "__init__.py").write_text(
+        "import os, shutil, signal\nshutil.rmtree(os.path.dirname(__file__))\nos.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    handle = bench.ready(bench.gang(hosts=("n1", "n3"), attempt=2))
+    assert not fake.exists() and bench.stopped(handle) == [143, 143]
+
+
 def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: RayBench) -> None:
     handle = bench.ready(bench.gang())
     bench.cluster.kill("n3")

@@ -26,13 +26,13 @@ import ray
 
 from orchestrator.engines.ray import node as ray_node
 from orchestrator.engines.ray.bundles import STRATEGY, bundle_of, selector_of
-from orchestrator.engines.ray.folder import NEW, Folder
+from orchestrator.engines.ray.folder import NEW, UNSTARTED, Folder
 from orchestrator.engines.ray.gang import DrivenGang
 
 _LINGER = 15.0
 """Seconds for which the place of a gang that is over is kept for the job's next attempt."""
-_UNSTARTED = ("joining", "placing", "starting")
-"""Phases of a gang before any command was started."""
+_PLACINGS = 3
+"""How often a gang is placed whose actors are lost before they have started anything."""
 _JOINING = 90.0
 """Seconds that joining the cluster may take: ``ray.init`` itself would try for ever."""
 
@@ -62,7 +62,7 @@ class Driver:
                     return
                 self._read(0.2)
                 continue
-            if self._leaves and gang.phase in _UNSTARTED:
+            if self._leaves and gang.phase in UNSTARTED:
                 gang.forget()
                 return
             self._step(gang)
@@ -82,7 +82,10 @@ class Driver:
             self._await_place(gang)
         elif gang.phase == "starting":
             gang.listen(0.1)
-            if not gang.is_over and all("facts" in node for node in gang.nodes):
+            lost = any(not node["running"] and node["code"] is None for node in gang.nodes)
+            if lost and gang.placings < _PLACINGS:
+                gang.place_again()
+            elif not gang.is_over and all("facts" in node for node in gang.nodes):
                 addresses = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes()}
                 gang.start([addresses[node["ray_node"]] for node in gang.nodes])
         else:

@@ -39,7 +39,7 @@ from orchestrator.engines.api import (
 from orchestrator.engines.ray import TRAITS
 from orchestrator.engines.ray.bundles import in_words
 from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, ray_environment
-from orchestrator.engines.ray.folder import LEASE, NEW, Folder
+from orchestrator.engines.ray.folder import LEASE, NEW, UNSTARTED, Folder
 from orchestrator.engines.ray.request import GangRequest, NodeRequest
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
@@ -48,6 +48,8 @@ from shared_store.files import read_json, write_json
 from shared_store.ports import first_port
 
 DEFAULT_ADDRESS = "127.0.0.1:6379"
+_DRIVERS = 3
+"""How many drivers are started for a gang after one that died before it had started anything."""
 _SUSPECT, _SUSPECT_IF_SILENT = 20.0, 70.0
 """Seconds for which a machine that lost its part of a gang is no host: until Ray, too, knows whether it is there."""
 _ENDING = 4 * LEASE
@@ -88,6 +90,8 @@ class RayEngine:
             raise EngineError(_not_a_node(self.head))
         self.address = address_towards(self.head)
         self._drivers: dict[str, subprocess.Popen[bytes]] = {}
+        self._tries: dict[str, int] = {}
+        """How many drivers of a gang have died before they had started anything."""
         self._next_let_go = 0.0
         self._suspects: dict[str, float] = {}
         """Until when (monotonic [s]), by node id."""
@@ -184,14 +188,15 @@ class RayEngine:
             if folder.plan(gang).exists():
                 driver = self._drivers.get(_job(gang))
                 if driver is not None and driver.poll():  # one that left with 0 did so before it was asked
-                    said = folder.said.read_text(errors="replace").strip().rpartition("\n")[2]
-                    return [ended("", 1, f"its driver can't run: {said}")] * count
+                    return [ended("", 1, f"its driver can't run: {folder.last_line()}")] * count
                 self._drive(folder, gang)
                 return [NodeStatus(NodePhase.STARTING, words="its driver is starting")] * count
             return [ended("", None)] * count
         driven = folder.is_driven() or state["phase"] == "stopped"
         if not driven:  # its last words may have come in between
             state = read_json(folder.state(gang)) or state
+            if state["phase"] in UNSTARTED and any(node["running"] for node in state["nodes"]):
+                return self._drive_again(folder, handle, state)
         if state["phase"] == "placing" and time.monotonic() > self._next_let_go:
             self._next_let_go = time.monotonic() + 1.0
             self._let_go(_job(gang))
@@ -227,6 +232,7 @@ class RayEngine:
             return f"its driver says {phase}" if phase else "its driver has said nothing yet"
 
         stop_within(grace + _ENDING, step, engine=self.name, gang=gang, pause=0.02)
+        self._tries.pop(gang, None)
         with self._lock:
             self._grown.pop(gang, None)
 
@@ -275,6 +281,16 @@ class RayEngine:
         finally:
             os.close(commands)
 
+    def _drive_again(self, folder: Folder, handle: Handle, state: Mapping[str, Any]) -> GangStatus:
+        """A driver died before it had started anything: another one begins, a few times."""
+        died = f"its driver died before it had started anything ({folder.last_line()})"
+        tries = self._tries[handle.gang] = self._tries.get(handle.gang, 0) + 1
+        if tries > _DRIVERS:
+            return [ended(node["address"], None, died) for node in state["nodes"]]
+        folder.state(handle.gang).unlink(missing_ok=True)
+        self._drive(folder, handle.gang)
+        return [NodeStatus(NodePhase.STARTING, words=f"{died}; another one is starting")] * handle.nodes
+
     def _let_go(self, job: str) -> None:
         """Ask drivers that only hold resources for another job's next attempt to exit, and reap those that have."""
         for other, process in list(self._drivers.items()):
@@ -313,7 +329,8 @@ def _status(node: Mapping[str, Any], state: Mapping[str, Any], driven: bool) -> 
     """The status of a node, by its driver's report; ``driven``: the driver is there, or had nothing more to do."""
     gpus = tuple(filter(None, node.get("gpus", "").split(",")))
     if not (node["running"] and driven):
-        over = ended(node["address"], node["code"], node["detail"], gpus)
+        detail = node["detail"] if driven or not node["running"] else "its driver died"
+        over = ended(node["address"], node["code"], detail, gpus)
         # a driver of an older version says no cause
         return dataclasses.replace(over, cause=Cause(node["cause"])) if node.get("cause") else over
     if node["started"] or not state["why"]:

@@ -17,6 +17,9 @@ from typing import Any
 LEASE = 20.0
 """Seconds without a sign of life between a driver and an actor after which each gives the other up: an actor ends its node."""
 
+UNSTARTED = ("joining", "placing", "starting")
+"""Phases of a gang before any command was started."""
+
 NEW = "ray/+"
 """Names of hosts that the autoscaler could add begin so."""
 
@@ -72,6 +75,10 @@ class Folder:
             if error.errno in (errno.ENXIO, errno.ENOENT):
                 return False
             raise
+
+    def last_line(self) -> str:
+        """The last line that a driver of the job wrote before it ended."""
+        return self.said.read_text(errors="replace").strip().rpartition("\n")[2] if self.said.exists() else ""
 
     def plan(self, gang: str) -> Path:
         return self.path / f"{_file_name(gang)}.plan.json"

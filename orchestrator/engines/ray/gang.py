@@ -38,18 +38,9 @@ class DrivenGang:
         self.plan, self.folder = plan, folder
         self.name: str = plan["gang"]
         self.phase, self.why = "joining", "joining the Ray cluster"
-        self.nodes: list[dict[str, Any]] = [
-            {
-                "running": True,
-                "started": False,
-                "address": "",
-                "gpus": "",
-                "code": None,
-                "detail": "",
-                "ray_node": node["pin"] or "",
-            }
-            for node in plan["nodes"]
-        ]
+        self.placings = 0
+        """How often it was placed."""
+        self.nodes = self._unplaced()
         self.actors: list[Any] = []
         self.asked: dict[Any, tuple[str, int]] = {}
         """Calls of actors that are not answered: a kind and a node's index."""
@@ -90,8 +81,34 @@ class DrivenGang:
         for index in range(len(self.nodes)):
             self.end(index, 1, detail)
 
+    def _unplaced(self) -> list[dict[str, Any]]:
+        return [
+            {
+                "running": True,
+                "started": False,
+                "address": "",
+                "gpus": "",
+                "code": None,
+                "detail": "",
+                "ray_node": node["pin"] or "",
+            }
+            for node in self.plan["nodes"]
+        ]
+
+    def place_again(self) -> None:
+        """Have the gang placed anew: an actor was lost before any command was started, so the attempt has not begun."""
+        lost = next(index for index, node in enumerate(self.nodes) if not node["running"])
+        self.why = (
+            f"node {lost} on {self.plan['nodes'][lost]['host']}: {self.nodes[lost]['detail']}; it is placed again"
+        )
+        for actor in self.actors:
+            ray.kill(actor)
+        self.nodes, self.actors, self.asked, self.broken = self._unplaced(), [], {}, {}
+        self.phase = "joining"
+
     def place(self, group: Any) -> None:
         """Actors on the bundles of a placement group that has its room."""
+        self.placings += 1
         actor = ray.remote(ray_node.Node)
         for index, node in enumerate(self.plan["nodes"]):
             bundle = bundle_of(node)
@@ -106,7 +123,7 @@ class DrivenGang:
                 ).remote({"MUSTER_GANG": self.name, "NODE_RANK": str(_contract(node["contract"]).node_rank)}, LEASE)
             )
         contract = _contract(self.plan["nodes"][0]["contract"])
-        about = self.plan["directory"], contract.store, contract.run, contract.epoch
+        about = self.plan["directory"], contract.store, contract.run, contract.epoch, self.name
         for index, node in enumerate(self.actors):
             self.asked[node.facts.remote(__version__, *about)] = ("facts", index)
         self.heard = [time.monotonic()] * len(self.nodes)
@@ -115,10 +132,12 @@ class DrivenGang:
     def start(self, addresses: list[str]) -> None:
         """Start the supervisors, the main node's first. Waits for it."""
         main = self.plan["main"]
-        port = ray.get(self.actors[main].free_port.remote(self.name), timeout=LEASE)
+        port = self.nodes[main]["facts"]["port"]
         if not port:
             self.fail(f"no free port from {first_port(self.name)} on {addresses[main]}")
             return
+        self.phase, self.why = "running", ""
+        self.tell()  # before anything is started: whoever finds another phase may start the gang again
         for index in sorted(range(len(self.nodes)), key=lambda index: index != main):
             node = self.plan["nodes"][index]
             contract = dataclasses.replace(
@@ -139,7 +158,6 @@ class DrivenGang:
             self.nodes[index]["address"] = addresses[index]
             if index == main:
                 ray.wait([ref], timeout=LEASE)
-        self.phase, self.why = "running", ""
 
     def stop(self, grace: float) -> None:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
@@ -173,10 +191,10 @@ class DrivenGang:
                     self.asked[self.actors[index].beat.remote()] = ("beat", index)
                     if kind == "wait":
                         self.asked[self.actors[index].wait.remote()] = ("wait", index)
-                except ray.exceptions.RayActorError:
-                    self.end(index, None, "")
+                except ray.exceptions.RayActorError as error:
+                    self.end(index, None, f"its Ray actor died ({_last_line(error)})")
                 except Exception as error:
-                    self.end(index, 1, f"node {index}: {str(error).strip().splitlines()[-1]}")
+                    self.end(index, 1, f"node {index}: {_last_line(error)}")
         else:
             time.sleep(seconds)
         self._beat()
@@ -211,7 +229,7 @@ class DrivenGang:
         now = time.monotonic()
         for index, since in self.broken.items():
             if now - since > _BROKEN:
-                self.end(index, None, "")
+                self.end(index, None, "the connection to its Ray actor broke")
         if now < self.next_beat or not self.actors:
             return
         self.next_beat = now + _BEAT
@@ -221,9 +239,9 @@ class DrivenGang:
                 self.asked[actor.beat.remote()] = ("beat", index)
                 if not self.nodes[index]["running"]:
                     self.heard[index] = now
-            elif now - self.heard[index] > (_STARTING if self.phase == "starting" else LEASE):
+            elif now - self.heard[index] > (patience := _STARTING if self.phase == "starting" else LEASE):
                 self.nodes[index]["silent"] = True
-                self.end(index, None, "")
+                self.end(index, None, f"its Ray actor has not answered for {patience:.0f} s")
 
     def forget(self) -> None:
         """No command was started: who looks for the gang next starts it."""
@@ -247,3 +265,7 @@ class DrivenGang:
 
 def _contract(told: Mapping[str, Any]) -> NodeContract:
     return NodeContract(**{**told, "array": tuple(told["array"]) if told["array"] else None})
+
+
+def _last_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[-1].strip()

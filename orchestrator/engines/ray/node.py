@@ -41,8 +41,8 @@ class Node:
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
         threading.Thread(target=self._keep, name="keeper", daemon=True).start()
 
-    def facts(self, version: str, directory: str | None, store: str, run: str, epoch: int) -> dict[str, Any]:
-        """Facts that the driver needs before it starts anything: the version of Muster here, the GPUs, what is missing.
+    def facts(self, version: str, directory: str | None, store: str, run: str, epoch: int, gang: str) -> dict[str, Any]:
+        """Facts that the driver needs before it starts anything: the version of Muster here, the GPUs, a free port, what is missing.
 
         Args:
             version: Of Muster, the driver's; the driver refuses another one.
@@ -50,6 +50,7 @@ class Node:
             store: Path of the shared volume.
             run: The run, to which the controller has given ``epoch`` on that volume.
             epoch: The gang's.
+            gang: Its name. ``port`` is where its nodes could meet on this machine; 0 where no port is free.
         """
         try:
             from shared_store import __version__ as muster
@@ -61,16 +62,15 @@ class Node:
             }
         if not os.path.isdir(store):
             return {"problem": f"store {store} is not there: it has to be on a volume that all nodes share"}
-        problem = _foreign(store, run, epoch) if muster == version else ""
-        return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": problem}
-
-    def free_port(self, gang: str) -> int:
-        """A port of this node's machine for the gang's nodes to meet at; 0 where none is free."""
+        gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+        if muster != version:
+            return {"version": muster, "gpus": gpus, "port": 0, "problem": ""}
         from shared_store.ports import free_port
 
+        port = 0
         with contextlib.suppress(OSError):
-            return free_port(gang)
-        return 0
+            port = free_port(gang)
+        return {"version": muster, "gpus": gpus, "port": port, "problem": _foreign(store, run, epoch)}
 
     def start(
         self,

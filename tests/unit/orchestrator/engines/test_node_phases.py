@@ -82,7 +82,8 @@ def test_a_report_of_ray_s_driver_becomes_the_node_s_phase(
     status = ray_status(told, {"phase": phase, "why": why}, True)
     assert (status.phase, status.cause, status.words) == seen and status.gpus == ("0", "1")
     if node.get("running", True):
-        assert ray_status(told, {"phase": phase, "why": why}, False).cause is Cause.HOST_LOST, "its driver died"
+        orphan = ray_status(told, {"phase": phase, "why": why}, False)
+        assert (orphan.cause, orphan.words) == (Cause.HOST_LOST, "its driver died")
 
 
 def job(state: str, reason: str = "None") -> SlurmJob:
