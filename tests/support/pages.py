@@ -46,7 +46,17 @@ def run_page(page: str, directory: Path, then: str = "", without: str = "make te
     ending = "trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT"
     command = ["bash", "-euxc", f"{ending}\n{script}"]
     env |= {"HOME": str(directory), "PYTHONUNBUFFERED": "1"}
-    done = subprocess.run(command, cwd=clone, env=env, capture_output=True, text=True, timeout=900)
+    try:
+        done = subprocess.run(command, cwd=clone, env=env, capture_output=True, text=True, timeout=900)
+    except subprocess.TimeoutExpired as late:
+        printed = [
+            (each or b"").decode(errors="replace")[-6000:] for each in (late.stdout, late.stderr)
+        ]  # always bytes
+        alive = subprocess.run(
+            ["ps", "-eo", "pid,ppid,etimes,stat,wchan:20,args"], capture_output=True, text=True
+        ).stdout
+        mine = "\n".join(line for line in alive.splitlines() if str(clone) in line or "muster" in line)
+        pytest.fail(f"it still runs after {late.timeout:.0f} s:\n{printed[0]}\n{printed[1]}\n{mine}")
     assert done.returncode == 0, f"{done.stdout[-6000:]}\n{done.stderr[-6000:]}"
     wait_for(lambda: not taken(), 20, "the controller's end")
     return done.stdout
