@@ -4,8 +4,11 @@ For each file of the packages below:
 
 (a) whether every compared value of the model is the file's, within 1e-6 of the greater one;
 (b) the greatest difference of a coordinate in one second of MuJoCo's C engine, with the file's own integrator, under fixed controls,
-    without contacts;
+    without contacts; a robot that these leave at rest begins with a small random velocity of each joint;
 (c) the same of Muster's own step, in float32 on the processor, at the end of that second.
+
+Where (b) is greater than its limit, the table also has the difference of the file's model from itself with each value rounded to
+float32, which is how Newton holds them.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation.robot_twins import Twins
+from worker.simulation.robot_values import freedoms, without_contacts
 from worker.simulation.worlds import Worlds
 from worker.tasks import EffortActuator, Robot
 
@@ -54,6 +58,8 @@ PARTS = (
     "primitives.xml",
 )
 """Files that are parts of others, or hold no robot."""
+_ROUNDED = ("body", "jnt", "dof", "geom", "site", "tendon", "wrap", "eq", "actuator", "qpos0", "qpos")
+"""Kinds of a model's values that Newton holds in float32."""
 EXACT, OWN = 1e-5, 1e-3
 """Limits of (b) and (c) [m, rad]."""
 OUT = Path(__file__).with_suffix(".md")
@@ -61,7 +67,7 @@ OUT = Path(__file__).with_suffix(".md")
 
 @dataclasses.dataclass
 class Row:
-    """One file. Differences are in metres or radians; None where there is nothing to compare."""
+    """One file. Differences are in metres or radians, relative for greater coordinates than 1; None where nothing is compared."""
 
     file: str
     state: str
@@ -69,6 +75,7 @@ class Row:
     freedoms: int = 0
     engine: float | None = None
     own: float | None = None
+    rounding: float | None = None
 
 
 def folder(package: str, build: Path) -> Path:
@@ -105,7 +112,7 @@ def files(build: Path) -> list[tuple[str, Path]]:
         found += [
             (f"{package}: {path.relative_to(base)}", path)
             for path in paths
-            if not any(part in str(path) for part in PARTS)
+            if not any(part in str(path.relative_to(base)) for part in PARTS)
         ]
     return found
 
@@ -122,10 +129,25 @@ def measure(name: str, path: Path) -> Row:
     twins = Twins(reading.reference.model, reading.builder)
     there, here = twins.free_of_contacts()
     row = Row(name, state, _short("".join(map(str, reading.corrected[:1])), path), there.nv)
+    if not there.nv:
+        row.detail = "nothing of it moves"
+        return row
+    here.opt.gravity = twins.built.opt.gravity
     controls = np.random.default_rng(1).uniform(-0.3, 0.3, there.nu)
-    last, row.engine = in_engine(twins, there, here, controls)
+    first, second = mujoco.MjData(there), mujoco.MjData(here)
+    if np.abs(second_of(there, first, controls)[-1] - first.qpos).max() < 1e-9:
+        speeds = np.random.default_rng(2).uniform(-0.2, 0.2, there.njnt)
+        for joint, twin in twins.joints.items():
+            if freedoms(there, joint) == 1:
+                first.qvel[there.jnt_dofadr[joint]] = second.qvel[here.jnt_dofadr[twin]] = speeds[joint]
+    columns = twins.columns()
+    path_there, path_here = second_of(there, first, controls), second_of(here, second, controls)
+    row.engine = difference(path_there[:, columns[0]], path_here[:, columns[1]])
+    if not row.engine <= EXACT:
+        row.rounding = difference(path_there, second_of(rounded(there), first, controls))
     try:
-        row.own = in_muster(robot, twins, there, controls, last)
+        last = in_muster(robot, twins, there, second.qvel, controls)
+        row.own = difference(path_there[-1, columns[0]], last[columns[1]])
     except (ValueError, NotImplementedError) as error:
         row.detail = f"{row.detail}; not stepped by Muster: {error}".strip("; ")
     return row
@@ -136,26 +158,43 @@ def _short(text: object, path: Path) -> str:
     return re.split(r"[;.] (?:change|Change|Give|Declare|Leave)", str(text).replace(str(path), path.name))[0]
 
 
-def in_engine(twins: Twins, there: Any, here: Any, controls: Any) -> tuple[Any, float]:
-    """One second in MuJoCo's C engine: the file's last coordinates, and the greatest difference on the way."""
-    first, second = mujoco.MjData(there), mujoco.MjData(here)
-    first.ctrl[:] = second.ctrl[:] = controls
-    columns = twins.columns()
-    worst = 0.0
-    for _ in range(steps_of(there)):
-        mujoco.mj_step(there, first)
-        mujoco.mj_step(here, second)
-        worst = max(worst, float(np.abs(first.qpos[columns[0]] - second.qpos[columns[1]]).max(initial=0.0)))
-    return first.qpos[columns[0]].copy(), worst
+def second_of(model: Any, begin: Any, controls: Any) -> Any:
+    """The coordinates of one second in MuJoCo's C engine from ``begin`` on, shape ``(steps, nq)``, float64."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = begin.qpos, begin.qvel, controls
+    path = np.empty((steps_of(model), model.nq))
+    for step in range(len(path)):
+        mujoco.mj_step(model, data)
+        path[step] = data.qpos
+    return path
 
 
-def in_muster(robot: Robot, twins: Twins, there: Any, controls: Any, last: Any) -> float:
-    """One second in Muster's own worlds: the greatest difference at its end."""
+def difference(first: Any, second: Any) -> float:
+    """The greatest difference of two arrays' elements, divided by the first where that is greater than 1; infinite for NaN."""
+    differences = np.abs(first - second) / np.maximum(1.0, np.abs(first))
+    return float(np.nan_to_num(differences, nan=np.inf).max(initial=0.0))
+
+
+def rounded(model: Any) -> Any:
+    """A model whose values are rounded to float32."""
+    other = without_contacts(model)
+    for name in dir(other):
+        array = getattr(other, name) if name.partition("_")[0] in _ROUNDED else None
+        if isinstance(array, np.ndarray) and array.dtype == np.float64:
+            array[...] = array.astype(np.float32)
+    return other
+
+
+def in_muster(robot: Robot, twins: Twins, there: Any, speeds: Any, controls: Any) -> Any:
+    """From the velocities ``speeds`` of the built model on, the coordinates after one second in Muster's own worlds, in the built model's order, shape ``(nq,)``, float32."""
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)
     if not there.nu:
         robot = dataclasses.replace(robot, actuators=(EffortActuator("*"),))
     robot.add_to(builder)
+    for joint, dof in enumerate(twins.dofs):
+        if freedoms(twins.built, joint) == 1:
+            builder.joint_qd[dof] = float(speeds[twins.built.jnt_dofadr[joint]])
     options = {"disable_contacts": True, "integrator": int(there.opt.integrator), "njmax": 400}
     worlds = Worlds(
         builder, 1, "cpu", timestep=there.opt.timestep, substeps=steps_of(there), fastest=1e9, solver_options=options
@@ -164,8 +203,7 @@ def in_muster(robot: Robot, twins: Twins, there: Any, controls: Any, last: Any) 
     if there.nu:
         worlds.arrays.controls.assign(controls[None].astype(np.float32))
     worlds.simulate()
-    coordinates = worlds.solver.mjw_data.qpos.numpy()[0]
-    return float(np.abs(last - coordinates[twins.columns()[1]]).max(initial=0.0))
+    return worlds.solver.mjw_data.qpos.numpy()[0]
 
 
 def steps_of(model: Any) -> int:
@@ -175,21 +213,26 @@ def steps_of(model: Any) -> int:
 def page(rows: list[Row]) -> str:
     equal = [row for row in rows if row.state != "refused" and row.engine is not None and row.engine <= EXACT]
     own = [row for row in equal if row.own is not None and row.own <= OWN]
+    further = [row for row in rows if row.engine is not None and not row.engine <= EXACT]
     lines = [
         "# Robot files",
         "",
         f"`python -m benchmarks.robots`: {len(rows)} public files; MuJoCo {mujoco.__version__}, Newton {newton.__version__}. "
         f"{len(equal)} are equal in every compared value of the model (within 1e-6) and move equally in MuJoCo's C engine for a "
         f"second (within {EXACT:g}); {len(own)} of them move equally in Muster's own float32 step, too (within {OWN:g}). "
-        f"{sum(row.state == 'refused' for row in rows)} are refused by name.",
+        f"{sum(row.state == 'refused' for row in rows)} are refused by name, {sum(not row.freedoms and row.state != 'refused' for row in rows)} "
+        f"hold nothing that moves. The other {len(further)} have equal values, too, but move further apart than {EXACT:g} in the C engine.",
+        "",
+        "Why these do: Newton holds a model's values in float32, and their motion enlarges the rounding. *float32* is the difference of "
+        "the file's own model from itself with its values rounded.",
         "",
         "Versions of the packages: " + ", ".join(f"{name} {version}" for name, (version, *_) in PACKAGES.items()) + ".",
         "",
-        "| file | read | freedoms | C engine | own step | the first that Newton's importer reads otherwise, or why it is refused |",
-        "|---|---|--:|--:|--:|---|",
+        "| file | read | freedoms | C engine | float32 | own step | the first that Newton's importer reads otherwise, or why it is refused |",
+        "|---|---|--:|--:|--:|--:|---|",
     ]
     for row in rows:
-        numbers = ["" if value is None else f"{value:.1e}" for value in (row.engine, row.own)]
+        numbers = ["" if value is None else f"{value:.1e}" for value in (row.engine, row.rounding, row.own)]
         lines.append(
             f"| {row.file} | {row.state} | {row.freedoms or ''} | {' | '.join(numbers)} | {row.detail.replace('|', '/')} |"
         )
@@ -204,7 +247,9 @@ def main() -> None:
     arguments.build.mkdir(parents=True, exist_ok=True)
     wp.config.log_level = wp.LOG_ERROR
     warnings.simplefilter("ignore")
-    kept = arguments.build / "rows.json"
+    reading = ["git", "rev-parse", "--short", "HEAD:worker/simulation"]  # other code reads files otherwise
+    revision = subprocess.run(reading, capture_output=True, text=True, check=True, cwd=OUT.parent.parent).stdout.strip()
+    kept = arguments.build / f"rows-{revision}.json"
     rows = {row["file"]: Row(**row) for row in json.loads(kept.read_text())} if kept.is_file() else {}
     for name, path in files(arguments.build):
         if arguments.only in name and name not in rows:

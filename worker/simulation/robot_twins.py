@@ -37,7 +37,8 @@ class Twins:
         self.built: Any = solver.mj_model
         self.body_indices = _column(solver.mjc_body_to_newton)
         """Index of each body of :attr:`built` among the builder's, -1 for the world."""
-        self._dofs = _column(solver.mjc_jnt_to_newton_dof)
+        self.dofs = _column(solver.mjc_jnt_to_newton_dof)
+        """Index of the first degree of freedom of each joint of :attr:`built` among the builder's."""
         self._shapes = _column(solver.mjc_geom_to_newton_shape)
 
     def name(self, kind: str, index: int) -> str:
@@ -50,7 +51,7 @@ class Twins:
 
     def built_joint(self, index: int) -> str:
         """Name of a joint of the built model."""
-        dof = self._dofs[index]
+        dof = self.dofs[index]
         joint = joint_of(self._builder, dof)
         if self._builder.joint_type[joint] in (newton.JointType.FREE, newton.JointType.BALL):
             return short(self._builder.joint_label[joint])
