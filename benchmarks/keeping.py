@@ -29,6 +29,7 @@ from typing import Any
 
 import yaml
 
+from shared_store.learning import LEARNING
 from worker.learning.ppo.settings import PPOConfig
 
 SPECS = Path(__file__).parents[1] / "job_specs"
@@ -46,16 +47,7 @@ WORLDS = {"ant": 4096}
 """Instead of a spec's worlds: with these the ant learns to run, as its spec says."""
 POINTS = 200
 """Points of a curve."""
-SHOWN = [
-    "kl",
-    "learning_rate",
-    "action_std",
-    "explained_variance",
-    "clip_fraction",
-    "gradient_norm",
-    "saturation",
-    "v_max_mass",
-]
+SHOWN = [metric.name for metric in LEARNING]
 KINDS = ("default", "then", "stock")
 KEPT_COLUMNS = ("iteration", "episodes", "reward", "action_std")
 """Those that ``keeping.json`` keeps of a point."""

@@ -12,9 +12,10 @@ from rich.table import Table
 
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
-from orchestrator.cli.jobs import JsonOption, scored
+from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.serving import StoreOption, controller
+from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
