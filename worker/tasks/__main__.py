@@ -44,6 +44,7 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
         "substeps": config.substeps,
         "episode_seconds": config.episode_seconds,
         **(_whole(plan) if whole and plan else {}),
+        **({"notes": list(task.notes())} if whole else {}),
     }
 
 
