@@ -3,7 +3,7 @@
     python -m benchmarks.keeping [cartpole ant ...] [--by default then stock] [--at-once 8] [--out DIRECTORY]
     python -m benchmarks.keeping --table                        # writes keeping.md, keeping.json and keeping.png
 
-Each training is a process of its own; ``keeping.jsonl`` gets a line whenever one has made a two-hundredth of its iterations. Trainings
+Each training is a separate process; ``keeping.jsonl`` gets a line whenever one has made a two-hundredth of its iterations. Trainings
 that it or ``keeping.json`` already holds whole are left out, so an interrupted benchmark continues where it stopped. Every spec is trained ``default``, with
 the settings that a new job gets; and on request as ``then``, with those of runs that began before limits existed, by ``stock`` rsl_rl, or
 with other settings: ``--by 'name={"min_std": 0.05}'``. Where matplotlib is missing there is no picture.

@@ -132,7 +132,7 @@ def table(curves: Mapping[Key, Curve]) -> str:
         "# Do trainings keep what they learnt?",
         "",
         f"`python -m benchmarks.keeping`, {', '.join(ON_CPU)} on one core each, the others on a GPU, ant with {WORLDS['ant']:,} worlds. Mean returns are over {WIDTH:.0%} of a training, weighted by episodes; *kept* is the last of "
-        "these means as a share of the best one. *Dipped*: seeds whose mean fell below 90 % of the best one at any time after it had been "
+        "these means as a share of the best one. *Dipped*: seeds with a mean below 90 % of the best one at any time after it had been "
         "there. *To 90 %*: iterations until a two-hundredth of the training had 90 % of the median best mean of the default settings.",
         "",
         "`default` are the settings of a new job; `then` those of runs that began before deviations and rates had limits; `stock` is "

@@ -137,20 +137,20 @@ def _source(detail: Mapping[str, Any]) -> str:
     return f"{section['run']}@{section.get('checkpoint', 'latest')}"
 
 
-def _automatic(run: str, told: Mapping[str, Any] | None) -> str:
+def _automatic(run: str, state: Mapping[str, Any] | None) -> str:
     """The newest automatic evaluation of a training in one line."""
-    if not told:
+    if not state:
         return ""
     parts = []
-    if told["job"]:
-        reason = f": {one_line(told['statusReason'] or '')}" if told["status"] not in ("SUCCEEDED", None) else ""
+    if state["job"]:
+        reason = f": {one_line(state['statusReason'] or '')}" if state["status"] not in ("SUCCEEDED", None) else ""
         parts.append(
-            f"{run}@{told['iteration']} by job {told['job'][:8]}, {told['status'] or 'which can not be seen'}{reason}"
+            f"{run}@{state['iteration']} by job {state['job'][:8]}, {state['status'] or 'which can not be seen'}{reason}"
         )
-    if told["passed"]:
-        parts.append(f"{counted(told['passed'], 'checkpoint')} passed over for newer ones")
-    if told["problem"]:
-        parts.append(one_line(told["problem"]))
+    if state["passed"]:
+        parts.append(f"{counted(state['passed'], 'checkpoint')} passed over for newer ones")
+    if state["problem"]:
+        parts.append(one_line(state["problem"]))
     return "; ".join(parts)
 
 
@@ -159,8 +159,8 @@ def started_from(parent: Mapping[str, Any] | None) -> str:
     if not parent:
         return ""
     score = scored(parent.get("score"), parent.get("score_error"))
-    told = f", score {score}" if score != "-" else ""
-    return f"{parent.get('run')}@{parent.get('iteration')} (checkpoint {parent.get('checkpoint')}{told})"
+    known = f", score {score}" if score != "-" else ""
+    return f"{parent.get('run')}@{parent.get('iteration')} (checkpoint {parent.get('checkpoint')}{known})"
 
 
 def scored(score: float | None, error: float | None) -> str:

@@ -43,8 +43,8 @@ def tasks(
     console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for kind in ("observations", "actions"):
         console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", markup=False)
-    if notes := found[0]["notes"]:
-        console.print("\nNOTES\n" + "\n".join(notes), markup=False)
+    if robots := found[0]["robots"]:
+        console.print("\nROBOTS\n" + "\n".join(robots), markup=False)
     for section, rows in found[0].get("tables", {}).items():
         echo("")
         _print(_terms(section, rows))

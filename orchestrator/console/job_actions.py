@@ -68,8 +68,8 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
     changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepted(form) else []))
-    told = runs.resume(reconciler_of(request), run, Changes(iteration, changes, directory))
-    return done(request, f"/jobs/{told['jobId']}", f"resumed {run.name} from iteration {told['iteration']}")
+    answer = runs.resume(reconciler_of(request), run, Changes(iteration, changes, directory))
+    return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
 
 
 @_stored.post("/jobs/{reference}/clone")

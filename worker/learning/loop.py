@@ -295,12 +295,12 @@ class Loop:
 
     def _begin_iteration(self, iteration: int) -> None:
         """Tell the task which iteration begins, since its curriculum may depend on it, and what the other ranks have counted."""
-        told = iteration, self.state.progress.reward, self.state.progress.episode_length
+        now = iteration, self.state.progress.reward, self.state.progress.episode_length
         own = self.task.own_counts() if self.gang.size > 1 else {}
         others = {name: self.gang.sum(counts.clone()) - counts for name, counts in own.items()}
-        self.incident.begin(*told, others)
+        self.incident.begin(*now, others)
         self.task.take_counts(others)
-        self.task.begin_iteration(*told)
+        self.task.begin_iteration(*now)
 
     def _signals(self) -> dict[str, float]:
         """This rank's :data:`SIGNALS`."""

@@ -69,7 +69,7 @@ class Watch:
         return sum(count * reward for count, reward in self._window) / sum(count for count, _ in self._window)
 
     def _lost(self, least: float) -> float | None:
-        """The present mean, if it is below ``least`` and below the best by more than its own noise."""
+        """The present mean, if it is below ``least`` and below the best by more than noise."""
         mean = self._mean()
         if mean is None:
             return None

@@ -91,12 +91,11 @@ class DeclaredTask(Task):
     def build(self, builder: newton.ModelBuilder) -> None:
         """Add robots and objects, and bind the terms to them."""
         config: Any = self.config
-        self.views: dict[str, RobotView] = {}
+        entities = {"robot": self.robot(config), **self.objects(config)}
         self.readings: dict[str, Reading] = {}
-        for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
+        for name, entity in entities.items():
             self._add(name, entity, builder)
-        for name in ("robot", *self.objects(config)):
-            self.views[name] = RobotView(builder, name)
+        self.views = {name: RobotView(builder, name) for name in entities}
         self.declaration = self.declare(config)
         if not isinstance(self.declaration, Declaration):
             found = type(self.declaration).__name__
@@ -159,11 +158,7 @@ class DeclaredTask(Task):
         return contract(self.plan, self.worlds)
 
     def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
-        """Further JSON documents of a policy's bundle, by file name.
-
-        Args:
-            algorithm: Name of the algorithm that trained the policy.
-        """
+        """Further JSON documents of the bundle of a policy that ``algorithm``, a name, trained; by file name."""
         return {}
 
     def _prepare(self) -> None:

@@ -1,4 +1,4 @@
-"""A cart-pole with a file of its own, which a test changes."""
+"""A cart-pole from a file that a test changes."""
 
 from __future__ import annotations
 
