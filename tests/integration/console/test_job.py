@@ -182,7 +182,8 @@ def test_the_stream_has_new_iterations_and_tells_what_went_back(visitor: Visitor
     assert told["series"]["reward"] == [i / 2 for i in range(1, 10)] and told["last"] == 9
     had = json.dumps({"i": 7, "l": {}})
     metrics = (data for name, data, _ in visitor.events(f"/jobs/{training}/stream?last={had}") if name == "metrics")
-    assert next(metrics) == {"iterations": [8, 9], "series": {"reward": [4.0, 4.5], "reward_alive": [1.0, 1.0]}}
+    series = {"reward": [4.0, 4.5], "reward_alive": [1.0, 1.0], "action_std": [None, 0.41]}
+    assert next(metrics) == {"iterations": [8, 9], "series": series}
     run: Run = store.run("taught")
     with MetricsWriter(run, 2, 4) as writer:
         writer.write({"iteration": 5, "reward": 50.0})
