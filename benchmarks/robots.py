@@ -242,7 +242,7 @@ def page(rows: list[Row]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--build", type=Path, default=Path("build/robots"), help="where wheels and rows are kept")
-    parser.add_argument("--only", default="", help="files whose name holds this")
+    parser.add_argument("--only", default="", help="files with this in their names")
     arguments = parser.parse_args()
     arguments.build.mkdir(parents=True, exist_ok=True)
     wp.config.log_level = wp.LOG_ERROR

@@ -1,4 +1,4 @@
-"""Faults: the Python exceptions that would end the next attempt of a job as they ended this one, known by type, file and line.
+"""Faults: the Python exceptions that would end the next attempt of a job as they ended this one, known by type, file, line and cause.
 
 Memory, signals, hosts, volumes, networks, GPUs and collectives fail by chance or because something else did: their exceptions are no faults.
 """
@@ -11,8 +11,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-_LONGEST_NAME, _LONGEST_FILE = 128, 512
-"""Characters that are kept of a type's name and of a file's path, the ends of both."""
+_LONGEST_NAME, _LONGEST_FILE, _LONGEST_CAUSE = 128, 512, 256
+"""Characters that are kept: of a type's name and of a file's path the last ones, of a cause the first ones."""
 _CHAINED = re.compile(
     r"^(?:During handling of the above exception, another exception occurred|"
     r"The above exception was the direct cause of the following exception):$",
@@ -54,17 +54,21 @@ class Fault:
     file: str
     """Path of the file that raised it, relative to the rank's directory if it lies there."""
     line: int
+    cause: str = ""
+    """Distinguishes exceptions that one line raises for unlike reasons, such as the reward term that is not finite. Without numbers
+    that differ between attempts; empty as a rule."""
 
     def __str__(self) -> str:
-        return f"{self.type} in {self.file}, line {self.line}"
+        return f"{self.type} in {self.file}, line {self.line}" + (f" ({self.cause})" if self.cause else "")
 
 
-def fault_in(text: str, directory: Path | None = None) -> Fault | None:
+def fault_in(text: str, directory: Path | None = None, cause: str = "") -> Fault | None:
     """The fault in a traceback, as Python prints it; None for an exception that another attempt may not meet, or without a traceback.
 
     Args:
         text: Ends with the traceback. Exceptions that led to it, also printed, must be faults too.
         directory: The rank's working directory; None: that of this process.
+        cause: :attr:`Fault.cause`, which no traceback shows.
     """
     fault, above = None, f"{directory or _here()}/"
     for part in reversed(_CHAINED.split(text)):
@@ -73,7 +77,7 @@ def fault_in(text: str, directory: Path | None = None) -> Fault | None:
         name, message, file, line = found
         if _is_from_outside(name, message, file):
             return None
-        fault = fault or _bounded(Fault(name, file.removeprefix(above), line))
+        fault = fault or _bounded(Fault(name, file.removeprefix(above), line, cause))
     return fault
 
 
@@ -84,7 +88,8 @@ def fault_from(value: object) -> Fault | None:
     if not isinstance(value, dict):
         raise TypeError("a fault is a mapping")
     fault = Fault(**value)
-    if not isinstance(fault.type, str) or not isinstance(fault.file, str) or type(fault.line) is not int:
+    texts = (fault.type, fault.file, fault.cause)
+    if not all(isinstance(text, str) for text in texts) or type(fault.line) is not int:
         raise TypeError("a field of a fault is of the wrong type")
     if not 0 <= fault.line < 2**31:
         raise TypeError("a fault is in a line that no file has")
@@ -92,7 +97,7 @@ def fault_from(value: object) -> Fault | None:
 
 
 def _bounded(fault: Fault) -> Fault:
-    return Fault(fault.type[-_LONGEST_NAME:], fault.file[-_LONGEST_FILE:], fault.line)
+    return Fault(fault.type[-_LONGEST_NAME:], fault.file[-_LONGEST_FILE:], fault.line, fault.cause[:_LONGEST_CAUSE])
 
 
 def _here() -> str:

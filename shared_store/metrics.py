@@ -33,6 +33,8 @@ _SECTIONS = {
     "learn_seconds": "speed/learn_seconds",
     "iteration_seconds": "speed/iteration_seconds",
 }
+THIS_RUN = "RUN@"
+"""Begins a checkpoint's reference in a record's warnings, since records do not depend on the run's name; :func:`warnings_of` puts it in."""
 _NAME = re.compile(r"metrics-e([0-9]{1,18})\.jsonl")
 _KEPT = 32 << 20
 """Bytes of records that wait for room on the volume; later ones are lost."""
@@ -98,10 +100,11 @@ def finite(value: Any) -> float | None:
     return float(value) if is_number else None
 
 
-def warnings_of(record: Mapping[str, Any]) -> list[str]:
-    """What a record says against its training; a job may have written anything into it."""
+def warnings_of(record: Mapping[str, Any], run: str) -> list[str]:
+    """What a record says against its training, with the name of its ``run``; a job may have written anything into it."""
     found = record.get("warnings")
-    return [text for text in found if isinstance(text, str)] if isinstance(found, list) else []
+    texts = [text for text in found if isinstance(text, str)] if isinstance(found, list) else []
+    return [text.replace(THIS_RUN, f"{run}@") for text in texts]
 
 
 def scalars(record: Mapping[str, Any]) -> dict[str, float]:

@@ -219,7 +219,7 @@ def _clear_leftovers(store: Store, registrar: str) -> None:
 def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> dict[str, Any]:
     """The origin of a policy, and its known scores."""
     description = run.description() or {}
-    judged = (read_json(run.exports / checkpoint.name / bundles.REPORT) or {}).get("judged")
+    report = read_json(run.exports / checkpoint.name / bundles.REPORT) or {}
     return {
         "run": run.name,
         "checkpoint": checkpoint.name,
@@ -232,6 +232,7 @@ def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> d
         "bundle": manifest.get("digest"),
         "score": manifest.get("score"),
         "evaluations": [each for each in list_evaluations(run) if each.get("checkpoint") == checkpoint.name],
-        "judged": judged,
+        "judged": report.get("judged"),
+        "changed_robot": report.get("changed_robot"),
         "registered": time.time(),
     }

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from shared_store.policy_contract import LARGEST, Action, Contract, Group
+from shared_store.policy_contract import LARGEST, Action, Contract, Group, RobotModel
 
 CLOSE = 1e-6
 """Relative difference up to which two numbers count as equal: recompiling a model rounds."""
@@ -39,11 +39,11 @@ def differences(before: Contract, now: Contract, *, ranges: bool = False) -> lis
     return lines
 
 
-def robot_changes(before: Contract, now: Contract) -> list[str]:
-    """The robots that load otherwise than in a policy's training, one line each; empty if the contract of then knows none."""
-    there = {robot.name: robot for robot in before.robots}
+def robot_changes(before: Sequence[RobotModel], now: Sequence[RobotModel]) -> list[str]:
+    """The robots that load otherwise now than before, one line each; those that only one side knows don't count."""
+    there = {robot.name: robot for robot in before}
     lines = []
-    for robot in now.robots:
+    for robot in now:
         then = there.get(robot.name)
         if then is None or then.digest == robot.digest:
             continue
@@ -53,8 +53,25 @@ def robot_changes(before: Contract, now: Contract) -> list[str]:
             ("actuators", then.actuators, robot.actuators),
         )
         changed = [f"{what} {old:g} became {new:g}" for what, old, new in pairs if old != new]
-        lines.append(f"{robot.name}: {', '.join(changed) or 'the values of its compiled model changed'}")
+        changed += _element_changes(then, robot)
+        lines.append(f"{robot.name}: {brief(changed, 4) or 'other values of its compiled model changed'}")
     return lines
+
+
+def _element_changes(before: RobotModel, now: RobotModel) -> Iterator[str]:
+    """The bodies, joints and actuators that changed, as far as contracts name their values."""
+    old, new = before.elements, now.elements
+    known = {name.partition(" ")[0] for name in old} & {name.partition(" ")[0] for name in new}
+    for element in {**old, **new}:
+        if element.partition(" ")[0] not in known:
+            continue  # read from another kind of file, or by an older Muster
+        if (element in old) != (element in new):
+            yield f"{element} is {'new' if element in new else 'gone'}"
+            continue
+        for name in {**old[element], **new[element]}:
+            pair = old[element].get(name, 0.0), new[element].get(name, 0.0)
+            if not _same(*pair):
+                yield f"{element}: {name} {pair[0]:g} became {pair[1]:g}"
 
 
 def brief(lines: Sequence[str], most: int = 5) -> str:

@@ -221,6 +221,9 @@ class RobotModel(_Part):
     """Number of joints, a free root among them."""
     actuators: int
     """Number of actuators in the file."""
+    elements: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
+    """By kind and name, such as ``body pole``, the values of each body, joint and actuator by which a change is named, in SI units;
+    those that are 0 are left out. Empty: unknown."""
 
 
 @dataclass(frozen=True)

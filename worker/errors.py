@@ -12,7 +12,16 @@ class GangError(Exception):
 
 
 class TrainingError(Exception):
-    """Training can't go on (the loss is not finite, …)."""
+    """Training can't go on (the loss is not finite, …).
+
+    Args:
+        message: The error.
+        cause: As :attr:`shared_store.faults.Fault.cause`.
+    """
+
+    def __init__(self, message: str, cause: str = "") -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -32,15 +33,18 @@ def export(
         UserError: The task's observations or actions mean something else by now, or its robot changed.
     """
     from worker.deploy import bundle
-    from worker.learning.setup import check_contract
+    from worker.learning.setup import check_contract, contract_from
     from worker.learning.trained import load_policy
     from worker.tasks.policy_contract import policy_contract
 
-    check_contract(checkpoint, task, section)
+    changes = check_contract(checkpoint, task, section)
     policy = load_policy(checkpoint)
     acting = policy if task.device == "cpu" else load_policy(checkpoint, task.device)
     contract = policy_contract(task, checkpoint.manifest["task"], policy.module())
-    return bundle.export(run, checkpoint, task, (policy, acting), contract, rounds)
+    if changes:  # the contract of a policy holds the robots of its training
+        then = contract_from(checkpoint.manifest, checkpoint.name)
+        contract = replace(contract, robots=then.robots if then else ())
+    return bundle.export(run, checkpoint, task, (policy, acting), contract, rounds, changes)
 
 
 def main() -> int:

@@ -10,10 +10,14 @@ from __future__ import annotations
 import argparse
 import pickle
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from shared_store.policy_changes import brief, robot_changes
+from shared_store.policy_contract import RobotModel
 from shared_store.wording import counted
+from worker.accepting import CHANGED_ROBOTS
 from worker.errors import UserError
 from worker.learning.job import EX_ERROR, configure, run_command, user_errors
 
@@ -41,6 +45,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
         raise UserError(f"{path} holds no incident of a training") from error
     if Path(content["directory"]).is_dir():
         sys.path.append(content["directory"])  # where a task of the user's own was found
+    CHANGED_ROBOTS.set(bool(section.get("accept_changed_robot")))
     with user_errors(str(path)):
         task_type = find_task(section["task"])
         if warp := sys.modules.get("warp"):
@@ -52,6 +57,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
             first_world=content["first_world"],
             device=device,
         )
+        _compare_robots(content.get("robots", ()), task)
         state, own = content["state"], task.state_tensors().get("world_factors")
         if own is not None and torch.allclose(state["world_factors"], own.cpu(), rtol=1e-5):
             state["world_factors"] = own.cpu()  # drawn anew, on another device with other last digits
@@ -60,6 +66,17 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
     task.begin_iteration(*content["began"])
     task.clear_statistics()
     return task, content
+
+
+def _compare_robots(then: Sequence[Mapping[str, Any]], task: Task) -> None:
+    """Print which robots load otherwise than in the training; files of older versions know none."""
+    from worker.tasks.policy_contract import robots_of
+
+    if lines := robot_changes([RobotModel(**each) for each in then], robots_of(task)):
+        print(
+            f"warning: it happened to another robot than the file gives now: {brief(lines)}; restore the file",
+            flush=True,
+        )
 
 
 def repeat(path: Path, device: str) -> int:

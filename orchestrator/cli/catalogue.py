@@ -32,7 +32,7 @@ ENTRIES = (
     ),
     Entry("submit", "jobs", _JOBS, "Submit a job to a running controller."),
     Entry("list", "listing", _JOBS, "List jobs, the newest first."),
-    Entry("show", "jobs", _JOBS, "Show a job: its state and the reason, its attempts and nodes, its run and results."),
+    Entry("show", "show", _JOBS, "Show a job: its state and the reason, its attempts and nodes, its run and results."),
     Entry("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
     Entry("stop", "jobs", _JOBS, "Stop a job: it checkpoints and exits; `muster resume` continues from there."),
     Entry("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),

@@ -8,7 +8,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from orchestrator.cli.jobs import COLOURS, JsonOption, took, when
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.show import COLOURS, took, when
 from orchestrator.cli.terminal import echo, echo_json, one_line, print_cut
 from orchestrator.client import Client
 from orchestrator.spec.evaluations import AUTOMATIC_TAG

@@ -12,16 +12,17 @@ from rich.table import Table
 
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
-from orchestrator.cli.jobs import JsonOption, scored
+from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.serving import StoreOption, controller
+from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
 from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
 from shared_store.evaluations import in_one_line, told_changes
-from shared_store.policy_changes import differences
+from shared_store.policy_changes import differences, robot_changes
 from shared_store.policy_contract import read
 from shared_store.wording import counted
 
@@ -113,6 +114,8 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
         echo(
             f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {counted(judged['episodes'], 'episode')}"
         )
+    if found.get("changed_robot"):
+        echo(f"  robot:       {found['changed_robot']}; the bundle was made and judged with that file")
     versions = ", ".join(f"{name} {version}" for name, version in (found.get("made_with") or {}).items())
     echo(f"  made with:   {versions or 'not known'}")
     echo(f"  registered:  {_when(found.get('registered'))} by {found.get('registered_by')}")
@@ -142,9 +145,10 @@ def diff(
     else:
         before, now = now, _read(other, store)
     try:
-        lines = differences(read(before.get("contract")), read(now.get("contract")), ranges=True)
+        old, new = (read(each.get("contract")) for each in (before, now))
     except DocumentError as error:
         raise UsageError(str(error)) from None
+    lines = [*differences(old, new, ranges=True), *robot_changes(old.robots, new.robots)]
     for section in ("task", "algorithm", "train", "settings", "made_with", "code"):
         lines += _changed(section, before.get(section), now.get(section))
     if weights := _weights(before, now):

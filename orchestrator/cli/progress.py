@@ -218,7 +218,7 @@ class _Display:
 
     def __init__(self, detail: dict[str, Any]) -> None:
         self.total = int(detail["spec"]["train"]["iterations"])
-        self.nodes = int(detail["nodes"])
+        self.nodes, self.run = int(detail["nodes"]), str(detail["run"])
         self.name = f"{detail['name']} ({detail['id'][:8]})"
         self._first: tuple[float, int] | None = None
         self.started = time.monotonic()
@@ -275,7 +275,7 @@ class _Bar(_Display):
             text = (
                 f"{iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
                 f"{values['rate']} steps/s  ETA {self.eta(record)}  {counted(self.nodes, 'node')}"
-            ) + "".join(f"  warning: {one_line(each)}" for each in warnings_of(record))
+            ) + "".join(f"  warning: {one_line(each)}" for each in warnings_of(record, self.run))
             self._progress.update(self._task, completed=iteration, text=text)
         elif task.completed == 0 or job["status"] not in ("RUNNING", *TERMINAL):
             self._progress.update(self._task, text=self.state(job))
@@ -317,6 +317,6 @@ class _Lines(_Display):
             f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
             f"steps/s {values['rate']}  ETA {self.eta(self._latest)}  nodes {self.nodes}"
         )
-        for each in warnings_of(self._latest):
+        for each in warnings_of(self._latest, self.run):
             echo(f"warning: {one_line(each)}")
         self._latest, self._printed = None, time.monotonic()

@@ -97,7 +97,7 @@ def _print(found: dict[str, Any], compare: bool) -> None:
         ],
     )
     _table(
-        "SENSORS of the file (a task declares its own)",
+        "SENSORS of the file (tasks declare sensors themselves)",
         ("NAME", "KIND"),
         [(each["name"], each["kind"]) for each in found["sensors"]],
     )

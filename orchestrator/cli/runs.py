@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, scored
+from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue
 from orchestrator.cli.progress import follow
+from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.spec.kept_files import changes_with_files

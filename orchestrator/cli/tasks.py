@@ -43,6 +43,8 @@ def tasks(
     console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for kind in ("observations", "actions"):
         console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", markup=False)
+    if robots := found[0]["robots"]:
+        console.print("\nROBOTS\n" + "\n".join(robots), markup=False)
     for section, rows in found[0].get("tables", {}).items():
         echo("")
         _print(_terms(section, rows))

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from orchestrator.cli.jobs import AcceptOption
 from orchestrator.cli.recordings import checkpoint_of, run_worker, source_of
 from orchestrator.cli.serving import CpusOption, StoreOption, controller
 from orchestrator.domain.errors import ServerError, UsageError
@@ -59,6 +60,7 @@ def view(
             help="Memory for data kept for pages opened later, such as 256MB or 1GB; beyond it the oldest data goes."
         ),
     ] = "256MB",
+    accept_changed_robot: AcceptOption = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
@@ -96,6 +98,7 @@ def view(
             raise typer.Exit(run_worker("worker.telemetry.view", "--training", run["path"], "--job", live, *given))
         given += ["--checkpoint", str(checkpoint_of(client, run, source))]
         given += ["--episodes", str(episodes)] if episodes is not None else []
+        given += ["--accept-changed-robot"] if accept_changed_robot else []
         raise typer.Exit(run_worker("worker.telemetry.view", "--policy", run["path"], *given))
 
 

@@ -31,6 +31,7 @@ from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.queries import short_id
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
+from shared_store.learning import LEARNING
 from shared_store.metrics import history_of, sampled
 
 router, _stored = page_router(), page_router(stored=True)
@@ -78,6 +79,7 @@ def job(request: Request, reference: str) -> Response:
         array=array,
         has_run=is_visible,
         trains=bool(spec.get("train")),
+        learning={each.name: each.label for each in LEARNING},
         container=_container(spec),
         nodes=range(detail["nodes"]),
         configuration=written(spec) if spec else "",

@@ -67,8 +67,9 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         )
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
-    told = runs.resume(reconciler_of(request), run, Changes(iteration, _changes(form), directory))
-    return done(request, f"/jobs/{told['jobId']}", f"resumed {run.name} from iteration {told['iteration']}")
+    changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepted(form) else []))
+    answer = runs.resume(reconciler_of(request), run, Changes(iteration, changes, directory))
+    return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
 
 
 @_stored.post("/jobs/{reference}/clone")
@@ -85,7 +86,9 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
 def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that evaluates a checkpoint."""
     run, directory = _run(request, reference, Operation.READ_RUN)
-    document = evaluation_document(run.name, _trained(request, run), {"checkpoint": _iteration(run, form)})
+    document = evaluation_document(
+        run.name, _trained(request, run), {"checkpoint": _iteration(run, form), **_accepted(form)}
+    )
     return _submitted(request, document, directory, f"evaluation of {run.name}")
 
 
@@ -120,7 +123,7 @@ def _beside(request: Request, reference: str, form: Form, kind: str) -> Response
         **kept,
         "name": f"{kind}-{run.name}".replace(".", "-")[:100],
         "resources": {"cpus": 1, "memory": "2GiB"},
-        kind: {"run": run.name, "checkpoint": _iteration(run, form)},
+        kind: {"run": run.name, "checkpoint": _iteration(run, form), **_accepted(form)},
     }
     return _submitted(request, document, directory, f"{kind} of {run.name}")
 
@@ -176,6 +179,11 @@ def _iteration(run: Run, form: Form) -> int:
     if chosen is None:
         raise ClientError(f"run {run.name} has no checkpoint yet; train it first")
     return chosen.iteration
+
+
+def _accepted(form: Form) -> dict[str, bool]:
+    """The key of a job's section that accepts a changed robot, if that is marked."""
+    return {"accept_changed_robot": True} if form.one("accept_changed_robot") else {}
 
 
 def _changes(form: Form) -> tuple[str, ...]:

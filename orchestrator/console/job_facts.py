@@ -18,6 +18,7 @@ from orchestrator.persistence.ownership import born_at
 from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
 from shared_store.evaluations import by_checkpoint
 from shared_store.layout import Run
+from shared_store.learning import in_words
 from shared_store.metrics import finite, warnings_of
 from shared_store.wording import counted
 
@@ -56,7 +57,8 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "reward": words.count(last.get("reward")),
         "score": _with_error(last.get("score"), last.get("score_error")),
         "straggler": _straggler(last),
-        "warning": "; ".join(warnings_of(last)),
+        "learning": in_words(last),
+        "warning": "; ".join(warnings_of(last, detail["run"])),
         "reported": words.moment(last["time"] * 1000)
         if not is_over and isinstance(last.get("time"), int | float)
         else "",

@@ -45,6 +45,7 @@ def model(
         "Run": f"{found.get('run')}@{found.get('iteration')}",
         "Score": _number(found.get("score")),
         "Return of the bundle": _number(((found.get("judged") or {}).get("bundle") or {}).get("mean_return")),
+        "Robot": found.get("changed_robot"),
         "Made with": ", ".join(f"{key} {value}" for key, value in (found.get("made_with") or {}).items()),
         "Registered by": found.get("registered_by"),
         "Queue": found.get("queue"),

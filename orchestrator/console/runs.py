@@ -20,7 +20,8 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
 from shared_store.evaluations import told_changes
-from shared_store.metrics import finite
+from shared_store.learning import LEARNING, in_words
+from shared_store.metrics import finite, warnings_of
 
 router = page_router(stored=True)
 
@@ -33,15 +34,7 @@ METRICS = (
     "episode_length",
     "success",
     "steps_per_second",
-    "kl",
-    "entropy",
-    "learning_rate",
-    "action_std",
-    "explained_variance",
-    "saturation",
-    "clip_fraction",
-    "gradient_norm",
-    "v_max_mass",
+    *(metric.name for metric in LEARNING),
 )
 """Metrics that the page of a run draws, where the run has them; the page of its job has all."""
 _listed = Recent(_INTERVAL * 0.9)
@@ -90,6 +83,7 @@ def run(request: Request, name: str) -> Response:
         parent=described["parent"] or {},
         tables={key: list(rows.values()) for key, rows in tables.items()},
         blanks={key: of({}) for key, of in _TABLES.items()},
+        progress=_progress(name, metrics),
         metrics=[each for each in METRICS if isinstance(metrics.get(each), int | float)],
         path=f"/runs/{quote(name, safe='')}",
         compare=_comparison(described),
@@ -106,10 +100,10 @@ def run_stream(request: Request, name: str) -> Response:
     def changes() -> Sequence[Event]:
         _, tables = _read_run(request, name)
         found = [event for key, rows in tables.items() for event in known[key].changes(rows, {})]
-        iteration = (last_metrics(reconciler.store.run(name)) or {}).get("iteration", 0)
-        if iteration != before[0]:
+        metrics = last_metrics(reconciler.store.run(name)) or {}
+        if (iteration := metrics.get("iteration", 0)) != before[0]:
             before[0] = iteration
-            found.append(Event("changed", {"iteration": iteration}))
+            found.append(Event("changed", {"iteration": iteration, **_progress(name, metrics)}))
         return found
 
     return stream(request, changes, stored=True)
@@ -167,6 +161,11 @@ def _train(run: Mapping[str, Any]) -> Mapping[str, Any]:
     """The ``train`` section of a run's spec; empty where there is none, since a store may hold anything."""
     train = (run.get("spec") or {}).get("train")
     return train if isinstance(train, Mapping) else {}
+
+
+def _progress(run: str, metrics: Mapping[str, Any]) -> dict[str, str]:
+    """The texts of the page that change with each iteration, from its record."""
+    return {"learning": in_words(metrics), "warning": "; ".join(warnings_of(metrics, run))}
 
 
 def _judged(run: Mapping[str, Any]) -> str:

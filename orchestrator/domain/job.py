@@ -83,7 +83,7 @@ class NodeEnd:
     asked: bool | None = False
     """The node was told to end: the cause lies elsewhere. None: that is not known."""
     fault: str | None = None
-    """Type, file and line of the Python exception that ended it, if another attempt would meet that, too."""
+    """Type, file, line and cause of the Python exception that ended it, if another attempt would meet that, too."""
 
     def __post_init__(self) -> None:
         object.__setattr__(

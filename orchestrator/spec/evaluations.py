@@ -74,7 +74,14 @@ def automatic_evaluation(
 
     ``place``: as :func:`place_of` says; ``iteration``: the checkpoint's.
     """
-    section = {"checkpoint": iteration, "episodes": wanted.episodes, "worlds": wanted.worlds, "keep": False}
+    section: dict[str, Any] = {
+        "checkpoint": iteration,
+        "episodes": wanted.episodes,
+        "worlds": wanted.worlds,
+        "keep": False,
+    }
+    if (trained.get("train") or {}).get("accept_changed_robot"):
+        section["accept_changed_robot"] = True
     document = evaluation_document(run, {**trained, "queue": None, "share": None}, section)
     if wanted.resources is not None:
         document["resources"] = wanted.resources.model_dump()

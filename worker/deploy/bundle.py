@@ -125,7 +125,13 @@ def bundle_files(
 
 
 def export(
-    run: Run, checkpoint: Checkpoint, task: Task, policies: tuple[Policy, Policy], contract: Contract, rounds: int = 1
+    run: Run,
+    checkpoint: Checkpoint,
+    task: Task,
+    policies: tuple[Policy, Policy],
+    contract: Contract,
+    rounds: int = 1,
+    changes: str = "",
 ) -> Path:
     """Write the bundle of a checkpoint to ``exports/<its name>/``, as a whole or not at all; returns that directory.
 
@@ -136,6 +142,7 @@ def export(
         policies: Its policy on the CPU, and on the task's device.
         contract: Its contract, with the policy's inputs and states.
         rounds: Episodes of each world on which the bundle is judged; 0: it is not.
+        changes: The accepted changes of the task's robots since the training, in a sentence; empty without any.
 
     Raises:
         TrainingError: A file computes something else than the policy, or does worse on the task's worlds; nothing is published then.
@@ -160,7 +167,7 @@ def export(
             "runtime": f"onnxruntime {metadata.version('onnxruntime')}",
             **rollouts.judge(trained, played),
         }
-    return _publish(run, checkpoint, task, contract, files, report)
+    return _publish(run, checkpoint, task, contract, files, {**report, "changed_robot": changes or None})
 
 
 def _publish(

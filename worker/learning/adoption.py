@@ -11,7 +11,7 @@ import torch
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.files import DamagedFile
 from shared_store.parent import parent_checkpoint
-from shared_store.policy_changes import brief, differences
+from shared_store.policy_changes import brief, differences, robot_changes
 from shared_store.settings import first_difference, fixed_settings, innermost
 from worker.distributed import Gang
 from worker.errors import UserError
@@ -63,8 +63,13 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
             f"the weights of checkpoint {name} do not fit this job: {why}{_others(checkpoint.manifest, here)}"
         ) from error
     then, now = (contract_from(facts, checkpoint.name) for facts in (checkpoint.manifest, here))
-    if gang.is_main and then and now and (lines := differences(then, now, ranges=True)):
-        print(f"warning: the weights were learnt with another policy contract: {brief(lines)}", flush=True)
+    if gang.is_main and then and now:
+        if lines := differences(then, now, ranges=True):
+            print(f"warning: the weights were learnt with another policy contract: {brief(lines)}", flush=True)
+        if lines := robot_changes(then.robots, now.robots):
+            print(
+                f"warning: the weights were learnt on another robot than the file gives now: {brief(lines)}", flush=True
+            )
     return checkpoint
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from shared_store.files import write_atomic
+from worker.tasks.policy_contract import robots_of
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import Share
@@ -22,7 +24,7 @@ class Incident:
 
     def __init__(self, task: Task, share: Share, steps: int, section: dict[str, Any], seed: int) -> None:
         self._share, self._section, self._seed = share, section, seed
-        self._live = task.state_tensors()
+        self._live, self._robots = task.state_tensors(), robots_of(task)
         self._kept = {name: tensor.clone() for name, tensor in self._live.items()}
         self._actions = torch.zeros(steps, *task.actions.shape, device=task.device)
         self._began: tuple[int, float | None, float | None] = (0, None, None)
@@ -58,6 +60,7 @@ class Incident:
             "seed": self._seed,
             "first_world": share.first,
             "worlds": share.count,
+            "robots": [asdict(robot) for robot in self._robots],
             "state": {name: tensor.cpu() for name, tensor in self._kept.items()},
             "actions": self._actions.cpu(),
         }

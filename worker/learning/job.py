@@ -197,7 +197,7 @@ def run_command(body: Callable[[], int]) -> None:
         print(getattr(error.__cause__, "trace", ""), end="", file=sys.stderr, flush=True)  # of a TaskMistake
         code = _fail(str(error), EX_USAGE)
     except (GangError, TrainingError, StaleEpoch, DamagedCheckpoint) as error:
-        code = _fail(str(error), EX_ERROR)
+        code = _fail(str(error), EX_ERROR, getattr(error, "cause", ""))
     except Exception as error:
         trace = traceback.format_exc()
         print(trace, file=sys.stderr, flush=True)
@@ -209,27 +209,28 @@ def run_command(body: Callable[[], int]) -> None:
     os._exit(code)
 
 
-def _fail(message: str, code: int) -> int:
+def _fail(message: str, code: int, cause: str = "") -> int:
     """Report the exception that is being handled in one line; returns ``code``."""
     print(f"error: {message}", file=sys.stderr, flush=True)
-    _write_error_file(message, "", traceback.format_exc())
+    _write_error_file(message, "", traceback.format_exc(), cause)
     return code
 
 
-def _write_error_file(message: str, shown: str, trace: str) -> None:
+def _write_error_file(message: str, shown: str, trace: str, cause: str = "") -> None:
     """Write the file of ``torch.distributed.elastic``'s ``@record``, without importing it.
 
     Args:
         message: The error.
         shown: The traceback for people, empty for an error that says all in one line.
         trace: The traceback with its place.
+        cause: As :attr:`shared_store.faults.Fault.cause`.
     """
     path = os.environ.get("TORCHELASTIC_ERROR_FILE")
     if not path:
         return
     now = time.time()
     # torch writes whole seconds; "time" is ours, to tell the first failure of a gang from those that it caused, and so is "fault"
-    fault = fault_in(trace)
+    fault = fault_in(trace, cause=cause)
     extra = {
         "py_callstack": shown,
         "timestamp": str(int(now)),

@@ -257,11 +257,11 @@ class Loop:
             self._judge_resets(int(record["nan_worlds"]), totals["mishap"])
         return record | learnt | straggler(totals["collected"]), signals
 
-    def _failure(self, what: str, hint: str) -> TrainingError:
-        """Build the error that ends training. Every rank must call it."""
+    def _failure(self, what: str, hint: str, cause: str = "") -> TrainingError:
+        """Build the error that ends training, for an unlike reason with an unlike ``cause``. Every rank must call it."""
         self.tell_saved(self.state.finish())
         last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
-        return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
+        return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}", cause)
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
         """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError if they are too many."""
@@ -290,16 +290,17 @@ class Loop:
         raise self._failure(
             f"{said}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
             f"See it happen again: python -m worker.repeat_incident {files[rank]}{where}{problem}",
+            cause,
         )
 
     def _begin_iteration(self, iteration: int) -> None:
         """Tell the task which iteration begins, since its curriculum may depend on it, and what the other ranks have counted."""
-        told = iteration, self.state.progress.reward, self.state.progress.episode_length
+        now = iteration, self.state.progress.reward, self.state.progress.episode_length
         own = self.task.own_counts() if self.gang.size > 1 else {}
         others = {name: self.gang.sum(counts.clone()) - counts for name, counts in own.items()}
-        self.incident.begin(*told, others)
+        self.incident.begin(*now, others)
         self.task.take_counts(others)
-        self.task.begin_iteration(*told)
+        self.task.begin_iteration(*now)
 
     def _signals(self) -> dict[str, float]:
         """This rank's :data:`SIGNALS`."""

@@ -157,17 +157,17 @@ class PlainPPO:
             torch.zeros((), device=device),
         )
         for rows in orders.flatten(1):
-            loss, told, beyond = self._loss({name: tensor[rows] for name, tensor in samples.items()}, old_deviation)
+            loss, parts, beyond = self._loss({name: tensor[rows] for name, tensor in samples.items()}, old_deviation)
             self.optimizer.zero_grad()
             (weight * loss).backward()
             for parameter in self.parameters:
                 assert parameter.grad is not None
                 self.gang.sum(parameter.grad)
-            told = self.gang.sum(weight * told)
-            sums += told
+            parts = self.gang.sum(weight * parts)
+            sums += parts
             clipped += weight * beyond
             if config.schedule == "adaptive":
-                self.rate = self._adapted_rate(kl=float(told[3]))
+                self.rate = self._adapted_rate(kl=float(parts[3]))
             found = [
                 nn.utils.clip_grad_norm_(each.parameters(), config.max_grad_norm) for each in (self.actor, self.critic)
             ]

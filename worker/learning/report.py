@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from shared_store.metrics import MetricsWriter, sampled, scalars
+from shared_store.learning import in_log
+from shared_store.metrics import MetricsWriter, sampled, scalars, warnings_of
 from worker.learning.watch import HISTORY, Watch
 
 if TYPE_CHECKING:
@@ -97,8 +98,7 @@ class Report:
             return SummaryWriter(str(directory), purge_step=first, filename_suffix=f".e{job.epoch}", flush_secs=10)
 
         self._run = job.run.name
-        # records are the same whatever the run is called
-        self._watch = Watch("RUN", self._iterations, getattr(training, "settings", None))
+        self._watch = Watch(self._iterations, getattr(training, "settings", None))
         with suppress(OSError):  # without them it begins anew
             earlier = sampled(job.run, HISTORY) if resumed_from else []
             self._watch.follow(record for record in earlier if record["iteration"] <= resumed_from)
@@ -116,7 +116,7 @@ class Report:
         print(
             f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
             f"length {_text(record['episode_length'], '.1f')}  {_shown(record)}steps/s {record['steps_per_second']:.0f}  "
-            f"{_learnt(record)}{mishaps}{_slow(record)}",
+            f"{in_log(record)}{mishaps}{_slow(record)}",
             flush=True,
         )
         if record["iteration"] == self._rated_at and (warning := self._long(record)):
@@ -127,7 +127,7 @@ class Report:
         }
         if warnings := self._watch.look(finite):
             finite["warnings"] = warnings
-        self._warn(warnings)
+        self._warn(warnings_of(finite, self._run))
         failures = list[OSError]()
         for write in (self._write_record, self._write_events):
             try:
@@ -146,7 +146,7 @@ class Report:
             kind = text.partition(":")[0]
             if kind not in self._warned_of:
                 self._warned_of.add(kind)
-                print(f"warning: {text.replace('RUN@', f'{self._run}@')}", flush=True)
+                print(f"warning: {text}", flush=True)
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         self._metrics.write({**record, "time": time.time()})
@@ -211,23 +211,6 @@ def shown_of(figures: Mapping[str, float | None], metrics: Mapping[str, str]) ->
 
 def _shown(record: Mapping[str, Any]) -> str:
     return "".join(f"{name} {text}  " for name, text in record.get("shown", {}).items())
-
-
-def _learnt(record: dict[str, float | int | None]) -> str:
-    """The most telling learning metrics among those of the algorithm."""
-    shown = {
-        "learning_rate": ("lr", ".1e"),
-        "kl": ("kl", ".3f"),
-        "temperature": ("temperature", ".1e"),
-        "q_mean": ("q", ".2f"),
-        "v_max_mass": ("at v_max", ".2f"),
-        "action_std": ("std", ".2g"),
-        "explained_variance": ("explained", ".2f"),
-        "saturation": ("saturated", ".2f"),
-        "clip_fraction": ("clipped", ".2f"),
-        "gradient_norm": ("gradient", ".2g"),
-    }
-    return "  ".join(f"{word} {_text(record[name], form)}" for name, (word, form) in shown.items() if name in record)
 
 
 def _slow(record: dict[str, float | int | None]) -> str:

@@ -25,7 +25,7 @@ from worker.learning.job import Job, user_errors
 from worker.simulation.robot_values import shown_value
 from worker.tasks.adapting import begin_evaluation
 from worker.tasks.mistakes import task_mistakes
-from worker.tasks.policy_contract import policy_contract, readings_of, same_policy
+from worker.tasks.policy_contract import policy_contract, readings_of, robots_of, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -189,7 +189,7 @@ def begin_as_trained(task: Task, checkpoint: Checkpoint) -> None:
     begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
 
 
-def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool) -> str:
+def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) -> str:
     """Compare the task's robots with those of a policy's training.
 
     A contract of an older Muster knows no robots. Then a robot changed if Newton's importer, which nothing judged, reads it otherwise.
@@ -197,7 +197,7 @@ def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool)
     Args:
         then: The policy's contract; None: of an older Muster.
         task: Its task, as it is now.
-        whose: What the contract is of: ``"checkpoint 00000100-e1"``.
+        of: The owner of the contract: ``"checkpoint 00000100-e1"``.
         accept: Whether changed robots are accepted.
 
     Returns:
@@ -207,7 +207,7 @@ def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool)
         UserError: A robot changed, and that is not accepted.
     """
     if then is not None and then.robots:
-        lines = robot_changes(then, policy_contract(task, then.task))
+        lines = robot_changes(then.robots, robots_of(task))
     else:
         changed = {
             name: [each for each in reading.corrected if not each.is_rounding]
@@ -216,7 +216,7 @@ def check_robots(then: Contract | None, task: Task, whose: str, *, accept: bool)
         lines = [f"{name}: {_before(differences)}" for name, differences in changed.items() if differences]
     if not lines:
         return ""
-    what = f"{whose} was trained on another robot than the file gives now: {brief(lines)}"
+    what = f"{of} was trained on another robot than the file gives now: {brief(lines)}"
     if not accept:
         raise UserError(
             f"{what}; to go on all the same, add --accept-changed-robot (accept_changed_robot: true in a job's section)"
@@ -230,7 +230,7 @@ def _before(found: Sequence[Difference]) -> str:
     return f"{first.element}: {first.field} was {was}, is {is_now}" + (f" ({more} more)" if more else "")
 
 
-def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any]) -> None:
+def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any]) -> str:
     """Check that a checkpoint's policy can act in the task as it is now.
 
     For a checkpoint without a contract, only sizes are compared.
@@ -240,13 +240,16 @@ def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any
         task: Its task, with worlds.
         section: The job's section, which may accept a changed robot.
 
+    Returns:
+        The robots' changes that are accepted and were printed, in a sentence; empty without any.
+
     Raises:
         UserError: The meaning of the task's observations, actions or commands changed since the training, or its robot did.
     """
     facts = checkpoint.manifest
     name, then = facts["task"], contract_from(facts, checkpoint.name)
-    whose = f"checkpoint {checkpoint.name}"
-    if changes := check_robots(then, task, whose, accept=section.get("accept_changed_robot", False)):
+    accept = bool(section.get("accept_changed_robot"))
+    if changes := check_robots(then, task, f"checkpoint {checkpoint.name}", accept=accept):
         print(f"warning: {changes}", flush=True)
     if then:
         now = same_policy(policy_contract(task, name), then)
@@ -258,3 +261,4 @@ def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any
         raise UserError(
             f"checkpoint {checkpoint.name} does not fit task {name} as it is now: it had {had}, it has {has}"
         )
+    return changes

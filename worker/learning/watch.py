@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from shared_store.metrics import THIS_RUN
+
 WINDOW = 20
 """Iterations over which returns are averaged."""
 FALLEN = 0.7
@@ -29,13 +31,12 @@ class Watch:
     """Looks at the records of a run in order.
 
     Args:
-        run: Name of the run.
         iterations: Iteration at which the training ends.
         settings: The algorithm's settings; the target and the limits of an adaptive rate are read from them, where they have these.
     """
 
-    def __init__(self, run: str, iterations: int, settings: Any) -> None:
-        self._run, self._iterations, self._settings = run, iterations, settings
+    def __init__(self, iterations: int, settings: Any) -> None:
+        self._iterations, self._settings = iterations, settings
         self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW)
         self._first: float | None = None
         self._best, self._best_at = -math.inf, 0
@@ -68,7 +69,7 @@ class Watch:
         return sum(count * reward for count, reward in self._window) / sum(count for count, _ in self._window)
 
     def _lost(self, least: float) -> float | None:
-        """The present mean, if it is below ``least`` and below the best by more than its own noise."""
+        """The present mean, if it is below ``least`` and below the best by more than noise."""
         mean = self._mean()
         if mean is None:
             return None
@@ -82,7 +83,7 @@ class Watch:
             return ""
         return (
             f"it unlearns: mean return {mean:.2f}, below {FALLEN:.0%} of its gain for {PATIENCE} iterations; the best was "
-            f"{self._best:.2f} at iteration {self._best_at} ({self._run}@best)"
+            f"{self._best:.2f} at iteration {self._best_at} ({THIS_RUN}best)"
         )
 
     def _ended(self) -> str:
@@ -91,7 +92,7 @@ class Watch:
             return ""
         return (
             f"it ended below its best: mean return {mean:.2f}, and {self._best:.2f} at iteration {self._best_at}; "
-            f"try its best checkpoint: muster evaluate {self._run}@best"
+            f"try its best checkpoint: muster evaluate {THIS_RUN}best"
         )
 
     def _dead(self, record: Mapping[str, Any]) -> str:

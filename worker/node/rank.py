@@ -244,7 +244,7 @@ class Rank:
 
     @property
     def _failed_alone(self) -> bool:
-        """Whether the program itself ended, for a reason of its own."""
+        """Whether the program ended by itself."""
         return not (self.asked or self.overdue or self.stalled or self.stuck or self.signal_name)
 
     def _traceback(self) -> FirstError | None:

@@ -1,7 +1,7 @@
 """Masses as MuJoCo has them: bodies that only carry a joint, and inertias that Newton leaves alone.
 
-MuJoCo lets several joints stand between a body and its parent, each at its own place. Newton has one joint for each body, so all
-but the last of them move a body without mass of its own.
+MuJoCo lets several joints stand between a body and its parent, each at another place. Newton has one joint for each body, so all
+but the last of them move a body without mass.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def keep_inertias(builder: newton.ModelBuilder) -> None:
 
 
 def unload(model: newton.Model, solver: SolverMuJoCo) -> None:
-    """Take the mass from the carriers of a model whose solver was built."""
+    """Take the mass from the carriers of a model, after its solver was built."""
     bodies = [index for index, label in enumerate(model.body_label) if is_carrier(label)]
     if not bodies:
         return

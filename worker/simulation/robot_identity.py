@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+import mujoco
 import newton
 import numpy as np
 
 from shared_store.policy_contract import RobotModel
+from worker.simulation.robot_elements import name_of, short
 from worker.simulation.robot_values import gravity, inertia
 
 _COMPILED = (
@@ -26,6 +28,24 @@ _IMPORTED = (
     "joint_limit_upper joint_armature joint_friction joint_damping shape_type shape_body shape_scale shape_transform"
 )
 """The same of Newton's builder, where it holds another robot than the file, or MuJoCo doesn't compile the file."""
+_NAMED = {
+    "body": (mujoco.mjtObj.mjOBJ_BODY, {"mass": "body_mass"}),
+    "joint": (
+        mujoco.mjtObj.mjOBJ_JOINT,
+        {
+            "range": "jnt_range",
+            "stiffness": "jnt_stiffness",
+            "damping": "dof_damping",
+            "armature": "dof_armature",
+            "frictionloss": "dof_frictionloss",
+        },
+    ),
+    "actuator": (
+        mujoco.mjtObj.mjOBJ_ACTUATOR,
+        {"gear": "actuator_gear", "forcerange": "actuator_forcerange", "ctrlrange": "actuator_ctrlrange"},
+    ),
+}
+"""By kind of element, its values by which a change is named, and their arrays."""
 DIGITS = 5
 """Significant digits of a number that count."""
 RESIDUE = 1e-9
@@ -42,12 +62,40 @@ def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
     if reference is None:
         arrays = {field: getattr(builder, field) for field in _IMPORTED.split()}
         joints, actuators, mass = builder.joint_count, 0, float(sum(builder.body_mass))
+        elements = {
+            f"body {short(label)}": {"mass": _rounded(own)}
+            for label, own in zip(builder.body_label, builder.body_mass, strict=True)
+        }
     else:
         moments = [inertia(reference, body) for body in range(reference.nbody)]
         arrays = {field: getattr(reference, field) for field in _COMPILED.split()}
         arrays |= {"inertia": moments, "gravity": gravity(reference)}
         joints, actuators, mass = reference.njnt, reference.nu, float(reference.body_mass.sum())
-    return RobotModel("", _digest(arrays), float(f"{mass:.6g}"), int(joints), int(actuators))
+        elements = _elements(reference)
+    return RobotModel("", _digest(arrays), float(f"{mass:.6g}"), int(joints), int(actuators), elements)
+
+
+def _elements(model: Any) -> dict[str, dict[str, float]]:
+    """As :attr:`RobotModel.elements`, of a compiled model."""
+    found = {}
+    for word, (kind, fields) in _NAMED.items():
+        for index in range({"body": model.nbody, "joint": model.njnt, "actuator": model.nu}[word]):
+            if (word, index) == ("body", 0):
+                continue  # the world
+            values: dict[str, float] = {}
+            for name, field in fields.items():
+                row = model.jnt_dofadr[index] if field.startswith("dof_") else index
+                numbers = np.atleast_1d(getattr(model, field)[row])
+                places = {1: [""], 2: [" least", " greatest"]}.get(len(numbers)) or [
+                    f" {i}" for i in range(len(numbers))
+                ]
+                values |= {f"{name}{place}": _rounded(value) for place, value in zip(places, numbers, strict=True)}
+            found[f"{word} {name_of(model, kind, index)}"] = {name: value for name, value in values.items() if value}
+    return found
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
 
 
 def _digest(arrays: dict[str, Any]) -> str:

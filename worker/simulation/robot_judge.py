@@ -301,7 +301,7 @@ def _options(twins: Twins) -> Iterator[Difference]:
 
 
 def _accelerations(twins: Twins) -> Iterator[Difference]:
-    """What no field shows: the first joint whose acceleration differs in one of three states, without contacts."""
+    """What no field shows: the first joint with another acceleration in one of three states, without contacts."""
     random = np.random.default_rng(0)
     file, built = twins.free_of_contacts()
     for trial in range(3):

@@ -30,7 +30,7 @@ from worker.simulation.robot_reference import Reference
 from worker.simulation.robot_view import actuator_value
 
 RAW_SOLREF = 1
-"""Newton's mode of a joint whose limit's ``solref`` is passed to MuJoCo unchanged."""
+"""Newton's mode of a joint that passes the ``solref`` of its limit to MuJoCo unchanged."""
 REMEDIES = {
     **dict.fromkeys(
         ("delay", "history"), "Declare the delay in the task, in physics steps: PositionActuator(..., delay=STEPS)"
@@ -73,7 +73,7 @@ class Reading:
     """A robot as its file says.
 
     Attributes:
-        builder: Holds the robot alone, with the actuators of its file, whose inputs are the controls.
+        builder: Holds the robot alone, with the actuators of its file; the controls are their inputs.
         reference: MuJoCo's compiled model of the file; None for a USD file.
         corrected: What Newton's importer had read otherwise, and is right now, or is accepted.
         notes: What else a user should know of it, one sentence each.

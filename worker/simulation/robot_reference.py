@@ -83,10 +83,10 @@ def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
     for body in spec.bodies:
         moments = _moments(body)
         if body.explicitinertial and 2.0 * max(moments) > sum(moments) * (1.0 + 1e-9):
-            given = " ".join(f"{moment:.4g}" for moment in moments)
+            listed = " ".join(f"{moment:.4g}" for moment in moments)
             corrected = " ".join(f"{moment:.4g}" for moment in model.body_inertia[body.id])
             notes.append(
-                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {given}, since one is greater than the sum of the "
+                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {listed}, since one is greater than the sum of the "
                 f"others; they are {corrected} here (MuJoCo's balanceinertia)"
             )
     return model
@@ -196,7 +196,7 @@ def _check_tree(root: ElementTree.Element, shown: str) -> None:
         if link in above:
             raise ValueError(
                 f"{shown}: link {link} closes a loop: the joints {above[link]} and {joint.get('name')} both move it; leave out one "
-                "of them, or use MJCF, whose <equality> can hold the two ends together"
+                "of them, or use MJCF: its <equality> can hold the two ends together"
             )
         above[link] = joint.get("name", "")
 

@@ -125,7 +125,7 @@ class Twins:
         return self._by_name("equality", "neq")
 
     def _by_name(self, kind: str, count: str) -> Pairs:
-        """Elements by their names, given or made, since Newton keeps no order among their kinds; the others in their order."""
+        """Elements by their names, of the file or made, since Newton keeps no order among their kinds; the others in their order."""
         file, built = (
             {index: plain(short(name_of(model, kind_of(kind), index))) for index in range(getattr(model, count))}
             for model in (self.file, self.built)

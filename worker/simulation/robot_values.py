@@ -12,7 +12,7 @@ import numpy as np
 from worker.simulation.robot_elements import word_of
 
 UNLIMITED = 1e6
-"""Newton's effort limit of joints whose file sets none [N, N m]."""
+"""Newton's effort limit of joints without one in their file [N, N m]."""
 
 
 def gravity(model: Any) -> Any:
@@ -93,7 +93,7 @@ def touching(model: Any) -> Any:
 
 
 def without_contacts(model: Any) -> Any:
-    """A copy of a model in which nothing touches, and whose other constraints are solved exactly."""
+    """A copy of a model without contacts, in which the other constraints are solved exactly."""
     copied = copy.copy(model)
     copied.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     copied.opt.solver, copied.opt.tolerance, copied.opt.iterations = int(mujoco.mjtSolver.mjSOL_NEWTON), 1e-10, 200

@@ -158,7 +158,7 @@ class RobotView:
         return [joint for joint, moved in enumerate(self.joint_bodies) if moved in above]
 
     def beyond_limits(self) -> list[str]:
-        """The joints whose default position violates their limits, one sentence each."""
+        """The joints with a default position beyond their limits, one sentence each."""
         return [
             f"joint {name}: its default position {default:.6g} lies outside its limits, {lower:.6g} to {upper:.6g}"
             for name, default, (lower, upper) in zip(self.joint_names, self.defaults, self.ranges, strict=True)

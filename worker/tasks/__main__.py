@@ -7,9 +7,11 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
+from shared_store.wording import counted
 from worker.tasks import find_task, task_names
 from worker.tasks.images import shown
 from worker.tasks.mistakes import task_mistakes
+from worker.tasks.policy_contract import robots_of
 from worker.tasks.tables import numbers, tables
 
 if TYPE_CHECKING:
@@ -44,7 +46,16 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
         "substeps": config.substeps,
         "episode_seconds": config.episode_seconds,
         **(_whole(plan) if whole and plan else {}),
+        **({"robots": _robots(task)} if whole else {}),
     }
+
+
+def _robots(task: Task) -> list[str]:
+    """A line for each robot as its file loads today, by which changes are seen, and the task's notes."""
+    return [
+        f"{each.name}: {each.mass:g} kg, {counted(each.joints, 'joint')}, {counted(each.actuators, 'actuator')}"
+        for each in robots_of(task)
+    ] + list(task.notes())
 
 
 def _whole(plan: Plan) -> dict[str, Any]:

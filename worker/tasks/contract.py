@@ -17,6 +17,7 @@ from worker.tasks.interface import Interface, Observation
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
+    from worker.simulation.worlds import Worlds
     from worker.tasks.plan import Column, Driven, Plan, Seen
 
 UNITS: Mapping[str, tuple[str, str]] = {"effort": ("N m", "N"), "position": ("rad", "m"), "velocity": ("rad/s", "m/s")}
@@ -29,14 +30,18 @@ Explicit = Mapping[str, Sequence[float]]
 """``stiffness``, ``damping`` and ``effort_limit`` of each actuator of one world, and whether its force is computed ``explicit``ly."""
 
 
-def contract(plan: Plan, model: Any, motors: Explicit | None = None) -> Interface:
+def contract(plan: Plan, worlds: Worlds) -> Interface:
     """Observations and actions of the policy, in order.
 
     Args:
         plan: The task's.
-        model: MuJoCo's, of one world: gains and limits of the actuators are read from it.
-        motors: Gains and limits of the actuators whose force is computed explicitly; None without any.
+        worlds: Gains and limits of the actuators are read from their model.
     """
+    model, attributes = worlds.solver.mj_model, getattr(worlds.model, "muster", None)
+    motors: Explicit | None = None
+    if attributes is not None and worlds.drives is not None:  # forces that are computed explicitly
+        names = ("explicit", "stiffness", "damping", "effort_limit")
+        motors = {name: getattr(attributes, name).numpy()[: model.nu].tolist() for name in names}
     observations = [
         column for seen in plan.groups["policy"] for back in backs(seen) for column in described(plan, seen, back)
     ]

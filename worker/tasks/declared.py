@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import newton
@@ -25,15 +24,14 @@ from worker.simulation.sensors.rays import RayCasting
 from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.terrain import Terrain
 from worker.tasks.adapting import Adapting
-from worker.tasks.binding import Bound
-from worker.tasks.checks import checked_interface
+from worker.tasks.checks import checked_interface, placed
 from worker.tasks.compiler import Kernels, further
 from worker.tasks.contract import contract
 from worker.tasks.declaration import Choice, Declaration
-from worker.tasks.functions import reads_poses
 from worker.tasks.interface import Interface
 from worker.tasks.numbers import flat
 from worker.tasks.plan import Plan, stacked
+from worker.tasks.step_needs import StepNeeds
 from worker.tasks.task import Task
 from worker.tasks.terms.motion import RecordedMotion
 from worker.tasks.torch_terms import TorchTerms
@@ -93,12 +91,11 @@ class DeclaredTask(Task):
     def build(self, builder: newton.ModelBuilder) -> None:
         """Add robots and objects, and bind the terms to them."""
         config: Any = self.config
-        self.views: dict[str, RobotView] = {}
+        entities = {"robot": self.robot(config), **self.objects(config)}
         self.readings: dict[str, Reading] = {}
-        for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
+        for name, entity in entities.items():
             self._add(name, entity, builder)
-        for name in ("robot", *self.objects(config)):
-            self.views[name] = RobotView(builder, name)
+        self.views = {name: RobotView(builder, name) for name in entities}
         self.declaration = self.declare(config)
         if not isinstance(self.declaration, Declaration):
             found = type(self.declaration).__name__
@@ -107,7 +104,7 @@ class DeclaredTask(Task):
         sensors = self.declaration.sensors
         for name, sensor in sensors.items():
             if hasattr(sensor, "rows"):  # a task's own sensor may have no columns
-                with _placed(f"task {type(self).__name__}: sensors.{name}"):
+                with placed(f"task {type(self).__name__}: sensors.{name}"):
                     sensor.rows(self.views)
         try:
             self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
@@ -123,17 +120,17 @@ class DeclaredTask(Task):
     def _add(self, name: str, entity: Any, builder: newton.ModelBuilder) -> None:
         where = f"task {type(self).__name__}: {'' if name == 'robot' else 'objects: '}"
         if not dataclasses.is_dataclass(entity) or isinstance(entity, type) or not hasattr(entity, "add_to"):
-            whose = "robot() returned" if name == "robot" else f"{name} is"
-            raise ValueError(f"{where}{whose} {type(entity).__name__}, which can't be put into a world")
-        with _placed(where.removesuffix(": ")):
+            found = "robot() returned" if name == "robot" else f"{name} is"
+            raise ValueError(f"{where}{found} {type(entity).__name__}, which can't be put into a world")
+        with placed(where.removesuffix(": ")):
             reading = dataclasses.replace(entity, name=name).add_to(builder)
         if isinstance(reading, Reading):
             self.readings[name] = reading
 
     def notes(self) -> Sequence[str]:
         """What a user should know of its robots, one sentence each."""
-        read = self.readings.items()
-        return [f"{name}: {line}" for name, each in read for line in (*each.lines(), *self.views[name].beyond_limits())]
+        found = {name: (*each.lines(), *self.views[name].beyond_limits()) for name, each in self.readings.items()}
+        return [f"{name}: {line}" for name, lines in found.items() for line in lines]
 
     def stands_on(self) -> bool | Terrain:
         """The result of :meth:`terrain`, or whether there is a plane."""
@@ -158,20 +155,10 @@ class DeclaredTask(Task):
 
     def interface(self) -> Interface:
         """The policy's contract, derived from the declaration."""
-        attributes = getattr(self.worlds.model, "muster", None)
-        motors = None
-        if attributes is not None and self.worlds.drives is not None:
-            count = self.worlds.solver.mj_model.nu
-            names = ("explicit", "stiffness", "damping", "effort_limit")
-            motors = {name: getattr(attributes, name).numpy()[:count].tolist() for name in names}
-        return contract(self.plan, self.worlds.solver.mj_model, motors)
+        return contract(self.plan, self.worlds)
 
     def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
-        """Further JSON documents of a policy's bundle, by file name.
-
-        Args:
-            algorithm: Name of the algorithm that trained the policy.
-        """
+        """Further JSON documents of the bundle of a policy that ``algorithm``, a name, trained; by file name."""
         return {}
 
     def _prepare(self) -> None:
@@ -187,11 +174,11 @@ class DeclaredTask(Task):
             )
             for group in further(plan)
         }
+        self._further = [array for both in self._rows.values() for array in both]
         bodies = body_arrays(self.worlds)
-        robots = {name: view.arrays(self.worlds) for name, view in self.views.items()}
-        terrain = self.worlds.ground.arrays if self.worlds.ground else None
+        self.robots = {name: view.arrays(self.worlds) for name, view in self.views.items()}
         context = SensorContext(
-            self.worlds, self.views, robots, bodies, self._episodes, self.ground_terrain, self.config.control_hz
+            self.worlds, self.views, self.robots, bodies, self._episodes, self.ground_terrain, self.config.control_hz
         )
         self.sensors = {
             name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
@@ -201,12 +188,14 @@ class DeclaredTask(Task):
         self._samplings = {name: each.sampling for name, each in motions.items() if each.sampling.is_adaptive}
         self._movers = [sensor for sensor in self.sensors.values() if isinstance(sensor, IkSolver)]
         self._sees = any(isinstance(sensor, Camera | RayCasting) for sensor in self.sensors.values())
-        structs: dict[str, Any] = {"bodies": bodies, "terrain": terrain}
-        structs |= {f"robot_{name}": arrays for name, arrays in robots.items()}
+        structs: dict[str, Any] = {
+            "bodies": bodies,
+            "terrain": self.worlds.ground.arrays if self.worlds.ground else None,
+        }
+        structs |= {f"robot_{name}": arrays for name, arrays in self.robots.items()}
         structs |= {f"sensor_{name}": sensor.arrays for name, sensor in self.sensors.items()}
-        self.robots = robots
         self._torch_terms = TorchTerms(self, plan, self._external)
-        self._needs = _Needs(plan, self.sensors, self._torch_terms)
+        self._needs = StepNeeds(plan, self.sensors, self._torch_terms)
         self._kernels = Kernels(type(self).__name__, plan, self._needs.apart)
         # generating the source collects the selections that are not ranges
         self._indices = wp.array(plan.binder.indices or [0], dtype=wp.int32, device=device)
@@ -214,7 +203,7 @@ class DeclaredTask(Task):
         self._common += [self.worlds.arrays, self._episodes, *(structs[name] for name in self._kernels.structs)]
 
     def _build_sensor(self, name: str, declared: Any, context: SensorContext) -> Any:
-        with _placed(f"task {type(self).__name__}: sensors.{name}"):
+        with placed(f"task {type(self).__name__}: sensors.{name}"):
             return declared.build(dataclasses.replace(context, name=name))
 
     def _begin(self) -> None:
@@ -234,8 +223,7 @@ class DeclaredTask(Task):
                 if place.startswith("randomize."):
                     view = self.numbers(place)
                     view.copy_(torch.tensor(flat(f"config.numbers.{place}", value, view.numel())).view_as(view))
-            if self.plan.adaptive:
-                rules = self.plan.adaptive
+            if rules := self.plan.adaptive:
                 self.adapting = Adapting(rules, self.numbers, self.world_count, self.device)
         self.randomizations.restart()
         if self.worlds.ground:
@@ -370,11 +358,8 @@ class DeclaredTask(Task):
         """Compute rewards or reset, and observe, by kernel launches alone."""
         if mode == STEP:
             self._measure()
-        if not self._torch_terms.any:
-            self._judge(mode)
-            return
-        if mode == STEP:  # a reset judges nothing
-            self._torch_terms.judge()
+            if self._torch_terms.any:  # a reset judges nothing
+                self._torch_terms.judge()
         self._judge_alone(mode)
         if self._torch_terms.observe_any:
             self._torch_terms.observe()
@@ -386,8 +371,7 @@ class DeclaredTask(Task):
 
     def _judge_alone(self, mode: int) -> None:
         """Rewards, terminations, resets; then update the worlds that begin: drives, bodies, sensors."""
-        rows = [array for group in further(self.plan) for array in self._rows[group]]
-        inputs = [mode, self.max_episode_length, *rows, *self._common]
+        inputs = [mode, self.max_episode_length, *self._further, *self._common]
         wp.launch(self._kernels.judge, dim=self.world_count, inputs=inputs, device=self.device)
         if self.randomizations:
             self.randomizations.settle()
@@ -401,9 +385,8 @@ class DeclaredTask(Task):
             sensor.settle()
 
     def _observe_alone(self, mode: int) -> None:
-        rows = [array for group in further(self.plan) for array in self._rows[group]]
         if self._kernels.observe is not None:
-            inputs = [mode, self.max_episode_length, *rows, *self._common]
+            inputs = [mode, self.max_episode_length, *self._further, *self._common]
             wp.launch(self._kernels.observe, dim=self.world_count, inputs=inputs, device=self.device)
         wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
         first = len(self.observation_names)
@@ -412,39 +395,3 @@ class DeclaredTask(Task):
             first += both[0].shape[1]
         if self._camera:
             self._camera.render(mode)
-
-
-@contextmanager
-def _placed(where: str) -> Iterator[None]:
-    """Prefix a ValueError with its place in the task."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
-
-
-class _Needs:
-    """The data, besides the joints, that a step must update.
-
-    Attributes:
-        bodies: Poses of bodies, after the physics.
-        apart: Whether observations have a kernel of their own: they read data that is stale right after a reset.
-        placed: Poses of bodies again after the reset of worlds: observations or the next step's actions read them.
-    """
-
-    def __init__(self, plan: Plan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:
-        observed = [seen.bound for group in plan.groups.values() for seen in group]
-        acting = [*(driven.bound for driven in plan.driven), *([plan.choice] if plan.choice else [])]
-        measured = any(sensor.needs_bodies for sensor in sensors.values())
-        self.bodies = measured or torch_terms.any or any(map(_reads_bodies, plan.terms))
-        self.apart = torch_terms.observe_any or any(_reads_bodies(bound) or _reads_sensors(bound) for bound in observed)
-        moved = any(isinstance(sensor, IkSolver) for sensor in sensors.values())
-        self.placed = self.bodies and (self.apart or moved or any(map(_reads_bodies, acting)))
-
-
-def _reads_bodies(bound: Bound) -> bool:
-    return "bodies" in bound.arguments.values() and reads_poses(bound.term.function)
-
-
-def _reads_sensors(bound: Bound) -> bool:
-    return any(variable.startswith("sensor_") for variable in bound.arguments.values())

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from shared_store import __version__
-from shared_store.policy_contract import Command, Contract, Group, Image, State, Term
+from shared_store.policy_contract import Command, Contract, Group, Image, RobotModel, State, Term
 from worker.tasks.contract import described, range_of
 from worker.tasks.images import described as images_of
 from worker.tasks.measured import frame_of, is_library
@@ -50,7 +50,7 @@ def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = Non
         commands=_commands(getattr(task, "plan", None)),
         states=tuple(states),
         discrete=bool(task.discrete),
-        robots=tuple(dataclasses.replace(reading.identity, name=name) for name, reading in readings_of(task).items()),
+        robots=robots_of(task),
         normalizer="unknown" if exported is None else "inside",
     )
 
@@ -59,6 +59,11 @@ def readings_of(task: Task) -> Mapping[str, Reading]:
     """How the file of each robot of a task was read, by its name; a task of kernels by hand keeps none."""
     readings: Mapping[str, Reading] = getattr(task, "readings", {})
     return readings
+
+
+def robots_of(task: Task) -> tuple[RobotModel, ...]:
+    """The robots of a task as they were loaded."""
+    return tuple(dataclasses.replace(reading.identity, name=name) for name, reading in readings_of(task).items())
 
 
 def _group(task: Task, name: str, given: str, shape: tuple[int, ...]) -> Group:

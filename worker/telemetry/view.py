@@ -12,7 +12,7 @@ import sys
 import time
 import webbrowser
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
@@ -24,6 +24,7 @@ from shared_store.layout import Run
 from shared_store.logs import LogFollower, LogLine
 from shared_store.metrics import history_of
 from shared_store.wording import counted
+from worker.accepting import CHANGED_ROBOTS
 from worker.errors import UserError
 from worker.telemetry.page import Page, need_rerun
 from worker.telemetry.progress import Activity, loading
@@ -161,21 +162,21 @@ class Policy:
 
     Args:
         run: The run.
-        checkpoint: Iteration, name or ``best``; None: the newest.
+        section: As of :meth:`Rollout.of`: ``checkpoint``, ``accept_changed_robot``.
         worlds: How many worlds.
         episodes: Of each world; None: until the user ends it.
         stop: Filled when the view is to end.
     """
 
     def __init__(
-        self, run: Run, checkpoint: int | str | None, worlds: int, episodes: int | None, stop: list[int]
+        self, run: Run, section: Mapping[str, Any], worlds: int, episodes: int | None, stop: list[int]
     ) -> None:
         import torch
 
         from worker.telemetry.rollout import Rollout
 
         torch.set_num_threads(1)  # a few worlds: more threads would wait for each other
-        self._rollout = Rollout.of(run, {"checkpoint": checkpoint}, worlds, device="cpu")
+        self._rollout = Rollout.of(run, section, worlds, device="cpu")
         self._stage, self._episodes, self._stop = self._rollout.stage(), episodes, stop
         self._sums = np.zeros((worlds, 2))
         self._ended = np.zeros(worlds, int)
@@ -324,6 +325,7 @@ def main() -> int:
         what.add_argument(name, type=Path)
     parser.add_argument("--job", default="")
     parser.add_argument("--checkpoint")
+    parser.add_argument("--accept-changed-robot", action="store_true")
     parser.add_argument("--worlds", type=int, default=4)
     parser.add_argument("--episodes", type=int)
     parser.add_argument("--port", type=int)
@@ -353,7 +355,9 @@ def _show(given: argparse.Namespace, start: Callable[[Path | None], Page], stop:
         os.nice(10)  # where processors are short, frames are fewer, and the training goes on
     else:
         activity.say(loading(Run(given.policy), given.worlds))
-        source = Policy(Run(given.policy), given.checkpoint, given.worlds, given.episodes, stop)
+        CHANGED_ROBOTS.set(given.accept_changed_robot)
+        section = {"checkpoint": given.checkpoint, "accept_changed_robot": given.accept_changed_robot}
+        source = Policy(Run(given.policy), section, given.worlds, given.episodes, stop)
     source.show(lambda: start(None))
     print(f"viewed: {counted(source.frames, 'frame')}", flush=True)
     return 0

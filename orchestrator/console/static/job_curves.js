@@ -5,23 +5,14 @@ import { show } from "./forms.js";
 const POINTS = 300;
 const MOST = 3 * POINTS;
 const RANK = "rank_collect_seconds/";
+const LEARNING = JSON.parse(document.querySelector("[data-learning]")?.dataset.learning ?? "{}");
 const GROUPS = [
   { label: "Reward", fits: (name) => name === "reward" || name === "score" },
   { label: "Reward terms", fits: (name) => name.startsWith("reward_") },
   { label: "Episode length", fits: (name) => name === "episode_length" },
   { label: "How episodes end", fits: (name) => name.startsWith("termination_") },
   { label: "Losses", fits: (name) => name.endsWith("_loss") || name === "loss" },
-  { label: "KL divergence", fits: (name) => name === "kl" },
-  { label: "Learning rate", fits: (name) => name === "learning_rate" },
-  { label: "Entropy", fits: (name) => name === "entropy" },
-  { label: "Standard deviation of actions", fits: (name) => name === "action_std" },
-  {
-    label: "Shares of actions beyond their range, and of clipped ratios",
-    fits: (name) => name === "saturation" || name === "clip_fraction",
-  },
-  { label: "Explained variance of the returns", fits: (name) => name === "explained_variance" },
-  { label: "Norm of the gradients", fits: (name) => name === "gradient_norm" },
-  { label: "Probability of v_max in the targets", fits: (name) => name === "v_max_mass" },
+  ...Object.entries(LEARNING).map(([own, label]) => ({ label, fits: (name) => name === own })),
   { label: "Environment steps a second", fits: (name) => name === "steps_per_second" },
   {
     label: "Simulation, learning and saving [s of an iteration]",

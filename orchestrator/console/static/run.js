@@ -1,4 +1,5 @@
 // The charts of a run, renewed when its stream says that it went on.
+import { fill } from "./bind.js";
 import { Chart, read } from "./curves.js";
 
 const region = document.querySelector("[data-curves]");
@@ -25,5 +26,8 @@ async function draw() {
   }
 }
 
-document.addEventListener("changed", draw);
+document.addEventListener("changed", (event) => {
+  fill(document.querySelector("[data-progress]"), event.detail);
+  draw();
+});
 draw();

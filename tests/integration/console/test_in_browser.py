@@ -159,6 +159,7 @@ def test_curves_are_drawn_and_a_window_of_them_is_read_again(shared_server: Serv
     with MetricsWriter(store.run("curved"), 1, 0) as metrics:
         for iteration in range(1, 2001):
             terms = {f"reward_term_{i}": iteration * i for i in range(8)}
+            terms |= {"explained_variance": 0.5, "kl": 0.25}
             metrics.write({"iteration": iteration, "env_steps": 10 * iteration, "reward": iteration % 7, **terms})
     blocker = submit_gang(shared_server.client, FOREVER, cpus="0.5")
     shared_server.wait(blocker, "RUNNING")
@@ -167,6 +168,8 @@ def test_curves_are_drawn_and_a_window_of_them_is_read_again(shared_server: Serv
     page = people(shared_server.url).goto(f"/jobs/{job}")
     assert int(see(page, "document.querySelector('.chart')?.dataset.points")) == 300
     assert page.evaluate("document.querySelectorAll('.chart')[1].querySelectorAll('path.curve.dashes-1').length") == 4
+    for label in ("KL divergence [nat]", "Explained variance"):
+        expect(page.get_by_text(label, exact=True)).to_be_visible()
     window = "new CustomEvent('window', {detail: {from: 1, to: 50}})"
     page.evaluate(f"document.querySelector('.chart').dispatchEvent({window})")
     see(page, "document.querySelector('.chart').dataset.points === '50'")
@@ -174,3 +177,18 @@ def test_curves_are_drawn_and_a_window_of_them_is_read_again(shared_server: Serv
     see(page, "document.querySelector('.chart').dataset.points === '300'")
     for each in (job, blocker):
         shared_server.client.batch("TerminateJob", jobId=each, reason="seen")
+
+
+def test_the_page_of_a_run_renews_how_it_learns(shared_server: Serving, people: People) -> None:
+    store = Store(shared_server.home / "store")
+    add_run(store, "learns", {**SPEC, "name": "learns"})
+    with MetricsWriter(store.run("learns"), 1, 0) as metrics:
+        metrics.write({"iteration": 1, "reward": 1.0, "action_std": 0.5})
+        page = people(shared_server.url).goto("/runs/learns")
+        expect(page.locator("[data-progress]")).to_have_text(
+            re.compile(r"^\s*Learning\s*deviation of actions 0.5\s*Warning\s*$")
+        )
+        expect(page.get_by_text("Warning", exact=True)).to_be_hidden()
+        metrics.write({"iteration": 2, "reward": 1.0, "action_std": 0.25, "warnings": ["it unlearns: (RUN@best)"]})
+        expect(page.get_by_text("deviation of actions 0.25", exact=True)).to_be_visible()
+        expect(page.get_by_text("it unlearns: (learns@best)", exact=True)).to_be_visible()

@@ -38,7 +38,9 @@ def store(console: Console) -> Store:
         add_checkpoint(store, "taught", iteration, score=float(iteration), score_error=0.5)
     with MetricsWriter(store.run("taught"), 1, 0) as metrics:
         for iteration in range(1, 10):
-            last = {"warnings": ["it unlearns: mean return 1.00 (taught@best)"]} if iteration == 9 else {}
+            last = (
+                {"warnings": ["it unlearns: mean return 1.00 (RUN@best)"], "action_std": 0.41} if iteration == 9 else {}
+            )
             metrics.write({"iteration": iteration, "reward": iteration / 2, "reward_alive": 1.0, "kl": None, **last})
     return store
 
@@ -88,7 +90,13 @@ def test_a_job_that_waits_says_why_and_shows_what_it_will_do(console: Console, t
     page = console.visitor().page(f"/jobs/{training}")
     assert "RUNNABLE" in page.text and "CPU" in page.text and "It has not started yet" in page.text
     assert "iterations: 20" in page.text and "Cartpole" in page.text and "muster view" in page.text
-    assert page.is_inert and "it unlearns: mean return 1.00 (taught@best)" in page.text
+    assert page.is_inert and "Warning it unlearns: mean return 1.00 (taught@best)" in page.text
+    assert "Learning deviation of actions 0.41" in page.text
+    (charts,) = [each for tag, each in page.elements if tag == "div" and "data-learning" in each]
+    assert (
+        json.loads(str(charts["data-learning"])).items()
+        >= {"kl": "KL divergence [nat]", "saturation": "Saturation"}.items()
+    )
     (place,) = [each for tag, each in page.elements if tag == "div" and "data-job" in each]
     assert place["data-curves"] == "/runs/taught/curves"
 
@@ -174,7 +182,8 @@ def test_the_stream_has_new_iterations_and_tells_what_went_back(visitor: Visitor
     assert told["series"]["reward"] == [i / 2 for i in range(1, 10)] and told["last"] == 9
     had = json.dumps({"i": 7, "l": {}})
     metrics = (data for name, data, _ in visitor.events(f"/jobs/{training}/stream?last={had}") if name == "metrics")
-    assert next(metrics) == {"iterations": [8, 9], "series": {"reward": [4.0, 4.5], "reward_alive": [1.0, 1.0]}}
+    series = {"reward": [4.0, 4.5], "reward_alive": [1.0, 1.0], "action_std": [None, 0.41]}
+    assert next(metrics) == {"iterations": [8, 9], "series": series}
     run: Run = store.run("taught")
     with MetricsWriter(run, 2, 4) as writer:
         writer.write({"iteration": 5, "reward": 50.0})
@@ -194,10 +203,15 @@ def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(co
     visitor = console.visitor()
     evaluated = spec_of(console, visitor.submit(f"/jobs/{training}/evaluate", checkpoint="6"))
     assert evaluated["evaluate"]["run"] == "taught" and evaluated["evaluate"]["checkpoint"] == 6
+    assert "accept_changed_robot" not in evaluated["evaluate"]
     exported = spec_of(console, visitor.submit(f"/jobs/{training}/export"))
     assert exported["export"]["checkpoint"] == 9 and exported["queue"] == "default"
     recorded = spec_of(console, visitor.submit(f"/jobs/{training}/record", checkpoint="best"))
     assert recorded["record"]["checkpoint"] == 9
+    assert visitor.page(f"/jobs/{training}").all("input", name="accept_changed_robot", type="checkbox")
+    for kind in ("evaluate", "export", "record"):
+        accepting = spec_of(console, visitor.submit(f"/jobs/{training}/{kind}", accept_changed_robot="yes"))
+        assert accepting[kind]["accept_changed_robot"] is True
     assert "it has: 3, 6, 9" in visitor.refusal(f"/jobs/{training}/evaluate", checkpoint="7", status=404)
     assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
 
@@ -212,9 +226,15 @@ def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console
     visitor = console.visitor()
     asked = visitor.submit(f"/jobs/{first}/resume", checkpoint="3")
     assert asked.status_code == 409 and "after iteration 3 counts no longer" in asked.json()["question"]["text"]
-    told = visitor.submit(f"/jobs/{first}/resume", checkpoint="3", confirmed="yes", changes="train.iterations=30\n\n")
-    assert spec_of(console, told)["train"]["iterations"] == 30 and "from iteration 3" in told.json()["message"]
-    page = visitor.page(told.json()["location"])
+    sent = {"confirmed": "yes", "changes": "train.iterations=30\n\n", "accept_changed_robot": "yes"}
+    answer = visitor.submit(f"/jobs/{first}/resume", checkpoint="3", **sent)
+    resumed = spec_of(console, answer)["train"]
+    assert (
+        resumed["iterations"] == 30
+        and resumed["accept_changed_robot"] is True
+        and "from iteration 3" in answer.json()["message"]
+    )
+    page = visitor.page(answer.json()["location"])
     assert "Compared with the job before it, again" in page.text and "train.iterations 9 30" in page.text
     assert "expected KEY=VALUE" in visitor.refusal(f"/jobs/{first}/resume", changes="nonsense", status=400)
 

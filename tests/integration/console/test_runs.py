@@ -86,6 +86,7 @@ def test_the_page_of_a_run_has_checkpoints_evaluations_and_lineage(console: Cons
     assert page.all("a", href="/runs/fast") and "No run was cloned from it" in page.text
     (curves,) = [each for each in page.all("div") if each.get("data-curves")]
     assert (curves["data-curves"], curves["data-metrics"]) == ("/runs/sure/curves", "reward kl")
+    assert "Learning KL divergence 0.010" in page.text
     parent = console.visitor().page("/runs/fast")
     assert parent.all("a", href="/runs/sure") and parent.all("a", href="/compare?run=fast&run=sure")
     assert console.client.get("/api/runs/fast")["clones"] == ["sure"]
@@ -96,10 +97,16 @@ def test_a_run_that_goes_on_is_renewed(console: Console, store: Store) -> None:
     run = trained(store, "goes-on", [1.0, 2.0], train={"worlds": 7})
     stream = console.visitor().events("/runs/goes-on/stream")
     first = dict((name, data) for name, data, _ in (next(stream) for _ in range(4)))
-    assert first["changed"] == {"iteration": 9} and first["checkpoints"]["order"] == ["00000009-e1", "00000006-e1"]
+    figures = {"learning": "KL divergence 0.010", "warning": ""}
+    assert first["changed"] == {"iteration": 9, **figures} and first["checkpoints"]["order"] == [
+        "00000009-e1",
+        "00000006-e1",
+    ]
     with MetricsWriter(run, 1, 9) as metrics:
-        metrics.write({"iteration": 10, "env_steps": 1000, "reward": 1.0})
-    assert next(stream)[:2] == ("changed", {"iteration": 10})
+        figures = {"explained_variance": 0.5, "gradient_norm": 12.0, "warnings": ["it unlearns: (RUN@best)"]}
+        metrics.write({"iteration": 10, "env_steps": 1000, "reward": 1.0, **figures})
+    texts = {"learning": "explained variance 0.50, gradient norm 12", "warning": "it unlearns: (goes-on@best)"}
+    assert next(stream)[:2] == ("changed", {"iteration": 10, **texts})
     add_checkpoint(store, "goes-on", 10)
     name, data, _ = next(stream)
     assert name == "checkpoints" and data["order"][0] == "00000010-e1"

@@ -18,7 +18,7 @@ import httpx
 import pytest
 from rich.table import Table
 
-from orchestrator.cli.jobs import _gpus
+from orchestrator.cli.show import _gpus
 from orchestrator.cli.terminal import print_cut
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.definitions import container, single

@@ -25,15 +25,15 @@ def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_it_describes_a_robot_and_draws_it(tmp_path: Path) -> None:
     found = command(tmp_path, "cheetah.xml", "-o", "cheetah.png", "--json")
     assert found.returncode == 0, found.stderr
-    told = json.loads(found.stdout)
-    assert told["mass"] == 14.0 and [body["name"] for body in told["bodies"]] == ["torso"]
-    slide, hinge = told["joints"]
+    shown = json.loads(found.stdout)
+    assert shown["mass"] == 14.0 and [body["name"] for body in shown["bodies"]] == ["torso"]
+    slide, hinge = shown["joints"]
     assert (slide["name"], slide["kind"], slide["lower"]) == ("x", "slide", None)
     assert (hinge["name"], hinge["kind"], round(hinge["upper"], 4)) == ("turn", "hinge", 1.0472)
-    assert told["actuators"][0]["drives"] == "joint turn" and told["actuators"][0]["gear"] == 120.0
-    assert told["sensors"] == [{"name": "spin", "kind": "gyro"}]
-    assert {each["field"] for each in told["corrected"]} >= {"mass", "pos"}
-    assert (tmp_path / "cheetah.png").read_bytes().startswith(b"\x89PNG") and told["picture"] == "cheetah.png"
+    assert shown["actuators"][0]["drives"] == "joint turn" and shown["actuators"][0]["gear"] == 120.0
+    assert shown["sensors"] == [{"name": "spin", "kind": "gyro"}]
+    assert {each["field"] for each in shown["corrected"]} >= {"mass", "pos"}
+    assert (tmp_path / "cheetah.png").read_bytes().startswith(b"\x89PNG") and shown["picture"] == "cheetah.png"
     again = command(tmp_path, "cheetah.xml", "-o", "cheetah.png")
     assert again.returncode == 2 and "cheetah.png" in again.stderr and "--overwrite" in again.stderr
 

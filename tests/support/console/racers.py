@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from shared_store import leagues, models
@@ -10,7 +11,7 @@ from shared_store.evaluations import evaluation_name
 from shared_store.files import read_json, write_json
 from shared_store.layout import Store
 from shared_store.models import Model
-from shared_store.policy_contract import Contract, Group
+from shared_store.policy_contract import Contract, Group, RobotModel
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.shared_store.leagues import entry, league, race, summary
 
@@ -20,9 +21,9 @@ TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
 def add_racer(store: Store, name: str, run: str, iteration: int, queue: str = "default", **facts: Any) -> Model:
     """The next version of a model, of a new checkpoint of a run, with one evaluation.
 
-    ``parent``: what the run is a clone of, where it is made here.
+    ``parent``: what the run is a clone of, where it is made here. ``pole``: mass of its robot's pole [kg], another one than in the training.
     """
-    parent = facts.pop("parent", None)
+    parent, pole = facts.pop("parent", None), facts.pop("pole", None)
     if store.run(run).description() is None:
         add_run(store, run, {**SPEC, "name": run, "train": TRAIN}, queue)
         path = store.run(run).path / "run.json"
@@ -36,6 +37,10 @@ def add_racer(store: Store, name: str, run: str, iteration: int, queue: str = "d
     contract = Contract(
         "Racer", "0.1.0", 15.0, (Group("policy", "policy", (8,), "float32"),), (), ("steering", "speed")
     )
+    if pole is not None:
+        robot = RobotModel("robot", f"{pole:064}", 1.0 + pole, 2, 1, {"body pole": {"mass": pole}})
+        contract = replace(contract, robots=(robot,))
+        write_json(bundle / "report.json", {"changed_robot": f"trained on another robot: pole {pole:g} kg"})
     write_json(bundle / "contract.json", contract.document())
     seal(bundle, {"task": "Racer", "train": TRAIN, "checkpoint_files": checkpoint.manifest["files"], "score": 3.5})
     return models.register(store, name, store.run(run), checkpoint, {"queue": queue, **facts})

@@ -45,7 +45,7 @@ class SimulatedJob:
     main_ends: list[tuple[int, int, bool]] = field(default_factory=list)
     """Attempt and exit code of each main node that ended by itself, and whether it had been asked to end by then."""
     faults: set[int] = field(default_factory=set)
-    """Attempts whose main node has left an outcome with the fault."""
+    """Attempts with the fault in their main node's outcome."""
     final: str = ""
     """The state that was shown once, and must stay."""
 

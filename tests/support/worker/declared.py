@@ -175,7 +175,7 @@ class Sliders(DeclaredTask):
 
 
 class FreeSliders(Sliders):
-    """The same robot, whose actions are not clipped."""
+    """The same robot, without clipped actions."""
 
     def sections(self) -> dict[str, Any]:
         return super().sections() | {"actions": {"force": Action(terms.effort, clip=None)}}

@@ -1,4 +1,4 @@
-"""A task whose worlds fail in one second of a motion."""
+"""A task with worlds that fail in one second of a motion."""
 
 from __future__ import annotations
 

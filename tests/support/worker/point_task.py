@@ -150,7 +150,7 @@ class Point(Telling):
 
 
 class Tripping(Point):
-    """The point, whose last world's physics fails in every iteration."""
+    """The point; the physics of its last world fails in every iteration."""
 
     statistic_names = (*Point.statistic_names, "nan_worlds")
 

@@ -131,6 +131,7 @@ def test_the_reward_term_that_is_not_finite_is_named_at_the_end_and_in_the_repla
         r"among them (world \d+): (its reward term rotten was not finite); .*repeat_incident (\S+)", str(stop.value)
     )
     assert found, stop.value
+    assert stop.value.cause == found[2], "another attempt names another world"
     again = call_worker(repeat_incident.main, {}, found[3])
     assert again.returncode == 0, again.stderr
     assert f"{found[1]}: {found[2]}; before it:" in again.stdout

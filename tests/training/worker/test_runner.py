@@ -293,22 +293,26 @@ def break_down() -> int:
 
 
 def diverge() -> int:
-    raise TrainingError("iteration 3: the loss is not finite")
+    raise TrainingError("iteration 3: 4 resets", "its physics")
 
 
 def meet_nobody() -> int:
     raise GangError("rank 1 did not report")
 
 
-@pytest.mark.parametrize(("body", "kind"), [(break_down, "ValueError"), (diverge, "worker.errors.TrainingError")])
+@pytest.mark.parametrize(
+    ("body", "kind", "cause"),
+    [(break_down, "ValueError", ""), (diverge, "worker.errors.TrainingError", "its physics")],
+)
 def test_the_supervisor_hears_of_the_fault_that_another_attempt_would_meet(
-    tmp_path: Path, body: Callable[[], int], kind: str
+    tmp_path: Path, body: Callable[[], int], kind: str, cause: str
 ) -> None:
     errors = tmp_path / "error.json"
     assert call_worker(body, {"TORCHELASTIC_ERROR_FILE": str(errors)}).returncode == 1
     fault = json.loads(errors.read_text())["message"]["extraInfo"]["fault"]
     line = body.__code__.co_firstlineno + 1
     assert (fault["type"], Path(fault["file"]).name, fault["line"]) == (kind, "test_runner.py", line)
+    assert fault["cause"] == cause
 
 
 def test_what_another_rank_did_is_no_fault(tmp_path: Path) -> None:

@@ -31,6 +31,13 @@ def test_a_fault_is_the_place_where_the_exception_was_raised(tmp_path: Path) -> 
     assert raised(tmp_path, "\n" + text) != fault
 
 
+def test_one_line_that_raises_for_unlike_causes_makes_unlike_faults() -> None:
+    text = f"{FRAME}worker.errors.TrainingError: 3 resets\n"
+    falls, spins = (fault_in(text, Path("/job"), cause) for cause in ("its reward term fall", "its physics"))
+    assert falls is not None and falls != spins and falls == fault_from(asdict(falls))
+    assert str(falls) == "worker.errors.TrainingError in train.py, line 7 (its reward term fall)"
+
+
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
@@ -101,10 +108,18 @@ def test_an_exception_that_a_collective_raised_is_none_whatever_it_says() -> Non
 
 def test_values_of_other_types_are_refused_and_long_ones_cut() -> None:
     assert fault_from(None) is None and fault_from(asdict(Fault("A", "a", 1))) == Fault("A", "a", 1)
-    for wrong in ({"type": 1}, {"file": None}, {"line": True}, {"line": 2**40}, {"line": -1}, {"other": 1}):
+    for wrong in (
+        {"type": 1},
+        {"file": None},
+        {"line": True},
+        {"line": 2**40},
+        {"line": -1},
+        {"other": 1},
+        {"cause": 1},
+    ):
         with pytest.raises(TypeError):
             fault_from({"type": "A", "file": "a", "line": 1, **wrong})
     with pytest.raises(TypeError):
         fault_from(["A", "a", 1])
-    long = fault_from({"type": "x" * 9999 + "Error", "file": "y" * 9999 + ".py", "line": 1})
-    assert long is not None and len(str(long)) < 700 and long.type.endswith("Error") and long.file.endswith(".py")
+    long = fault_from({"type": "x" * 9999 + "Error", "file": "y" * 9999 + ".py", "line": 1, "cause": "z" * 9999})
+    assert long is not None and len(str(long)) < 950 and long.type.endswith("Error") and long.file.endswith(".py")

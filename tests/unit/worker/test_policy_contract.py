@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import torch
 import warp as wp
 
 from job_specs.my_kernels import PendulumByHand, PendulumConfig
-from shared_store.policy_changes import differences
+from shared_store.policy_changes import differences, robot_changes
 from shared_store.policy_contract import Contract, read
 from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
 from worker.errors import UserError
@@ -142,6 +143,26 @@ def test_a_policy_of_another_robot_is_refused_unless_it_is_accepted(sliders: Sli
         check_contract(then, sliders, {})
     check_contract(then, sliders, {"accept_changed_robot": True})
     assert "warning: checkpoint 00000004-e1 was trained on another robot" in capsys.readouterr().out
+
+
+def test_a_change_of_a_robot_is_named_by_its_element(sliders: Sliders) -> None:
+    (robot,) = published(sliders).robots
+    body, *_ = [name for name in robot.elements if name.startswith("body ")]
+    joint, *_ = [name for name in robot.elements if name.startswith("joint ")]
+    changed = {
+        **robot.elements,
+        body: {"mass": 7.5},
+        joint: {**robot.elements[joint], "armature": 0.25},
+        "actuator more": {},
+    }
+    then = dataclasses.replace(robot, digest="0" * 64, elements={**changed, "weld x": {}})
+    mass = robot.elements[body]["mass"]
+    assert robot_changes([then], [robot]) == [
+        f"robot: {body}: mass 7.5 became {mass:g}; {joint}: armature 0.25 became 0; actuator more is gone"
+    ]
+    assert robot_changes([dataclasses.replace(then, elements={})], [robot]) == [
+        "robot: other values of its compiled model changed"
+    ]
 
 
 def test_a_policy_of_an_older_muster_was_trained_on_what_newton_s_importer_read(sliders: Sliders) -> None:

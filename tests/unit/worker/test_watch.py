@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli.jobs import _learning
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
+from shared_store.learning import in_log, in_words
 from shared_store.metrics import read_metrics, warnings_of
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.report import Report
@@ -19,7 +19,7 @@ from worker.learning.watch import Watch
 
 
 def watch(iterations: int = 1000, **settings: Any) -> Watch:
-    return Watch("cart", iterations, PPOConfig(**settings))
+    return Watch(iterations, PPOConfig(**settings))
 
 
 def record(iteration: int, reward: float | None = None, **figures: Any) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def test_a_fall_below_the_share_of_the_gain_is_reported_after_fifty_iterations(f
     assert (first is not None) == reported and (not reported or 40 + 50 < first <= 60 + 50)
     if reported:
         assert found[-1] == [
-            "it unlearns: mean return 14.00, below 70% of its gain for 50 iterations; the best was 21.00 at iteration 40 (cart@best)"
+            "it unlearns: mean return 14.00, below 70% of its gain for 50 iterations; the best was 21.00 at iteration 40 (RUN@best)"
         ]
 
 
@@ -62,7 +62,7 @@ def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
     found = begun(watch(60), [*RISE, *([18.5] * 20)])
     assert not any(found[:-1])
     assert found[-1] == [
-        "it ended below its best: mean return 18.50, and 21.00 at iteration 40; try its best checkpoint: muster evaluate cart@best"
+        "it ended below its best: mean return 18.50, and 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
     ]
     assert not any(begun(watch(60), [*RISE, *([20.0] * 20)]))
 
@@ -106,12 +106,13 @@ def test_a_resumed_training_remembers_its_best_and_warns_once(
         report.close()
     printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
     assert len(printed) == 1 and "the best was 21.00 at iteration 40 (cart@best)" in printed[0]
-    (kept,) = warnings_of(read_metrics(run)[-1])
-    assert kept.startswith("it unlearns: mean return 2.00, ")
+    (kept,) = warnings_of(read_metrics(run)[-1], run.name)
+    assert kept.startswith("it unlearns: mean return 2.00, ") and kept.endswith("(cart@best)")
+    assert "cart" not in str(read_metrics(run)), "records are the same whatever the run is called"
 
 
 def test_what_a_job_wrote_into_its_record_is_shown_only_where_it_is_text_or_a_number() -> None:
-    assert warnings_of({"warnings": ["a", 1, None]}) == ["a"] and warnings_of({"warnings": "a"}) == []
-    assert _learning({"action_std": 0.41234, "kl": "x", "saturation": None, "clip_fraction": 0.1}) == (
-        "deviation 0.412, clip fraction 0.1"
-    )
+    assert warnings_of({"warnings": ["a", 1, None]}, "cart") == ["a"] and warnings_of({"warnings": "a"}, "cart") == []
+    record = {"action_std": 0.41234, "kl": "x", "saturation": None, "clip_fraction": 0.1, "reward": 1.0}
+    assert in_words(record) == "deviation of actions 0.41, clip fraction 0.10"
+    assert in_log(record) == "kl -  std 0.41  saturated -  clipped 0.10"

@@ -43,7 +43,7 @@ class Head(Protocol):
 
     @property
     def clipped(self) -> torch.Tensor:
-        """Numbers whose sum is that of the ratios beyond the clip range, since they were last set to 0."""
+        """Numbers that sum to the count of ratios beyond the clip range, since they were last set to 0."""
 
     def spread(self) -> torch.Tensor:
         """Mean standard deviation of the actions of the last rollout, shape (); 0 for choices."""

@@ -89,7 +89,7 @@ class RslRl:
     def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
         """The metrics of rsl_rl's ``update``, as means over the ranks, ``learning_rate``, and for a stochastic policy ``action_std``.
 
-        With a critic also ``explained_variance``, for a task whose actions have ranges ``saturation``; with RND ``intrinsic_reward``, a
+        With a critic also ``explained_variance``, for a task with ranges of actions ``saturation``; with RND ``intrinsic_reward``, a
         mean over the steps, and ``rnd_weight``.
         """
         with torch.no_grad():

@@ -228,7 +228,7 @@ class SAC:
         torch.div(learner.norm, updates, out=self._norm)
         self._figures[0].copy_(self._spread * (self.share.count / self.share.total))
         self._figures[1].copy_(learner.mass / updates)
-        self.gang.sum(self._figures)  # apart from the gradients, whose bits so do not depend on the metrics
+        self.gang.sum(self._figures)  # apart from the gradients: their bits must not depend on the metrics
 
     def _compute(self, improves: bool) -> None:
         self.learner.compute(self.replay.sample(self._rows), self._noise, improves)

@@ -23,6 +23,7 @@ TRAINED: dict[str, Any] = {
     "image": "mine",
     "train": {"task": "Ant", "worlds": 8, "iterations": 100},
 }
+EVALUATION = Evaluation(every=2, episodes=32, worlds=16)
 
 
 def saved(*iterations: int, epoch: int = 1) -> list[Checkpoint]:
@@ -68,8 +69,7 @@ def test_the_last_checkpoint_is_left_to_the_training_itself_and_a_later_epoch_is
 
 
 def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_nothing_else() -> None:
-    wanted = Evaluation(every=2, episodes=32, worlds=16)
-    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", EVALUATION), EVALUATION, 40)
     assert spec.evaluate is not None and spec.evaluate.model_dump(exclude_none=True) == {
         **{"run": "ant-1", "checkpoint": 40, "episodes": 32, "worlds": 16, "config": {}, "keep": False}
     }
@@ -82,6 +82,13 @@ def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_
     spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
     assert (spec.queue, spec.share, spec.resources.cpus, spec.resources.memory) == ("idle", None, 0.5, 512)
     assert (spec.resources.gpus, spec.retry.attempts) == (0, 1)
+
+
+def test_the_evaluations_of_a_training_that_accepts_a_changed_robot_accept_it_too() -> None:
+    accepting = {**TRAINED, "train": {**TRAINED["train"], "accept_changed_robot": True}}
+    for trained, accepts in ((TRAINED, False), (accepting, True)):
+        spec = automatic_evaluation("ant-1", trained, place_of("slow", "a", EVALUATION), EVALUATION, 40)
+        assert spec.evaluate is not None and spec.evaluate.accept_changed_robot is accepts
 
 
 def test_a_spec_of_the_batch_api_is_read_with_care() -> None:
