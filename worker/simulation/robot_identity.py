@@ -41,7 +41,12 @@ def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
     """
     if reference is None:
         arrays = {field: getattr(builder, field) for field in _IMPORTED.split()}
-        joints, actuators, mass = builder.joint_count, 0, float(sum(builder.body_mass))
+        drives = {
+            field: builder.custom_attributes[f"mujoco:actuator_{field}"].values or []
+            for field in ("gainprm", "biasprm")
+        }
+        arrays |= drives
+        joints, actuators, mass = builder.joint_count, len(drives["gainprm"]), float(sum(builder.body_mass))
     else:
         moments = [inertia(reference, body) for body in range(reference.nbody)]
         arrays = {field: getattr(reference, field) for field in _COMPILED.split()}
