@@ -16,6 +16,7 @@ from orchestrator.cli.recordings import check_output
 from orchestrator.cli.tasks import ask_worker
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.domain.errors import SpecError
+from shared_store.wording import counted
 
 _EXAMPLES = """Examples:  muster robot arm.urdf
 muster robot package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml -o go1.png
@@ -93,7 +94,8 @@ def robot(
 
 def _print(found: dict[str, Any], compare: bool) -> None:
     root = "no free root" if found["fixed"] else "a free root"
-    echo(f"{found['file']}: {found['mass']:g} kg, {len(found['bodies'])} bodies, {len(found['joints'])} joints, {root}")
+    counts = f"{counted(len(found['bodies']), 'body', 'bodies')}, {counted(len(found['joints']), 'joint')}"
+    echo(f"{found['file']}: {found['mass']:g} kg, {counts}, {root}")
     _table(
         "JOINTS",
         ("NAME", "KIND", "LIMITS [rad, m]", "DEFAULT", "STIFFNESS", "DAMPING", "ARMATURE", "EFFORT"),
@@ -135,9 +137,9 @@ def _print(found: dict[str, Any], compare: bool) -> None:
         [(each["name"], each["kind"]) for each in found["sensors"]],
     )
     if found["corrected"] and not compare:
-        count, first = len(found["corrected"]), found["corrected"][0]
+        count, first = counted(len(found["corrected"]), "value"), found["corrected"][0]
         echo(
-            f"\ncorrected: {count} values that Newton's importer reads otherwise, such as {first['field']} of {first['element']} (--compare lists all)"
+            f"\ncorrected: {count} that Newton's importer reads otherwise, such as {first['field']} of {first['element']} (--compare lists all)"
         )
     if compare:
         _print_differences("CORRECTED", found["corrected"])

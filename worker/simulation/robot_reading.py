@@ -8,6 +8,7 @@ does not compile.
 from __future__ import annotations
 
 import fnmatch
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -241,7 +242,9 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    """An error in one line, of OpenUSD's only what they say."""
+    text = " ".join(str(error).split())
+    return "; ".join(re.findall(r" : '(.+?)'(?= Error in '|$)", text)) or text
 
 
 def _rewritten(file: RobotFile, model: Any, shown: str) -> str:
