@@ -31,7 +31,8 @@ def register(app: typer.Typer) -> None:
 def robot(
     file: Annotated[str, typer.Argument(help="An MJCF, URDF or USD file: a path, package:NAME/path, or newton:NAME.")],
     compare: Annotated[
-        bool, typer.Option("--compare", help="List every value that Newton's importer reads otherwise than MuJoCo.")
+        bool,
+        typer.Option("--compare", help="List every value that Newton's importer reads otherwise than the file says."),
     ] = False,
     output: Annotated[
         Path | None,

@@ -272,6 +272,14 @@ def test_switches_of_the_schema_are_held(tmp_path: Path) -> None:
     assert "physics:collisionEnabled" in made(joint="bool physics:collisionEnabled = 1").notes[0]
 
 
+def test_an_articulation_whose_bodies_do_not_collide_is_held(tmp_path: Path) -> None:
+    touch = "bool physics:collisionEnabled = 1"
+    assert read(usd(tmp_path, joint=touch)).builder.shape_collision_filter_pairs == []
+    (tmp_path / "off").mkdir()
+    off = usd(tmp_path / "off", robot="bool physxArticulation:enabledSelfCollisions = 0", joint=touch)
+    assert read(off).builder.shape_collision_filter_pairs == [(0, 1)]
+
+
 def _flags(reading: Reading) -> tuple[list[str], list[int]]:
     return reading.builder.shape_label, [int(flag) for flag in reading.builder.shape_flags]
 
