@@ -7,6 +7,7 @@ import json
 import math
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,11 @@ import numpy as np
 import warp as wp
 
 from worker.simulation.robot import Robot
-from worker.simulation.robot_elements import kind_of, name_of, word_of
+from worker.simulation.robot_elements import kind_of, name_of, short, word_of
 from worker.simulation.robot_judge import Difference
 from worker.simulation.robot_reading import AnotherRobot, Reading
 from worker.simulation.robot_values import shown_value
-from worker.simulation.robot_view import RobotView, joint_of
+from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs, is_limited, joint_of
 from worker.tasks.config import TaskConfig
 from worker.tasks.task import Task
 from worker.telemetry import picture
@@ -49,7 +50,7 @@ def describe(file: str, reading: Reading) -> dict[str, Any]:
             for name, body in zip(view.body_names, view.bodies, strict=True)
         ],
         "joints": [_joint(builder, view, joint) for joint in range(len(view.joint_names))],
-        "actuators": _actuators(reference.model) if reference else [],
+        "actuators": _actuators(reference.model) if reference else _drives(builder, view),
         "sensors": [{"name": name, "kind": kind} for name, kind in reference.sensors] if reference else [],
         "sites": view.site_names,
         "corrected": [_difference(each) for each in reading.corrected],
@@ -80,23 +81,72 @@ def _is_linear(builder: newton.ModelBuilder, dof: int) -> bool:
 
 
 def _actuators(model: Any) -> list[dict[str, Any]]:
+    """Those of a compiled model, ``mujoco.MjModel``."""
     found = []
     for actuator in range(model.nu):
         kind = word_of(mujoco.mjtTrn, model.actuator_trntype[actuator])
         target = {"jointinparent": "joint", "slidercrank": "site"}.get(kind, kind)
-        limited = bool(model.actuator_ctrllimited[actuator])
+        limits = {
+            name: values[actuator] if limited[actuator] else None
+            for name, limited, values in (
+                ("control", model.actuator_ctrllimited, model.actuator_ctrlrange),
+                ("force", model.actuator_forcelimited, model.actuator_forcerange),
+            )
+        }
         found.append(
-            {
-                "name": name_of(model, kind_of("actuator"), actuator),
-                "drives": f"{kind} {name_of(model, kind_of(target), int(model.actuator_trnid[actuator, 0]))}",
-                "gear": float(model.actuator_gear[actuator, 0]),
-                "gain": float(model.actuator_gainprm[actuator, 0]),
-                "bias": [float(each) for each in model.actuator_biasprm[actuator, :3]],
-                "dynamics": word_of(mujoco.mjtDyn, model.actuator_dyntype[actuator]),
-                "control_range": [float(each) for each in model.actuator_ctrlrange[actuator]] if limited else None,
-            }
+            _actuator(
+                name_of(model, kind_of("actuator"), actuator),
+                f"{kind} {name_of(model, kind_of(target), int(model.actuator_trnid[actuator, 0]))}",
+                model.actuator_gear[actuator],
+                model.actuator_gainprm[actuator],
+                model.actuator_biasprm[actuator],
+                word_of(mujoco.mjtDyn, model.actuator_dyntype[actuator]),
+                limits,
+            )
         )
     return found
+
+
+def _drives(builder: newton.ModelBuilder, view: RobotView) -> list[dict[str, Any]]:
+    """Those of a USD file: drives of joints, and actuators of MuJoCo's schema on joints."""
+    found = []
+    for actuator, dof in sorted((actuator, dof) for dof, actuator in actuators_of_dofs(builder).items()):
+        value = partial(actuator_value, builder, actuator=actuator)
+        limits = {
+            name: value(f"actuator_{word}range") if is_limited(builder, word, actuator) else None
+            for name, word in (("control", "ctrl"), ("force", "force"))
+        }
+        joint = view.joint_names[view.dofs.index(dof)]
+        dynamics = word_of(mujoco.mjtDyn, value("actuator_dyntype"))
+        found.append(
+            _actuator(
+                short(value("actuator_label")) or joint,
+                f"joint {joint}",
+                value("actuator_gear"),
+                value("actuator_gainprm"),
+                value("actuator_biasprm"),
+                dynamics,
+                limits,
+            )
+        )
+    return found
+
+
+def _actuator(
+    name: str, target: str, gear: Any, gain: Any, bias: Any, dynamics: str, limits: dict[str, Any]
+) -> dict[str, Any]:
+    """Source of the names: MuJoCo's documentation, actuation model; its force is ``gain input + b0 + b1 length + b2 velocity``."""
+    return {
+        "name": name,
+        "drives": target,
+        "gear": float(gear[0]),
+        "gain": float(gain[0]),
+        "bias": [float(bias[index]) for index in range(3)],
+        "stiffness": -float(bias[1]) or 0.0,
+        "damping": -float(bias[2]) or 0.0,
+        "dynamics": dynamics,
+        **{f"{word}_range": None if pair is None else [float(each) for each in pair] for word, pair in limits.items()},
+    }
 
 
 def _difference(difference: Difference) -> dict[str, str]:
@@ -125,10 +175,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m worker.robot", description=__doc__)
     parser.add_argument("file", help="as Robot's: a path, package:NAME/path, newton:NAME")
     parser.add_argument("--picture", type=Path, help="draw the robot in its default pose into this PNG file")
+    parser.add_argument("--fixed", action=argparse.BooleanOptionalAction, help="as Robot's")
+    parser.add_argument("--ignore", action="append", help="as one of Robot's")
+    parser.add_argument("--accept", action="append", default=[], help="as one of Robot's")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     warnings.simplefilter("ignore")
-    robot = Robot(options.file, passive=True)
+    ignored = {} if options.ignore is None else {"ignore": options.ignore}
+    robot = Robot(options.file, passive=True, fixed=options.fixed, accept=options.accept, **ignored)
     try:
         reading = robot.read()
     except ValueError as error:

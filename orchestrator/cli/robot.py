@@ -16,10 +16,12 @@ from orchestrator.cli.recordings import check_output
 from orchestrator.cli.tasks import ask_worker
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.domain.errors import SpecError
+from shared_store.wording import counted
 
 _EXAMPLES = """Examples:  muster robot arm.urdf
 muster robot package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml -o go1.png
-muster robot humanoid.xml --compare"""
+muster robot humanoid.xml --compare
+muster robot arm.usda --fixed --ignore "table*" --accept "joint root: stiffness\""""
 
 
 def register(app: typer.Typer) -> None:
@@ -29,26 +31,58 @@ def register(app: typer.Typer) -> None:
 def robot(
     file: Annotated[str, typer.Argument(help="An MJCF, URDF or USD file: a path, package:NAME/path, or newton:NAME.")],
     compare: Annotated[
-        bool, typer.Option("--compare", help="List every value that Newton's importer reads otherwise than MuJoCo.")
+        bool,
+        typer.Option("--compare", help="List every value that Newton's importer reads otherwise than the file says."),
     ] = False,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Draw its default pose into this PNG file.", show_default=False),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+    fixed: Annotated[
+        bool | None,
+        typer.Option(
+            "--fixed/--no-fixed",
+            help="Fix its root to the world, or let it move; else as in the file.",
+            show_default=False,
+        ),
+    ] = None,
+    ignore: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ignore",
+            metavar="PATTERN",
+            help="Leave out these bodies and geoms (repeatable); else floor and ground.",
+            show_default=False,
+        ),
+    ] = None,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--accept",
+            metavar="PATTERN",
+            help='Accept these differences from the file, "ELEMENT: VALUE" (repeatable).',
+            show_default=False,
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show a robot's file as a task would load it, beside MuJoCo's own reading.
 
-    It lists joints, limits, masses, actuators and sensors, and with -o it draws the default pose. MuJoCo's compiled model judges the file: what Newton's
-    importer reads otherwise is corrected, and what can't be held is refused by name.
+    It lists joints, limits, masses, actuators and sensors, and with -o it draws the default pose. MuJoCo's compiled model judges the file,
+    and USD's schema a USD file: what Newton's importer reads otherwise is corrected, and what can't be held is refused by name.
+    --fixed, --ignore and --accept are Robot's arguments fixed, ignore and accept.
     """
     if output is not None:
         check_output(output, overwrite, ".png")
     if sys.stderr.isatty():
         echo("importing the simulation, which takes some seconds …", err=True)
-    drawing = ["--picture", str(output)] if output else []
-    found: dict[str, Any] = ask_worker("worker.robot", [file, *drawing], f"{file} can't be shown")
+    arguments = ["--picture", str(output)] if output else []
+    arguments += [] if fixed is None else ["--fixed" if fixed else "--no-fixed"]
+    arguments += [
+        f"--{name}={each}" for name, given in (("ignore", ignore), ("accept", accept)) for each in given or ()
+    ]
+    found: dict[str, Any] = ask_worker("worker.robot", [*arguments, "--", file], f"{file} can't be shown")
     if as_json:
         echo_json(found, indent=1)
         raise typer.Exit(2 if "error" in found else 0)
@@ -61,7 +95,8 @@ def robot(
 
 def _print(found: dict[str, Any], compare: bool) -> None:
     root = "no free root" if found["fixed"] else "a free root"
-    echo(f"{found['file']}: {found['mass']:g} kg, {len(found['bodies'])} bodies, {len(found['joints'])} joints, {root}")
+    counts = f"{counted(len(found['bodies']), 'body', 'bodies')}, {counted(len(found['joints']), 'joint')}"
+    echo(f"{found['file']}: {found['mass']:g} kg, {counts}, {root}")
     _table(
         "JOINTS",
         ("NAME", "KIND", "LIMITS [rad, m]", "DEFAULT", "STIFFNESS", "DAMPING", "ARMATURE", "EFFORT"),
@@ -82,16 +117,17 @@ def _print(found: dict[str, Any], compare: bool) -> None:
     _table("BODIES", ("NAME", "MASS [kg]"), [(each["name"], f"{each['mass']:.6g}") for each in found["bodies"]])
     _table(
         "ACTUATORS",
-        ("NAME", "DRIVES", "GEAR", "GAIN", "BIAS", "DYNAMICS", "CONTROL"),
+        ("NAME", "DRIVES", "GEAR", "GAIN", "STIFFNESS", "DAMPING", "DYNAMICS", "CONTROL", "FORCE"),
         [
             (
                 each["name"],
                 each["drives"],
                 f"{each['gear']:.4g}",
                 f"{each['gain']:.4g}",
-                " ".join(f"{number:.4g}" for number in each["bias"]),
+                f"{each['stiffness']:.4g}",
+                f"{each['damping']:.4g}",
                 each["dynamics"],
-                "" if each["control_range"] is None else _range(*each["control_range"]),
+                *("" if each[name] is None else _range(*each[name]) for name in ("control_range", "force_range")),
             )
             for each in found["actuators"]
         ],
@@ -102,9 +138,9 @@ def _print(found: dict[str, Any], compare: bool) -> None:
         [(each["name"], each["kind"]) for each in found["sensors"]],
     )
     if found["corrected"] and not compare:
-        count, first = len(found["corrected"]), found["corrected"][0]
+        count, first = counted(len(found["corrected"]), "value"), found["corrected"][0]
         echo(
-            f"\ncorrected: {count} values that Newton's importer reads otherwise, such as {first['field']} of {first['element']} (--compare lists all)"
+            f"\ncorrected: {count} that Newton's importer reads otherwise, such as {first['field']} of {first['element']} (--compare lists all)"
         )
     if compare:
         _print_differences("CORRECTED", found["corrected"])
@@ -116,10 +152,10 @@ def _print(found: dict[str, Any], compare: bool) -> None:
 
 def _print_differences(title: str, differences: list[dict[str, str]]) -> None:
     if not differences:
-        echo(f"\n{title}: nothing; Newton's importer and MuJoCo read the same robot")
+        echo(f"\n{title}: nothing; Newton's importer reads the robot that its file says")
         return
     rows = [(each["element"], each["field"], each["here"], each["file"]) for each in differences]
-    _table(title, ("ELEMENT", "VALUE", "NEWTON", "FILE (MUJOCO)"), rows)
+    _table(title, ("ELEMENT", "VALUE", "NEWTON", "FILE"), rows)
 
 
 def _range(lower: float | None, upper: float | None) -> str:

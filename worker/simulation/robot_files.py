@@ -121,7 +121,7 @@ def _in_folder(file: str, folder: Path, name: str, where: str) -> Path:
 
 
 def _files(folder: Path) -> list[str]:
-    return sorted(item.name for item in folder.iterdir() if item.suffix.lower() in FORMATS)
+    return sorted(item.name for item in folder.iterdir() if item.suffix.lower() in FORMATS and item.is_file())
 
 
 def _kind_of_xml(text: str, shown: str) -> str:

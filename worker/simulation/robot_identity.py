@@ -61,7 +61,12 @@ def identity(builder: newton.ModelBuilder, reference: Any) -> RobotModel:
     """
     if reference is None:
         arrays = {field: getattr(builder, field) for field in _IMPORTED.split()}
-        joints, actuators, mass = builder.joint_count, 0, float(sum(builder.body_mass))
+        drives = {
+            field: builder.custom_attributes[f"mujoco:actuator_{field}"].values or []
+            for field in ("gainprm", "biasprm")
+        }
+        arrays |= drives
+        joints, actuators, mass = builder.joint_count, len(drives["gainprm"]), float(sum(builder.body_mass))
         elements = {
             f"body {short(label)}": {"mass": _rounded(own)}
             for label, own in zip(builder.body_label, builder.body_mass, strict=True)

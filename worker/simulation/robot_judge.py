@@ -119,12 +119,12 @@ def compare(
         twins = Twins(reference, builder)
         found = [difference for check in CHECKS for difference in check(twins)]
         found += _options(twins) if options else ()
-        counting = [each for each in found if not _matches(each, accept)] if found else [*_accelerations(twins)]
+        counting = [each for each in found if not matches(each, accept)] if found else [*_accelerations(twins)]
         bodies = {body: twins.body_indices[twin] for body, twin in twins.bodies.items() if body}
         return Comparison(tuple(counting), tuple(_notes(twins)), bodies)
 
 
-def _matches(difference: Difference, patterns: Sequence[str]) -> bool:
+def matches(difference: Difference, patterns: Sequence[str]) -> bool:
     return any(fnmatchcase(f"{difference.element}: {difference.field}", pattern) for pattern in patterns)
 
 

@@ -1,12 +1,14 @@
 """Reads a robot's file with Newton's importer, judged by MuJoCo's compiler.
 
 Newton reads the file as it is. Where the robot that it builds differs from MuJoCo's compiled model of the same file, the robot is
-built from the compiled model instead; what differs even then is refused by name.
+built from the compiled model instead; what differs even then is refused by name. USD's own schema judges a USD file, which MuJoCo
+does not compile.
 """
 
 from __future__ import annotations
 
 import fnmatch
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +29,8 @@ from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
 from worker.simulation.robot_judge import Comparison, Difference
 from worker.simulation.robot_reference import Reference
-from worker.simulation.robot_view import actuator_value
+from worker.simulation.robot_values import UNLIMITED
+from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs
 
 RAW_SOLREF = 1
 """Newton's mode of a joint that passes the ``solref`` of its limit to MuJoCo unchanged."""
@@ -41,6 +44,8 @@ REMEDIES = {
     "acceleration in the same state": "No single value shows why: leave out parts of the file until it is read",
 }
 """What to do about a value that Newton can't hold, by its field."""
+AS_IMPORTED = "loaded as Newton's importer reads it, since changed robots are accepted: {}"
+"""Note of a robot that would be refused."""
 FILE = "file"
 """Stands for an element where Newton's importer can't read the file at all."""
 SOLREF_DEFAULT = (0.02, 1.0)
@@ -93,7 +98,8 @@ class Reading:
         first = self.corrected[0]
         otherwise = f"differs in {counted(len(self.corrected), 'value')}, first in {first.field} of {first.element}"
         why = "can't read it" if first.element == FILE else otherwise
-        return [f"built as MuJoCo reads its file; Newton's importer {why}", *self.notes]
+        judge = "MuJoCo reads" if self.reference else "USD's schema reads"
+        return [f"built as {judge} its file; Newton's importer {why}", *self.notes]
 
 
 def shown(file: str | Path) -> str:
@@ -132,9 +138,7 @@ def read(source: Source) -> Reading:
     file, name = robot_files.read(source.file), shown(source.file)
     floating = None if source.fixed is None else not source.fixed
     if file.format == "usd":
-        imported = _imported(source, file, floating)
-        robot_usd.check(file.source, imported, _ignored(source), name)
-        return Reading(imported, None, (), (), identity(imported, None))
+        return _read_usd(source, file, floating, name)
     reference = robot_reference.compile_file(file, fixed=source.fixed, ignored=_ignored(source), shown=name)
     model, is_readable = reference.model, True
     try:
@@ -157,9 +161,22 @@ def read(source: Source) -> Reading:
         if not CHANGED_ROBOTS.get() or not is_readable:
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
-        note = f"loaded as Newton's importer reads it, since changed robots are accepted: {refusal}"
-        return Reading(builder, reference, corrected, (*reference.notes, note), identity(builder, None))
+        notes = (*reference.notes, AS_IMPORTED.format(refusal))
+        return Reading(builder, reference, corrected, notes, identity(builder, None))
     return Reading(builder, reference, corrected, notes, identity(builder, model))
+
+
+def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str) -> Reading:
+    builder = _imported(source, file, floating)
+    found, corrected = robot_usd.judge(file.source, builder, _ignored(source), name, source.accept)
+    notes = found.notes
+    if found.differences:
+        refusal = AnotherRobot(name, found.differences)
+        if not CHANGED_ROBOTS.get():
+            raise refusal
+        builder = _imported(source, file, floating)  # as the training had it
+        notes = (AS_IMPORTED.format(refusal),)
+    return Reading(builder, None, corrected, notes, identity(builder, None))
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
@@ -211,6 +228,8 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
                     floating=floating,
                     ignore_paths=[f".*/{pattern}" for pattern in _ignored(source)],
                     load_visual_shapes=source.visuals,
+                    only_load_enabled_rigid_bodies=True,
+                    schema_resolvers=list(robot_usd.SCHEMAS),
                     parse_mujoco_options=source.options,
                 )
     except (ValueError, KeyError, RuntimeError) as error:
@@ -223,7 +242,9 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    """An error in one line, of OpenUSD's only what they say."""
+    text = " ".join(str(error).split())
+    return "; ".join(re.findall(r" : '(.+?)'(?= Error in '|$)", text)) or text
 
 
 def _rewritten(file: RobotFile, model: Any, shown: str) -> str:
@@ -250,7 +271,15 @@ def _name_hinges(own: newton.ModelBuilder, hinges: Mapping[str, Sequence[str]]) 
 
 
 def _take_controls(own: newton.ModelBuilder) -> None:
-    """Let every actuator of the file follow the controls, and none Newton's joint targets, which a task does not write."""
+    """Let every actuator of the file follow the controls, and none Newton's joint targets, which a task does not write.
+
+    A drive of a USD file becomes an actuator, unless its joint has one beside it.
+    """
+    drives = {
+        dof: (own.joint_target_ke[dof], own.joint_target_kd[dof], own.joint_effort_limit[dof])
+        for dof, mode in enumerate(own.joint_target_mode)
+        if mode != int(newton.JointTargetMode.NONE)
+    }
     for dof in range(own.joint_dof_count):
         own.joint_target_mode[dof] = int(newton.JointTargetMode.NONE)
         own.joint_target_ke[dof] = own.joint_target_kd[dof] = 0.0
@@ -268,3 +297,17 @@ def _take_controls(own: newton.ModelBuilder) -> None:
     actuation.register(own)
     for name, (_, default) in actuation.MOTOR_ATTRIBUTES.items():
         own.custom_attributes[f"muster:{name}"].values = [default] * len(rows or ())
+    _add_drives(own, drives)
+
+
+def _add_drives(own: newton.ModelBuilder, drives: Mapping[int, tuple[float, float, float]]) -> None:
+    """Make actuators of drives: by degree of freedom, stiffness, damping and greatest force, in the joint's units."""
+    view, driven = RobotView(own, ""), actuators_of_dofs(own)
+    for name, dof in zip(view.joint_names, view.dofs, strict=True):
+        stiffness, damping, limit = drives.get(dof, (0.0, 0.0, 0.0))
+        limits: Any = {"effort_limit": limit} if 0.0 < limit < UNLIMITED else {}
+        actuator: actuation.Actuator = actuation.PositionActuator(name, stiffness, damping, **limits)
+        if not stiffness:
+            actuator = actuation.VelocityActuator(name, damping, **limits)
+        if dof not in driven and stiffness + damping > 0.0:
+            actuation.add(own, [name], [dof], [actuator], "robot")

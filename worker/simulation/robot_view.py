@@ -115,7 +115,7 @@ class RobotView:
             (_limit(template.joint_limit_lower[dof], -1), _limit(template.joint_limit_upper[dof], 1))
             for dof in self.dofs
         ]
-        columns = _actuators_of_dofs(template)
+        columns = actuators_of_dofs(template)
         self.actuators = [columns.get(dof, -1) for dof in self.dofs]
         self.efforts = [
             _effort(template, dof, actuator) for dof, actuator in zip(self.dofs, self.actuators, strict=True)
@@ -250,7 +250,7 @@ def _value(template: newton.ModelBuilder, attribute: str, actuator: int) -> Any:
     return attributes.default if value is None else value
 
 
-def _actuators_of_dofs(template: newton.ModelBuilder) -> dict[int, int]:
+def actuators_of_dofs(template: newton.ModelBuilder) -> dict[int, int]:
     """The first actuator on each degree of freedom with a joint transmission; further ones can't be addressed by joint name."""
     columns: dict[int, int] = {}
     labels: Any = template.custom_attributes["mujoco:joint_dof_label"].values or {}
@@ -272,9 +272,9 @@ def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
     limits = [joint_limit if joint_limit < UNLIMITED_EFFORT else math.inf]
     if actuator >= 0:
         gear = abs(float(actuator_value(template, "actuator_gear", actuator)[0]))
-        if _is_limited(template, "force", actuator):
+        if is_limited(template, "force", actuator):
             limits.append(gear * max(map(abs, actuator_value(template, "actuator_forcerange", actuator))))
-        if not int(actuator_value(template, "actuator_biastype", actuator)) and _is_limited(template, "ctrl", actuator):
+        if not int(actuator_value(template, "actuator_biastype", actuator)) and is_limited(template, "ctrl", actuator):
             gain = abs(float(actuator_value(template, "actuator_gainprm", actuator)[0]))
             limits.append(gear * gain * max(map(abs, actuator_value(template, "actuator_ctrlrange", actuator))))
     return float(min(limits))
@@ -303,7 +303,7 @@ def _input(template: newton.ModelBuilder, actuator: int) -> Input | Literal[""]:
     return "velocity" if math.isclose(velocity, -gain, rel_tol=1e-5) else ""
 
 
-def _is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:
+def is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:
     """MuJoCo's rule for limits: on, off, or (2) on if a range is given."""
     limited = int(actuator_value(template, f"actuator_{what}limited", actuator))
     return bool(actuator_value(template, f"actuator_has_{what}range", actuator)) if limited == 2 else limited == 1

@@ -130,10 +130,9 @@ class Camera:
         owners, bodies, flags = numbers(model.shape_world), numbers(model.shape_body), numbers(model.shape_flags)
         radii, places = numbers(model.shape_collision_radius), numbers(model.shape_transform)
         scales = numbers(model.shape_scale)
-        links = len(self.stage.links)
         least, most = np.full(3, np.inf), np.full(3, -np.inf)
         for shape in np.flatnonzero((owners == 0) & (bodies >= 0) & (flags & int(newton.ShapeFlags.VISIBLE) > 0)):
-            pose = wp.transform(*map(float, poses[0, bodies[shape] % links]))
+            pose = wp.transform(*map(float, poses[0, self.stage.link_of[bodies[shape]]]))
             place = pose * wp.transform(*map(float, places[shape]))
             source = model.shape_source[shape]
             if isinstance(source, newton.Mesh):  # its origin may be anywhere

@@ -17,6 +17,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation import robot_files
+from worker.simulation.carriers import is_carrier
 from worker.simulation.on_host import numbers
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
@@ -44,11 +45,12 @@ class Stage:
     Attributes:
         model: Newton's model of all worlds.
         state: Where the bodies are, after :meth:`pose`.
-        links: Names of the bodies of one world, in the model's order.
+        links: Names of the links of one world, in the model's order: its bodies, without those that only carry a joint.
+        link_of: Index of each link by that of its body in world 0.
         joints: Names of the joints with one degree of freedom.
         coordinates: Their columns among the joint coordinates.
         dofs: Their columns among the joint velocities.
-        root: The body that a picture follows.
+        root: The link that a picture follows.
         robot_file: ``robot.urdf`` or ``robot.xml`` (MJCF) and the text of the robot's file; None of other kinds of files.
 
     Raises:
@@ -66,8 +68,10 @@ class Stage:
             self.joints += [own + name for name in view.joint_names]
             self.coordinates += view.coordinates
             self.dofs += view.dofs
-        self.root = views[0].root_body
-        self.links = _link_names(template.body_label)
+        bodies = [body for body, label in enumerate(template.body_label) if not is_carrier(label)]
+        self.links = _link_names([template.body_label[body] for body in bodies])
+        self.link_of = {body: link for link, body in enumerate(bodies)}
+        self.root = self.link_of[views[0].root_body]
         scene = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(scene)
         scene.replicate(template, worlds)
@@ -103,7 +107,7 @@ class Stage:
         assert joint_q is not None and joint_qd is not None
         joint_q.assign(np.ascontiguousarray(coordinates, np.float32).reshape(-1))
         newton.eval_fk(self.model, joint_q, joint_qd, self.state)
-        return numbers(self.state.body_q).reshape(self.worlds, -1, 7)
+        return numbers(self.state.body_q).reshape(self.worlds, -1, 7)[:, list(self.link_of)]
 
     def meshes(self) -> dict[str, bytes]:
         """The visible shapes of one world, each link in its own frame, as binary glTF (y up, as glTF has it).
@@ -115,7 +119,6 @@ class Stage:
         import trimesh
 
         model = self.model
-        names = self.links
         bodies, owners, flags = numbers(model.shape_body), numbers(model.shape_world), numbers(model.shape_flags)
         kinds, sizes, places = numbers(model.shape_type), numbers(model.shape_scale), numbers(model.shape_transform)
         colors = numbers(model.shape_color)
@@ -123,7 +126,9 @@ class Stage:
         for shape in range(model.shape_count):
             if owners[shape] > 0 or not flags[shape] & newton.ShapeFlags.VISIBLE:
                 continue
-            name = "ground" if owners[shape] < 0 else "" if bodies[shape] < 0 else names[bodies[shape]]
+            name = (
+                "ground" if owners[shape] < 0 else "" if bodies[shape] < 0 else self.links[self.link_of[bodies[shape]]]
+            )
             found = _mesh(int(kinds[shape]), sizes[shape], model.shape_source[shape])
             if found is None:
                 continue

@@ -51,3 +51,58 @@ def test_it_lists_what_can_t_be_held(tmp_path: Path) -> None:
         "muster: late.xml would be another robot here: actuator motor: delay is 0, in the file 0.01"
     )
     assert found.stderr.count("\n") == 1
+
+
+USD = """#usda 1.0
+(
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Xform "robot" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {
+    def Cube "base" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI", "PhysicsCollisionAPI"]) {
+        double size = 0.2
+        float physics:mass = 2
+    }
+    def Cube "arm" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI", "PhysicsCollisionAPI"]) {
+        double size = 0.2
+        float physics:mass = 3
+        double3 xformOp:translate = (0.5, 0, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+    def Cube "table" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {
+    }
+    def PhysicsRevoluteJoint "j" (prepend apiSchemas = ["PhysicsDriveAPI:angular"]) {
+        rel physics:body0 = </robot/base>
+        rel physics:body1 = </robot/arm>
+        point3f physics:localPos0 = (0.5, 0, 0)
+        uniform token drive:angular:physics:type = "acceleration"
+        float drive:angular:physics:stiffness = 10
+        float drive:angular:physics:damping = 1
+        float drive:angular:physics:maxForce = 7
+    }
+}
+"""
+
+
+def test_it_shows_drives_of_a_usd_file_as_its_task_would_have_them(tmp_path: Path) -> None:
+    (tmp_path / "arm.usda").write_text(USD)
+    refused = command(tmp_path, "arm.usda", "--ignore", "table", "--compare")
+    assert (
+        refused.returncode == 2 and refused.stderr.count("\n") == 1 and "drive /robot/j.angular  type" in refused.stdout
+    )
+    assert "accept=('drive /robot/j.angular: type',)" in refused.stderr
+    taken = ("arm.usda", "--ignore", "table", "--accept", "drive *: type", "--fixed")
+    found = json.loads(command(tmp_path, *taken, "--json").stdout)
+    assert found["fixed"] and [body["name"] for body in found["bodies"]] == ["base", "arm"]
+    (drive,) = found["actuators"]
+    assert (drive["name"], drive["drives"], drive["force_range"]) == ("j", "joint j", [-7.0, 7.0])
+    assert (round(drive["stiffness"], 3), round(drive["damping"], 3)) == (572.958, 57.296)
+    shown = command(tmp_path, *taken).stdout
+    assert "ACTUATORS" in shown and "-7 to 7" in shown and "no free root" in shown
+
+
+def test_a_file_of_bytes_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "bytes.usda").write_bytes(bytes(range(256)))
+    refused = command(tmp_path, "bytes.usda")
+    assert refused.returncode == 2 and refused.stdout == ""
+    assert refused.stderr.startswith("muster: bytes.usda can't be read: ") and "pxrInternal" not in refused.stderr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -299,68 +298,3 @@ def test_the_identity_of_a_robot_follows_its_model_and_not_its_notation() -> Non
     assert plain == same and plain.digest != other.digest
     elements = {**plain.elements, "body b": {"mass": 1.5}}
     assert dataclasses.replace(plain, digest="", mass=1.5, elements=elements) == dataclasses.replace(other, digest="")
-
-
-USD = """#usda 1.0
-(
-    metersPerUnit = 1
-    upAxis = "Z"
-)
-def Xform "robot" (
-    prepend apiSchemas = ["PhysicsArticulationRootAPI"]
-)
-{{
-    def Cube "base" (
-        prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]
-    ) {{
-        float physics:mass = 2
-    }}
-    def Cube "arm" (
-        prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]
-    ) {{
-        float physics:mass = 3
-    }}
-    def PhysicsRevoluteJoint "j" {{
-        rel physics:body0 = </robot/base>
-        rel physics:body1 = </robot/arm>
-        uniform token physics:axis = "Y"
-        float physics:lowerLimit = -30
-        float physics:upperLimit = 60
-    }}
-    {more}
-}}
-"""
-
-
-def usd(folder: Path, more: str = "") -> Path:
-    path = folder / "robot.usda"
-    path.write_text(USD.format(more=more))
-    return path
-
-
-def test_a_usd_file_is_judged_by_its_schema(tmp_path: Path) -> None:
-    reading = read(str(usd(tmp_path)))
-    assert reading.identity.mass == 5.0 and reading.reference is None
-
-
-def test_a_loop_of_a_usd_file_is_refused_by_its_joint(tmp_path: Path) -> None:
-    second = 'def PhysicsRevoluteJoint "k" {\nrel physics:body0 = </robot/base>\nrel physics:body1 = </robot/arm>\n}'
-    with pytest.raises(ValueError, match=r"joint k closes a loop"):
-        read(str(usd(tmp_path, second)))
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
-        ("metersPerUnit = 1", "metersPerUnit = 0.01", r"metersPerUnit is 0.01; export the file in metres"),
-        ("float physics:mass = 3", "", r"body arm moves and has no mass"),
-        ("physics:upperLimit = 60", "physics:upperLimit = nan", r"joint j: its limits -30 and nan are no range"),
-        ("physics:upperLimit = 60", "physics:upperLimit = -40", r"joint j: its limits -30 and -40 are no range"),
-        ("def PhysicsRevoluteJoint", "def PhysicsJoint", r"joint j has 0 degrees of freedom, in the file 6"),
-    ],
-)
-def test_what_a_usd_file_says_otherwise_is_refused(tmp_path: Path, before: str, after: str, words: str) -> None:
-    path = usd(tmp_path)
-    path.write_text(path.read_text().replace(before, after))
-    with pytest.raises(ValueError, match=words):
-        read(str(path))
