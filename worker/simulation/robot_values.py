@@ -71,6 +71,11 @@ def extent(model: Any, geom: int) -> Any:
     return np.vstack([position, axes @ half @ axes.T])
 
 
+def has_mask(model: Any, geom: int) -> bool:
+    """Whether a geom can touch others by its masks."""
+    return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+
+
 def touching(model: Any) -> Any:
     """Which geoms can touch by their masks, excluded bodies and kinship, shape ``(geoms, geoms)``, bool.
 
