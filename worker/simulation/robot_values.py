@@ -32,6 +32,13 @@ def matrix(quaternion: Any) -> Any:
     return found.reshape(3, 3)
 
 
+def quaternion(matrix: Any) -> Any:
+    """Quaternion wxyz of a rotation matrix, shape ``(4,)``."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix, np.float64).ravel())
+    return found
+
+
 def inertia(model: Any, body: int) -> Any:
     """Moments of inertia about the centre of mass in the body's own frame [kg m^2], shape ``(3, 3)``."""
     rotation = matrix(model.body_iquat[body])
