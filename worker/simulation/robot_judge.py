@@ -354,8 +354,17 @@ def _accelerations(twins: Twins) -> Iterator[Difference]:
             theirs = first.qacc[file.jnt_dofadr[joint] :][:width]
             mine = second.qacc[built.jnt_dofadr[twin] :][:width]
             if not (np.abs(theirs - mine) <= ACCELERATION * scale).all():
-                yield Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
+                unexplained = Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
+                yield next(_inertia_axes(twins), unexplained)
                 return
+
+
+def _inertia_axes(twins: Twins) -> Iterator[Difference]:
+    """Bodies whose drag differs, since a medium acts on the axes of their inertias: Newton keeps no axes of equal moments."""
+    for body, twin in twins.bodies.items() if twins.file.opt.density else ():
+        theirs, mine = matrix(twins.file.body_iquat[body]), matrix(twins.built.body_iquat[twin])
+        if twins.file.body_mass[body] and (np.abs(theirs.T @ mine).max(0) < 1.0 - RELATIVE).any():
+            yield Difference(twins.name("body", body), "axes of inertia", mine, theirs)
 
 
 def _notes(twins: Twins) -> Iterator[str]:

@@ -38,6 +38,8 @@ REMEDIES = {
     "dampingpoly": "Give damping one number",
     "stiffnesspoly": "Give stiffness one number",
     "fluid": "Leave out fluidshape",
+    "anchor2": "Let both sites of the equality be at one place in the first pose of the file",
+    "axes of inertia": "Give the body an <inertial> of three different moments, on whose axes the medium's drag acts",
     "acceleration in the same state": "No single value shows why: leave out parts of the file until it is read",
 }
 """What to do about a value that Newton can't hold, by its field."""
@@ -148,10 +150,13 @@ def read(source: Source) -> Reading:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
         found = _amended(source, builder, model, found)
+    notes = list(reference.notes)
     if found.differences:
-        builder = _imported(source, RobotFile(_rewritten(file, model, name), "mjcf", {}), None)
+        builder = _imported(source, RobotFile(_rewritten(file, model, name), "mjcf"), None)
         found = _amended(source, builder, model, _compared(source, builder, model))
-    notes = (*reference.notes, *found.notes)
+        if reference.looks:
+            notes.append(f"pictures lack the {reference.looks} of the file, since MuJoCo's compiled model has none")
+    notes += found.notes
     if found.differences:
         refusal = AnotherRobot(name, found.differences)
         if not CHANGED_ROBOTS.get() or not is_readable:
@@ -159,7 +164,7 @@ def read(source: Source) -> Reading:
         builder = _imported(source, file, floating)  # as the training had it
         note = f"loaded as Newton's importer reads it, since changed robots are accepted: {refusal}"
         return Reading(builder, reference, corrected, (*reference.notes, note), identity(builder, None))
-    return Reading(builder, reference, corrected, notes, identity(builder, model))
+    return Reading(builder, reference, corrected, tuple(notes), identity(builder, model))
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
