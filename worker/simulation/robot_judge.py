@@ -45,8 +45,8 @@ FAR = 10.0
 """Ends of an equality are compared this much less sharply: their places add up along chains of bodies."""
 ACCELERATION = 1e-3
 """Accelerations in the same state are equal up to this share of the greatest one."""
-ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY")
-"""Flags that a task's solver options set, that nothing here reads, or that are compared in another way."""
+ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV")
+"""Flags that a task's solver options set, that nothing here reads, that only report, or that are compared in another way."""
 COUNTS = {
     "coordinates": "nq",
     "degrees of freedom": "nv",

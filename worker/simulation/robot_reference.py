@@ -17,6 +17,11 @@ from worker.simulation import robot_files
 from worker.simulation.robot_elements import kind_of, name_of, some, word_of
 from worker.simulation.robot_files import RobotFile
 
+_KINDS = {"jnt": "joint", "dof": "dof", "eq": "equality"} | {
+    kind: kind for kind in ("body", "geom", "site", "tendon", "actuator")
+}
+"""Kinds of elements, by the prefix of their fields in ``mujoco.MjModel``."""
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -39,7 +44,7 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     """Compile an MJCF or URDF file.
 
     Args:
-        file: The file.
+        file: The file, whose ``spec`` is changed and compiled.
         fixed: Whether its root is fixed to the world; None: as in the file.
         ignored: Regular expressions of the names of geoms and sites to leave out.
         shown: The file's name, for errors.
@@ -51,14 +56,14 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     if file.format == "urdf":
         spec, looks = _urdf_spec(file, shown, notes)
     else:
-        spec = file.spec.copy()
-        looks = _without_looks(spec, notes)
+        spec, looks = file.spec, ""  # not a copy: MjSpec.copy drops actuators of unknown targets
     sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
     for element in (*spec.sensors, *spec.keys):
         spec.delete(element)  # sensors may name places that do not exist, and poses do not fit another root
     for element in (*spec.geoms, *spec.sites):
         if any(re.match(pattern, element.name) for pattern in ignored):
             spec.delete(element)
+    looks = _without_looks(spec, notes) or looks
     if fixed is not None:
         _set_root(spec, fixed, shown)
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
@@ -72,9 +77,13 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
 
 
 def _without_looks(spec: Any, notes: list[str]) -> str:
-    """Take textures and skins, which move nothing, from a file, and note those of which there is no picture; what was taken."""
+    """Take textures and skins, which move nothing, from a file, and note those that are missing.
+
+    Returns:
+        What of them a picture would have shown: textures of meshes.
+    """
     names = {texture.name or Path(texture.file).stem for texture in spec.textures}
-    folder = Path(spec.modelfiledir) / (spec.texturedir or spec.meshdir)
+    folder = Path(spec.modelfiledir) / spec.texturedir
     files = [file for texture in spec.textures for file in (texture.file, *texture.cubefiles)]
     missing = [file for file in files if file and not (folder / file).is_file()]
     missing += [
@@ -82,15 +91,18 @@ def _without_looks(spec: Any, notes: list[str]) -> str:
         for skin in spec.skins
         if skin.file and not (Path(spec.modelfiledir) / spec.meshdir / skin.file).is_file()
     ]
+    textured = {material.name for material in spec.materials if any(material.textures)}
+    meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
     for material in spec.materials:
         missing += [name for name in material.textures if name and name not in names]
         material.textures = [""] * len(material.textures)
+    for light in spec.lights:
+        light.texture = ""
     if missing:
         notes.append(f"pictures lack textures or skins that the file names and that are missing ({some(missing)})")
-    taken = [word for word, elements in (("textures", spec.textures), ("skins", spec.skins)) if len(elements)]
     for element in (*spec.textures, *spec.skins):
         spec.delete(element)
-    return " and ".join(taken)
+    return "textures" if any(geom.material in textured for geom in meshes) else ""
 
 
 def _set_root(spec: Any, fixed: bool, shown: str) -> None:
@@ -119,21 +131,17 @@ def _set_root(spec: Any, fixed: bool, shown: str) -> None:
 
 def _empty_ranges(model: Any) -> Iterator[str]:
     """What has a range without any values, and so no limit in MuJoCo."""
-    for kind, limit in (
-        ("jnt", ""),
-        ("jnt", "actfrc"),
-        ("tendon", ""),
-        ("tendon", "actfrc"),
-        *(("actuator", word) for word in ("ctrl", "force", "act")),
-    ):
+    limits = [(kind, limit) for kind in ("jnt", "tendon") for limit in ("", "actfrc")]
+    for kind, limit in (*limits, *(("actuator", word) for word in ("ctrl", "force", "act"))):
         ranges, limited = getattr(model, f"{kind}_{limit}range"), getattr(model, f"{kind}_{limit}limited")
-        for index in np.flatnonzero((ranges[:, 0] >= ranges[:, 1]) & ranges.any(1) & (limited == 0)):
-            element = {"jnt": "joint"}.get(kind, kind)
-            lower, upper = ranges[index]
-            yield (
-                f"{element} {name_of(model, kind_of(element), index)}: its {limit}range {lower:.4g} to {upper:.4g} has no values, so it is not "
-                "limited, as in MuJoCo"
-            )
+        empty = np.flatnonzero((ranges[:, 0] >= ranges[:, 1]) & ranges.any(1) & (limited == 0))
+        element = _KINDS[kind]
+        names = [
+            f"{element} {name_of(model, kind_of(element), int(index))} ({ranges[index, 0]:.4g} to {ranges[index, 1]:.4g})"
+            for index in empty
+        ]
+        if names:
+            yield f"a {limit}range without values is no limit, as in MuJoCo: {some(names)}"
 
 
 def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
@@ -189,12 +197,6 @@ def _refusal(spec: Any, error: Exception, shown: str) -> str:
     return f"{shown}: MuJoCo refuses it: {text}{remedy}"
 
 
-_KINDS = {"jnt": "joint", "dof": "dof", "eq": "equality"} | {
-    kind: kind for kind in ("body", "geom", "site", "tendon", "actuator")
-}
-"""Kinds of elements, by the prefix of their fields in ``mujoco.MjModel``."""
-
-
 def _check_numbers(model: Any, shown: str) -> None:
     """Refuse numbers that are not finite: MuJoCo only warns, and every step would reset every world."""
     for field in dir(model):
@@ -212,6 +214,7 @@ def _check_numbers(model: Any, shown: str) -> None:
 
 URDF_UNREAD = (("limit", "velocity"), ("mimic", "joint"))
 """Attributes of URDF, by element, that are read as no number here."""
+URDF_LIMITS = ("lower", "upper", "effort")
 URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
 
@@ -226,7 +229,8 @@ def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> tuple[Any, str]
     for element in (*root.findall("link"), *root.findall("joint")):
         _check_urdf_numbers(element, shown)
     for joint in root.iter("joint"):
-        _check_urdf_joint(joint, shown, notes)
+        _check_urdf_joint(joint, shown)
+    notes += _unlimited(root)
     looks = "visuals" if root.find("link/visual") is not None else ""
     for link in root.iter("link"):
         for visual in link.findall("visual"):
@@ -289,25 +293,26 @@ def _number(word: str) -> float:
         return 0.0
 
 
-def _check_urdf_joint(joint: ElementTree.Element, shown: str, notes: list[str]) -> None:
+def _check_urdf_joint(joint: ElementTree.Element, shown: str) -> None:
     name, kind = joint.get("name"), joint.get("type")
-    if kind is None:
-        return  # a joint of a <transmission>
-    if kind not in URDF_JOINTS:
+    if kind is not None and kind not in URDF_JOINTS:  # else a joint of a <transmission>
         raise ValueError(f"{shown}: joint {name} is of type {kind!r}; URDF has {', '.join(URDF_JOINTS)}")
-    if kind not in ("revolute", "prismatic"):
-        return
-    limit = joint.find("limit")
-    if limit is None:
-        notes.append(f"joint {name}: a {kind} joint of URDF needs a <limit>; without it the joint turns without end")
-        return
-    lower, upper, effort = (_number(limit.get(word, "0")) for word in ("lower", "upper", "effort"))
-    if lower == upper == 0.0:
-        notes.append(f"joint {name}: its limits are both 0 or left out, so it is not limited, as in MuJoCo")
-    if effort < 0.0:
-        notes.append(
-            f"joint {name}: its effort limit {effort:g} is negative, so its force is not limited, as in MuJoCo"
-        )
+
+
+def _unlimited(root: ElementTree.Element) -> Iterator[str]:
+    """Which joints of a URDF file have no limits, though URDF wants some, or a negative one."""
+    unlimited, negative = [], []
+    for joint in root.iter("joint"):
+        limit, name = joint.find("limit"), str(joint.get("name"))
+        lower, upper, effort = (0.0 if limit is None else _number(limit.get(word, "0")) for word in URDF_LIMITS)
+        if joint.get("type") in ("revolute", "prismatic") and lower == upper == 0.0:
+            unlimited.append(name)
+        if effort < 0.0:
+            negative.append(name)
+    if unlimited:
+        yield f"joints without <limit>, or whose lower and upper are both 0, move without end, as in MuJoCo: {some(unlimited)}"
+    if negative:
+        yield f"a negative effort is no limit, as in MuJoCo: joint {some(negative)}"
 
 
 def _add_mimics(spec: Any, root: ElementTree.Element) -> None:
