@@ -65,9 +65,14 @@ COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "equality": "neq"}
 """Fields of ``mujoco.MjModel`` that count elements, where they are not an n and the kind's word."""
 
 
+def count_of(model: Any, kind: str) -> int:
+    """Number of a model's elements of a kind."""
+    return int(getattr(model, COUNTS.get(kind, f"n{kind}")))
+
+
 def unique_names(model: Any, kind: str) -> list[str]:
     """Names of all elements of a kind, as Newton's importer keeps them and each once; made ones where the file gives none."""
-    count = range(getattr(model, COUNTS.get(kind, f"n{kind}")))
+    count = range(count_of(model, kind))
     named = {index: bool(mujoco.mj_id2name(model, kind_of(kind), index)) for index in count}
     names: dict[int, str] = {}
     taken: set[str] = set()

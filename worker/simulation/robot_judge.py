@@ -20,7 +20,7 @@ from worker.simulation.robot_connections import (
     tendon_ends,
     tendon_numbers,
 )
-from worker.simulation.robot_elements import some, word_of
+from worker.simulation.robot_elements import count_of, some, word_of
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import (
@@ -141,8 +141,9 @@ def _matches(difference: Difference, patterns: Sequence[str]) -> bool:
 
 
 def _counts(twins: Twins) -> Iterator[Difference]:
-    for kind, pairs, count in (("body", twins.bodies, twins.file.nbody), ("joint", twins.joints, twins.file.njnt)):
-        for index in range(count):
+    kinds = {"body": twins.bodies, "joint": twins.joints, "tendon": twins.tendons, "equality": twins.equalities}
+    for kind, pairs in kinds.items():
+        for index in range(count_of(twins.file, kind)):
             if index not in pairs:
                 yield Difference(twins.name(kind, index), "existence", "missing", "there")
     for what, field in COUNTS.items():
@@ -319,8 +320,6 @@ def _equalities(twins: Twins) -> Iterator[Difference]:
         for name, theirs in held(file, equality).items():
             scale = {"polycoef": 0.0, "torquescale": 0.0}.get(name, FAR * max(1.0, length(file)))
             yield from _unequal(element, name, mine[name], theirs, scale)
-    for equality in set(range(file.neq)) - set(twins.equalities):
-        yield Difference(twins.name("equality", equality), "existence", "missing", "there")
 
 
 def _options(twins: Twins) -> Iterator[Difference]:

@@ -12,7 +12,7 @@ from newton.solvers import SolverMuJoCo
 
 from worker.simulation import carriers
 from worker.simulation.robot_connections import Ends, equality_ends, pair_ends, tendon_ends, wrapped_geoms
-from worker.simulation.robot_elements import Pairs, kind_of, name_of, names_of, paired, plain, short
+from worker.simulation.robot_elements import Pairs, count_of, kind_of, name_of, names_of, paired, plain, short
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
 
@@ -136,10 +136,10 @@ class Twins:
 
     def _both(self, kind: str) -> tuple[list[Ends], list[Ends]]:
         """Ends of all elements of a kind in both models, by the file's indices."""
-        count, ends = ENDS[kind]
+        ends = ENDS[kind]
         return (
-            [ends(self.file, index) for index in range(getattr(self.file, count))],
-            [self.in_file(ends(self.built, index)) for index in range(getattr(self.built, count))],
+            [ends(self.file, index) for index in range(count_of(self.file, kind))],
+            [self.in_file(ends(self.built, index)) for index in range(count_of(self.built, kind))],
         )
 
     def in_file(self, ends: Ends) -> Ends:
@@ -196,12 +196,8 @@ class Twins:
         }
 
 
-ENDS: dict[str, tuple[str, Callable[[Any, int], Ends]]] = {
-    "tendon": ("ntendon", tendon_ends),
-    "equality": ("neq", equality_ends),
-    "pair": ("npair", pair_ends),
-}
-"""Field of ``mujoco.MjModel`` that counts the elements of a kind, and what says their ends."""
+ENDS: dict[str, Callable[[Any, int], Ends]] = {"tendon": tendon_ends, "equality": equality_ends, "pair": pair_ends}
+"""What says the ends of an element, by its kind."""
 
 
 def _effective(model: Any) -> list[int]:

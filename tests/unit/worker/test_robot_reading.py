@@ -155,7 +155,7 @@ def test_a_file_that_newton_reads_as_mujoco_does_stays_as_newton_reads_it(file: 
 
 NAMED = SECOND.replace("<geom", '<geom name="i"')
 ENDS = mjcf(
-    f'{HINGE}{BOX}<site name="s"/><site name="t" pos="0 .1 0"/>{NAMED}<geom name="g" size=".1" mass="1" contype="0" conaffinity="0"/>'
+    f'{HINGE}{BOX}<site name="s"/><site name="t" pos="0 .1 0"/><site name="u" pos=".1 0 0"/>{NAMED}<geom name="g" size=".1" mass="1" contype="0" conaffinity="0"/>'
     f'<geom name="h" size=".1" pos="0 0 .3" mass="1" contype="0" conaffinity="0"/>',
     '<tendon><fixed name="e"><joint joint="j" coef="1"/></fixed><fixed name="f"><joint joint="k" coef="1"/></fixed>{tendon}</tendon>'
     '<equality>{equality}</equality><contact>{pair}</contact><actuator>{actuator}<motor joint="j"/></actuator>',
@@ -211,6 +211,7 @@ def ends(tendon: str = "", equality: str = "", actuator: str = "", pair: str = "
             "h",
             "tendon t: path 1",
         ),
+        ("tendon", '<spatial><site site="s"/><site site="{}"/></spatial>', "u", "t", "tendon tendon_2: existence"),
         ("pair", '<pair geom1="{}" geom2="i"/>', "g", "h", "contact pair 0: existence"),
     ],
 )
