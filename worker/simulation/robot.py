@@ -36,7 +36,8 @@ class Robot:
         rotation: Of its root at the start (quaternion xyzw); None: as in the file, or upright where a position is given.
         joint_positions: Initial joint positions [rad, m], by pattern; other joints start as in the file.
         actuators: Actuators that replace those of the file; without any, the file's are kept.
-        fixed: Whether its root is fixed to the world; None: as in the file.
+        fixed: Whether its root is fixed to the world, or moves freely; None: as in the file. A joint of the root that an actuator, a
+            tendon or an equality of an MJCF file needs is not taken away: then only None is accepted.
         self_collisions: Whether its own geoms may touch each other; None: as in the file and in ``collisions``.
         collisions: How its geoms collide; geoms without a match collide as in the file.
         armature: Inertia of rotors, reflected to the joint [kg m^2, kg], by pattern or for all joints; None: as in the file.

@@ -44,13 +44,35 @@ def word_of(kind: Any, value: int) -> str:
     return str(kind(int(value)).name.rpartition("_")[2].lower())
 
 
+class Words:
+    """The words of MJCF for values of one of MuJoCo's enumerations, as far as Newton's models have them."""
+
+    def __init__(self, kind: Any, words: str) -> None:
+        self._kind = kind
+        prefix = next(iter(kind.__members__)).partition("_")[0]
+        self._words = {int(kind.__members__[f"{prefix}_{word.upper()}"]): word for word in words.split()}
+
+    def of(self, value: Any, element: str) -> str:
+        """The word of a value of an element. Raises ValueError, with the element's name, where Newton has nothing of the kind."""
+        if int(value) not in self._words:
+            raise ValueError(
+                f"{element} is of the kind {word_of(self._kind, value)!r}, which Newton's models don't have"
+            )
+        return self._words[int(value)]
+
+
 COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "equality": "neq"}
 """Fields of ``mujoco.MjModel`` that count elements, where they are not an n and the kind's word."""
 
 
+def count_of(model: Any, kind: str) -> int:
+    """Number of a model's elements of a kind."""
+    return int(getattr(model, COUNTS.get(kind, f"n{kind}")))
+
+
 def unique_names(model: Any, kind: str) -> list[str]:
     """Names of all elements of a kind, as Newton's importer keeps them and each once; made ones where the file gives none."""
-    count = range(getattr(model, COUNTS.get(kind, f"n{kind}")))
+    count = range(count_of(model, kind))
     named = {index: bool(mujoco.mj_id2name(model, kind_of(kind), index)) for index in count}
     names: dict[int, str] = {}
     taken: set[str] = set()

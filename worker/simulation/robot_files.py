@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,13 @@ class RobotFile:
         format: ``"mjcf"``, ``"urdf"`` or ``"usd"``.
         hinges: Names of several MJCF joints between one body and its parent, which Newton merges into one joint: by the name of that
             joint, in the order of its degrees of freedom.
+        spec: The parsed MJCF, ``mujoco.MjSpec``; None for another format.
     """
 
     source: str
     format: str
-    hinges: dict[str, list[str]]
+    hinges: dict[str, list[str]] = field(default_factory=dict)
+    spec: Any = None
 
 
 def read(file: str | Path) -> RobotFile:
@@ -63,15 +65,14 @@ def read(file: str | Path) -> RobotFile:
             )
         kind = FORMATS[path.suffix.lower()] or _kind_of_xml(_text_of(path, text), text)
     shown = "the robot's XML" if source == text and source.lstrip().startswith("<") else text
-    hinges: dict[str, list[str]] = {}
     if kind == "mjcf":
         spec = parse_mjcf(source, shown)
         _check_mjcf_assets(spec, shown)
-        hinges = _hinges(spec)
-    elif kind == "urdf":
+        return RobotFile(source, kind, _hinges(spec), spec)
+    if kind == "urdf":
         for mesh in urdf_root(source, shown).iter("mesh"):  # Newton would only warn and continue without them
             urdf_mesh(source, mesh.get("filename", ""), shown)
-    return RobotFile(source, kind, hinges)
+    return RobotFile(source, kind)
 
 
 def _text_of(path: Path, shown: str) -> str:
@@ -165,10 +166,16 @@ def names_integrator(source: str) -> bool:
 
 
 def _not_a_number(text: str) -> str:
-    for element in ElementTree.fromstring(text).iter():
+    root = ElementTree.fromstring(text)
+    parents = {child: parent for parent in root.iter() for child in parent}
+    for element in root.iter():
         for name, value in element.attrib.items():
             if "nan" in value.lower().split():
-                return f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}> is not a number"
+                owner = element
+                while not owner.get("name") and owner in parents:
+                    owner = parents[owner]
+                within = f" in {owner.tag} {owner.get('name')}" if owner is not element and owner.get("name") else ""
+                return f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}>{within} is not a number"
     return "a value of a file that it includes is not a number"
 
 
@@ -186,12 +193,12 @@ def quiet() -> Iterator[list[str]]:
 
 
 def _check_mjcf_assets(spec: Any, shown: str) -> None:
-    """Refuse missing meshes: Newton would leave them out and build a different robot."""
-    folders = [(spec.meshdir, mesh.file) for mesh in spec.meshes]
-    folders += [(spec.meshdir, field.file) for field in spec.hfields]
-    for folder, name in folders:
-        if name and not (Path(spec.modelfiledir) / folder / name).is_file():
-            _refuse_mesh(shown, name, Path(spec.modelfiledir) / folder)
+    """Refuse missing meshes and height fields: Newton would leave them out and build a different robot."""
+    folder = Path(spec.modelfiledir) / spec.meshdir
+    for kind, elements in (("mesh", spec.meshes), ("height field", spec.hfields)):
+        for name in (element.file for element in elements):
+            if name and not (folder / name).is_file():
+                _refuse_missing(shown, kind, name, folder)
 
 
 def urdf_root(source: str, shown: str) -> ElementTree.Element:
@@ -226,14 +233,14 @@ def urdf_mesh(source: str, name: str, shown: str) -> Path:
             )
         place = above.parent / inside
     if not place.is_file():
-        _refuse_mesh(shown, name, place.parent)
+        _refuse_missing(shown, "mesh", name, place.parent)
     return place
 
 
-def _refuse_mesh(shown: str, name: str, folder: Path) -> None:
+def _refuse_missing(shown: str, kind: str, name: str, folder: Path) -> None:
     there = sorted(item.name for item in folder.iterdir() if item.is_file()) if folder.is_dir() else []
     near = nearest(Path(name).name, there, "put it there") if there else "that folder does not exist or is empty"
-    raise ValueError(f"{shown}: its mesh {name} is missing in {folder}; {near}")
+    raise ValueError(f"{shown}: its {kind} {name} is missing in {folder}; {near}")
 
 
 def _hinges(spec: Any) -> dict[str, list[str]]:

@@ -11,7 +11,16 @@ import mujoco
 import newton
 import numpy as np
 
-from worker.simulation.robot_elements import some, word_of
+from worker.simulation.robot_connections import (
+    TARGETS,
+    Ends,
+    actuator_ends,
+    equality_ends,
+    held,
+    tendon_ends,
+    tendon_numbers,
+)
+from worker.simulation.robot_elements import count_of, some, word_of
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import (
@@ -19,6 +28,7 @@ from worker.simulation.robot_values import (
     extent,
     freedoms,
     gravity,
+    has_mask,
     inertia,
     length,
     matrix,
@@ -31,10 +41,12 @@ RELATIVE = 1e-6
 """Two values are equal up to this share of the greater one: Newton computes in float32."""
 ROUNDING = 1e-4
 """Up to this share of the greater one, a difference is of no consequence to a policy."""
+FAR = 10.0
+"""Ends of an equality are compared this much less sharply: their places add up along chains of bodies."""
 ACCELERATION = 1e-3
 """Accelerations in the same state are equal up to this share of the greatest one."""
-ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY")
-"""Flags that a task's solver options set, that nothing here reads, or that are compared in another way."""
+ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV")
+"""Flags that a task's solver options set, that nothing here reads, that only report, or that are compared in another way."""
 COUNTS = {
     "coordinates": "nq",
     "degrees of freedom": "nv",
@@ -129,8 +141,9 @@ def matches(difference: Difference, patterns: Sequence[str]) -> bool:
 
 
 def _counts(twins: Twins) -> Iterator[Difference]:
-    for kind, pairs, count in (("body", twins.bodies, twins.file.nbody), ("joint", twins.joints, twins.file.njnt)):
-        for index in range(count):
+    kinds = {"body": twins.bodies, "joint": twins.joints, "tendon": twins.tendons, "equality": twins.equalities}
+    for kind, pairs in kinds.items():
+        for index in range(count_of(twins.file, kind)):
             if index not in pairs:
                 yield Difference(twins.name(kind, index), "existence", "missing", "there")
     for what, field in COUNTS.items():
@@ -185,7 +198,7 @@ def _joints(twins: Twins) -> Iterator[Difference]:
 def _geoms(twins: Twins) -> Iterator[Difference]:
     file, built = twins.file, twins.built
     for geom in set(range(file.ngeom)) - set(twins.geoms):
-        if file.geom_contype[geom] or file.geom_conaffinity[geom]:
+        if has_mask(file, geom):
             yield Difference(twins.name("geom", geom), "existence", "missing", "there")
         yield from _unequal(
             twins.name("geom", geom), "fluid", np.zeros_like(file.geom_fluid[geom]), file.geom_fluid[geom]
@@ -196,9 +209,11 @@ def _geoms(twins: Twins) -> Iterator[Difference]:
         if kind != other:
             yield Difference(element, "type", other, kind)
             continue
-        yield from _fields(twins, "geom", geom, twin, "condim friction solref solimp solmix priority gap fluid")
-        if not (file.geom_margin[geom] and not built.geom_margin[twin]):  # else a note says so
-            yield from _fields(twins, "geom", geom, twin, "margin")
+        if has_mask(file, geom):
+            yield from _fields(twins, "geom", geom, twin, "condim friction solref solimp solmix priority gap")
+            if not (file.geom_margin[geom] and not built.geom_margin[twin]):  # else a note says so
+                yield from _fields(twins, "geom", geom, twin, "margin")
+        yield from _fields(twins, "geom", geom, twin, "fluid")
         yield from _unequal(element, "shape and place", extent(built, twin), extent(file, geom), length(file))
 
 
@@ -215,12 +230,16 @@ def _sites(twins: Twins) -> Iterator[Difference]:
 
 
 def _pairs(twins: Twins) -> Iterator[Difference]:
-    for pair in range(min(twins.file.npair, twins.built.npair)):
+    for pair in range(twins.file.npair):
         element = f"contact pair {pair}"
+        if pair not in twins.contact_pairs:
+            yield Difference(element, "existence", "missing", "there")
+            continue
+        models = (twins.built, twins.contact_pairs[pair]), (twins.file, pair)
         for name in ("dim", "friction", "solref", "solimp", "margin", "gap"):
-            mine, theirs = (getattr(model, f"pair_{name}")[pair] for model in (twins.built, twins.file))
+            mine, theirs = (getattr(model, f"pair_{name}")[index] for model, index in models)
             yield from _unequal(element, name, mine, theirs)
-        mine, theirs = (_of_friction(model, pair) for model in (twins.built, twins.file))
+        mine, theirs = (_of_friction(model, index) for model, index in models)
         yield from _unequal(element, "solreffriction", mine, theirs)
 
 
@@ -258,11 +277,24 @@ def _stay_apart(twins: Twins, pair: tuple[int, int]) -> bool:
 def _tendons(twins: Twins) -> Iterator[Difference]:
     for tendon, twin in twins.tendons.items():
         yield from _fields(twins, "tendon", tendon, twin, TENDON)
+        there, here = tendon_ends(twins.file, tendon), twins.in_file(tendon_ends(twins.built, twin))
+        element, mine, theirs = (
+            twins.name("tendon", tendon),
+            *(tendon_numbers(model, index) for model, index in ((twins.built, twin), (twins.file, tendon))),
+        )
+        yield from _ends(twins, element, [f"path {index}" for index in range(len(there))], here, there)
+        yield from _unequal(element, "coefficients", mine, theirs)
+
+
+def _ends(twins: Twins, element: str, words: Sequence[str], here: Ends, there: Ends) -> Iterator[Difference]:
+    """The ends of an element that are others than in the file, by the attributes that name them."""
+    for word, mine, theirs in zip(words, here, there, strict=False):
+        if mine != theirs:
+            yield Difference(element, word, twins.shown_end(mine), twins.shown_end(theirs))
 
 
 def _actuators(twins: Twins) -> Iterator[Difference]:
     file, built = twins.file, twins.built
-    on_joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     for actuator in range(min(file.nu, built.nu)):
         yield from _fields(twins, "actuator", actuator, actuator, ACTUATOR)
         for limit in ("ctrl", "force", "act"):
@@ -271,26 +303,29 @@ def _actuators(twins: Twins) -> Iterator[Difference]:
                 yield from _fields(twins, "actuator", actuator, actuator, f"{limit}range")
         if file.actuator_dyntype[actuator]:
             yield from _fields(twins, "actuator", actuator, actuator, "dynprm lengthrange")
-        kind, target = int(file.actuator_trntype[actuator]), int(file.actuator_trnid[actuator, 0])
-        other = int(built.actuator_trnid[actuator, 0])
-        if kind in on_joints and kind == built.actuator_trntype[actuator] and twins.joints.get(target) != other:
-            element = twins.name("actuator", actuator)
-            yield Difference(element, "joint", twins.built_joint(other), twins.name("joint", target))
+        if file.actuator_trntype[actuator] == built.actuator_trntype[actuator]:
+            words = TARGETS.get(word_of(mujoco.mjtTrn, file.actuator_trntype[actuator]), ())
+            here, there = twins.in_file(actuator_ends(built, actuator)), actuator_ends(file, actuator)
+            yield from _ends(twins, twins.name("actuator", actuator), words, here, there)
 
 
 def _equalities(twins: Twins) -> Iterator[Difference]:
-    linear = (int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON))
+    file, built = twins.file, twins.built
     for equality, twin in twins.equalities.items():
-        yield from _fields(twins, "eq", equality, twin, "type active0 solref solimp")
-        if twins.file.eq_type[equality] in linear:
-            mine, theirs = twins.built.eq_data[twin, :5], twins.file.eq_data[equality, :5]
-            yield from _unequal(twins.name("equality", equality), "polycoef", mine, theirs)
+        element = twins.name("equality", equality)
+        yield from _fields(twins, "eq", equality, twin, "active0 solref solimp")
+        here, there = twins.in_file(equality_ends(built, twin)), equality_ends(file, equality)
+        yield from _ends(twins, element, [f"{kind}{number}" for number, (kind, _) in enumerate(there, 1)], here, there)
+        mine = held(built, twin)
+        for name, theirs in held(file, equality).items():
+            scale = {"polycoef": 0.0, "torquescale": 0.0}.get(name, FAR * max(1.0, length(file)))
+            yield from _unequal(element, name, mine[name], theirs, scale)
 
 
 def _options(twins: Twins) -> Iterator[Difference]:
     file, built = twins.file.opt, twins.built.opt
     yield from _unequal("option", "gravity", gravity(twins.built), gravity(twins.file))
-    for name in ("wind", "density", "viscosity", "impratio", "cone"):
+    for name in ("wind", "density", "viscosity", "impratio", "cone", "disableactuator"):
         yield from _unequal("option", name, getattr(built, name), getattr(file, name))
     for kind, name in ((mujoco.mjtDisableBit, "disableflags"), (mujoco.mjtEnableBit, "enableflags")):
         mine, theirs = int(getattr(built, name)), int(getattr(file, name))
@@ -318,13 +353,23 @@ def _accelerations(twins: Twins) -> Iterator[Difference]:
             theirs = first.qacc[file.jnt_dofadr[joint] :][:width]
             mine = second.qacc[built.jnt_dofadr[twin] :][:width]
             if not (np.abs(theirs - mine) <= ACCELERATION * scale).all():
-                yield Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
+                unexplained = Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
+                yield next(_inertia_axes(twins), unexplained)
                 return
+
+
+def _inertia_axes(twins: Twins) -> Iterator[Difference]:
+    """Bodies whose drag differs, since a medium acts on the axes of their inertias: Newton keeps no axes of equal moments."""
+    for body, twin in twins.bodies.items() if twins.file.opt.density else ():
+        theirs, mine = matrix(twins.file.body_iquat[body]), matrix(twins.built.body_iquat[twin])
+        if twins.file.body_mass[body] and (np.abs(theirs.T @ mine).max(0) < 1.0 - RELATIVE).any():
+            yield Difference(twins.name("body", body), "axes of inertia", mine, theirs)
 
 
 def _notes(twins: Twins) -> Iterator[str]:
     file, built = twins.file, twins.built
-    bare = [geom for geom, twin in twins.geoms.items() if file.geom_margin[geom] and not built.geom_margin[twin]]
+    pairs = [(geom, twin) for geom, twin in twins.geoms.items() if has_mask(file, geom)]
+    bare = [geom for geom, twin in pairs if file.geom_margin[geom] and not built.geom_margin[twin]]
     if bare:
         names = some([twins.name("geom", geom) for geom in bare])
         yield f"contacts begin where geoms touch, not at the margin of the file ({names}): MuJoCo-Warp has none between boxes"

@@ -13,38 +13,23 @@ import mujoco
 import numpy as np
 
 from worker.simulation import carriers
-from worker.simulation.robot_elements import unique_names, word_of
+from worker.simulation.robot_connections import TARGETS, actuator_ends, equality_ends, held
+from worker.simulation.robot_elements import Words, unique_names
+from worker.simulation.robot_values import quaternion
 
 Element = ElementTree.Element
 
 
-class _Words:
-    """The words of MJCF for values of one of MuJoCo's enumerations, as far as Newton's models have them."""
-
-    def __init__(self, kind: Any, words: str) -> None:
-        self._kind = kind
-        prefix = next(iter(kind.__members__)).partition("_")[0]
-        self._words = {int(kind.__members__[f"{prefix}_{word.upper()}"]): word for word in words.split()}
-
-    def of(self, value: Any, element: str) -> str:
-        """The word of a value of an element. Raises ValueError, with the element's name, where Newton has nothing of the kind."""
-        if int(value) not in self._words:
-            raise ValueError(
-                f"{element} is of the kind {word_of(self._kind, value)!r}, which Newton's models don't have"
-            )
-        return self._words[int(value)]
-
-
-_GEOM_TYPES = _Words(mujoco.mjtGeom, "plane hfield sphere capsule ellipsoid cylinder box mesh")
-_JOINT_TYPES = _Words(mujoco.mjtJoint, "free ball slide hinge")
-_WRAP_TYPES = _Words(mujoco.mjtWrap, "joint pulley site sphere cylinder")
-_EQUALITY_TYPES = _Words(mujoco.mjtEq, "connect weld joint tendon")
-_TRANSMISSIONS = _Words(mujoco.mjtTrn, "joint jointinparent slidercrank tendon site body")
-_DYNAMICS = _Words(mujoco.mjtDyn, "none integrator filter filterexact muscle user")
-_INTEGRATORS = _Words(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast")
-_CONES = _Words(mujoco.mjtCone, "pyramidal elliptic")
-_GAINS = _Words(mujoco.mjtGain, "fixed affine muscle user")
-_BIASES = _Words(mujoco.mjtBias, "none affine muscle user")
+_GEOM_TYPES = Words(mujoco.mjtGeom, "plane hfield sphere capsule ellipsoid cylinder box mesh")
+_JOINT_TYPES = Words(mujoco.mjtJoint, "free ball slide hinge")
+_WRAP_TYPES = Words(mujoco.mjtWrap, "joint pulley site sphere cylinder")
+_EQUALITY_TYPES = Words(mujoco.mjtEq, "connect weld joint tendon")
+_TRANSMISSIONS = Words(mujoco.mjtTrn, "joint jointinparent slidercrank tendon site body")
+_DYNAMICS = Words(mujoco.mjtDyn, "none integrator filter filterexact muscle user")
+_INTEGRATORS = Words(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast")
+_CONES = Words(mujoco.mjtCone, "pyramidal elliptic")
+_GAINS = Words(mujoco.mjtGain, "fixed affine muscle user")
+_BIASES = Words(mujoco.mjtBias, "none affine muscle user")
 
 
 def write(model: Any, *, integrator: bool = False) -> str:
@@ -79,7 +64,7 @@ class _Writer:
             self.names[kind] = unique_names(self.model, kind)
         return self.names[kind][int(index)]
 
-    def word(self, words: _Words, values: Any, kind: str, index: int) -> str:
+    def word(self, words: Words, values: Any, kind: str, index: int) -> str:
         """The word for the value of an element of some kind."""
         return words.of(values[index], f"{kind} {self.name(kind, index)}")
 
@@ -340,19 +325,15 @@ class _Writer:
 
     def _write_equality(self, section: Element, equality: int) -> None:
         model = self.model
-        tag, data = self.word(_EQUALITY_TYPES, model.eq_type, "equality", equality), model.eq_data[equality]
-        values: dict[str, Any] = {}
-        if tag in ("connect", "weld"):
-            of = "site" if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE) else "body"
-            values = {"anchor": data[:3]} if of == "body" else {}
-            if tag == "weld":
-                values |= {"relpose": data[3:10]} if of == "body" else {}
-                values["torquescale"] = data[10]
-        else:
-            of, values = tag, {"polycoef": data[:5]}
-        for number, index in ((1, model.eq_obj1id[equality]), (2, model.eq_obj2id[equality])):
-            if index > 0 or (index == 0 and of != "body"):
-                values[f"{of}{number}"] = self.name(of, index)
+        tag, values = self.word(_EQUALITY_TYPES, model.eq_type, "equality", equality), held(model, equality)
+        if tag == "connect":
+            values = {"anchor": values["anchor1"]}
+        elif tag == "weld":  # one of sites, too: Newton's importer reads their bodies alone
+            relpose = np.concatenate([values["anchor1"], quaternion(values["turn"])])
+            values = {"anchor": values["anchor2"], "relpose": relpose, "torquescale": values["torquescale"]}
+        for number, (kind, index) in enumerate(equality_ends(model, equality), 1):
+            if index >= 0:
+                values[f"{kind}{number}"] = self.name(kind, index)
         _add(
             section,
             tag,
@@ -366,16 +347,15 @@ class _Writer:
     def _write_actuator(self, section: Element, actuator: int) -> None:
         model = self.model
         transmission = self.word(_TRANSMISSIONS, model.actuator_trntype, "actuator", actuator)
-        first, second = model.actuator_trnid[actuator]
-        values: dict[str, Any]
+        values: dict[str, Any] = {
+            word: self.name(*end)
+            for word, end in zip(TARGETS[transmission], actuator_ends(model, actuator), strict=True)
+            if end[1] >= 0
+        }
+        if transmission == "jointinparent":
+            values = {transmission: values["joint"]}
         if transmission == "slidercrank":
-            values = {"cranksite": self.name("site", first), "slidersite": self.name("site", second)}
             values["cranklength"] = model.actuator_cranklength[actuator]
-        else:
-            kind = "joint" if transmission == "jointinparent" else transmission
-            values = {transmission: self.name(kind, first)}
-            if transmission == "site" and second >= 0:
-                values["refsite"] = self.name("site", second)
         for limit in ("ctrl", "force", "act"):
             values[f"{limit}limited"] = bool(getattr(model, f"actuator_{limit}limited")[actuator])
             values[f"{limit}range"] = getattr(model, f"actuator_{limit}range")[actuator]

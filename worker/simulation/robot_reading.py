@@ -41,6 +41,8 @@ REMEDIES = {
     "dampingpoly": "Give damping one number",
     "stiffnesspoly": "Give stiffness one number",
     "fluid": "Leave out fluidshape",
+    "anchor2": "Let both sites of the equality be at one place in the first pose of the file",
+    "axes of inertia": "Give the body an <inertial> of three different moments, on whose axes the medium's drag acts",
     "acceleration in the same state": "No single value shows why: leave out parts of the file until it is read",
 }
 """What to do about a value that Newton can't hold, by its field."""
@@ -152,18 +154,21 @@ def read(source: Source) -> Reading:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
         found = _amended(source, builder, model, found)
+    notes = list(reference.notes)
     if found.differences:
-        builder = _imported(source, RobotFile(_rewritten(file, model, name), "mjcf", {}), None)
+        builder = _imported(source, RobotFile(_rewritten(file, model, name), "mjcf"), None)
         found = _amended(source, builder, model, _compared(source, builder, model))
-    notes = (*reference.notes, *found.notes)
+        if reference.looks:
+            notes.append(f"pictures lack the {reference.looks} of the file, since MuJoCo's compiled model has none")
+    notes += found.notes
     if found.differences:
         refusal = AnotherRobot(name, found.differences)
         if not CHANGED_ROBOTS.get() or not is_readable:
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
-        notes = (*reference.notes, AS_IMPORTED.format(refusal))
-        return Reading(builder, reference, corrected, notes, identity(builder, None))
-    return Reading(builder, reference, corrected, notes, identity(builder, model))
+        accepted = (*reference.notes, AS_IMPORTED.format(refusal))
+        return Reading(builder, reference, corrected, accepted, identity(builder, None))
+    return Reading(builder, reference, corrected, tuple(notes), identity(builder, model))
 
 
 def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str) -> Reading:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -13,8 +14,13 @@ import numpy as np
 
 from shared_store.wording import nearest
 from worker.simulation import robot_files
-from worker.simulation.robot_elements import name_of, word_of
+from worker.simulation.robot_elements import kind_of, name_of, some, word_of
 from worker.simulation.robot_files import RobotFile
+
+_KINDS = {"jnt": "joint", "dof": "dof", "eq": "equality"} | {
+    kind: kind for kind in ("body", "geom", "site", "tendon", "actuator")
+}
+"""Kinds of elements, by the prefix of their fields in ``mujoco.MjModel``."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +30,13 @@ class Reference:
     Attributes:
         model: ``mujoco.MjModel``.
         notes: What MuJoCo had to correct, one sentence each.
+        looks: What is only seen and is lost where the robot is built from :attr:`model`, such as ``"textures"``.
         sensors: Name and kind of each of the file's own sensors, which nothing here reads.
     """
 
     model: Any
     notes: tuple[str, ...] = ()
+    looks: str = ""
     sensors: tuple[tuple[str, str], ...] = ()
 
 
@@ -36,7 +44,7 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     """Compile an MJCF or URDF file.
 
     Args:
-        file: The file.
+        file: The file, whose ``spec`` is changed and compiled.
         fixed: Whether its root is fixed to the world; None: as in the file.
         ignored: Regular expressions of the names of geoms and sites to leave out.
         shown: The file's name, for errors.
@@ -45,26 +53,95 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
         ValueError: MuJoCo refuses the file; the message names the element.
     """
     notes: list[str] = []
-    spec = _urdf_spec(file, shown, notes) if file.format == "urdf" else robot_files.parse_mjcf(file.source, shown)
+    if file.format == "urdf":
+        spec, looks = _urdf_spec(file, shown, notes)
+    else:
+        spec, looks = file.spec, ""  # not a copy: MjSpec.copy drops actuators of unknown targets
     sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
     for element in (*spec.sensors, *spec.keys):
         spec.delete(element)  # sensors may name places that do not exist, and poses do not fit another root
     for element in (*spec.geoms, *spec.sites):
         if any(re.match(pattern, element.name) for pattern in ignored):
             spec.delete(element)
+    looks = _without_looks(spec, notes) or looks
     if fixed is not None:
-        for body in spec.worldbody.bodies:
-            for joint in body.joints:
-                spec.delete(joint)
-            if not fixed:
-                body.add_freejoint()
+        _set_root(spec, fixed, shown)
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         notes.append("the file asks for the solver PGS, which MuJoCo-Warp lacks: worlds use Newton's method")
     if spec.option.noslip_iterations:
         notes.append("noslip_iterations of the file are not used: a task's solver_options have none")
     model = _compiled(spec, shown, notes)
     _check_numbers(model, shown)
-    return Reference(model, tuple(notes), sensors)
+    notes += _empty_ranges(model)
+    return Reference(model, tuple(notes), looks, sensors)
+
+
+def _without_looks(spec: Any, notes: list[str]) -> str:
+    """Take textures and skins, which move nothing, from a file, and note those that are missing.
+
+    Returns:
+        What of them a picture would have shown: textures of meshes.
+    """
+    names = {texture.name or Path(texture.file).stem for texture in spec.textures}
+    folder = Path(spec.modelfiledir) / spec.texturedir
+    files = [file for texture in spec.textures for file in (texture.file, *texture.cubefiles)]
+    missing = [file for file in files if file and not (folder / file).is_file()]
+    missing += [
+        skin.file
+        for skin in spec.skins
+        if skin.file and not (Path(spec.modelfiledir) / spec.meshdir / skin.file).is_file()
+    ]
+    textured = {material.name for material in spec.materials if any(material.textures)}
+    meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
+    for material in spec.materials:
+        missing += [name for name in material.textures if name and name not in names]
+        material.textures = [""] * len(material.textures)
+    for light in spec.lights:
+        light.texture = ""
+    if missing:
+        notes.append(f"pictures lack textures or skins that the file names and that are missing ({some(missing)})")
+    for element in (*spec.textures, *spec.skins):
+        spec.delete(element)
+    return "textures" if any(geom.material in textured for geom in meshes) else ""
+
+
+def _set_root(spec: Any, fixed: bool, shown: str) -> None:
+    """Fix the root bodies to the world, or let them move freely; refuse to take a joint away that something drives or holds."""
+    on_joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    ends = {actuator.target for actuator in spec.actuators if actuator.trntype in on_joints}
+    joined = (equality for equality in spec.equalities if equality.type == mujoco.mjtEq.mjEQ_JOINT)
+    ends |= {name for equality in joined for name in (equality.name1, equality.name2)}
+    ends |= {
+        wrap.target.name for tendon in spec.tendons for wrap in tendon.path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT
+    }
+    for body in spec.worldbody.bodies:
+        name = ""
+        for joint in body.joints:
+            if joint.type == mujoco.mjtJoint.mjJNT_FREE and not fixed:
+                name = joint.name
+            elif joint.name and joint.name in ends:
+                raise ValueError(
+                    f"{shown}: fixed={fixed} would take the joint {joint.name} of the root {body.name}, which an actuator, a tendon or an "
+                    "equality of the file needs; leave fixed out, and the root moves as in the file"
+                )
+            spec.delete(joint)
+        if not fixed and not body.mocap:
+            body.add_freejoint(name=name)
+
+
+def _empty_ranges(model: Any) -> Iterator[str]:
+    """What has a range without any values, and so no limit in MuJoCo."""
+    limits = [(kind, limit) for kind in ("jnt", "tendon") for limit in ("", "actfrc")]
+    for kind, limit in (*limits, *(("actuator", word) for word in ("ctrl", "force", "act"))):
+        ranges, limited = getattr(model, f"{kind}_{limit}range"), getattr(model, f"{kind}_{limit}limited")
+        empty = np.flatnonzero((ranges[:, 0] >= ranges[:, 1]) & ranges.any(1) & (limited == 0))
+        element = _KINDS[kind]
+        names = [
+            f"{element} {name_of(model, kind_of(element), int(index))} ({ranges[index, 0]:.4g} to {ranges[index, 1]:.4g})"
+            for index in empty
+        ]
+        if names:
+            yield f"a {limit}range without values is no limit, as in MuJoCo: {some(names)}"
 
 
 def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
@@ -120,18 +197,6 @@ def _refusal(spec: Any, error: Exception, shown: str) -> str:
     return f"{shown}: MuJoCo refuses it: {text}{remedy}"
 
 
-_KINDS = {
-    "body": "body",
-    "jnt": "joint",
-    "dof": "dof",
-    "geom": "geom",
-    "site": "site",
-    "tendon": "tendon",
-    "eq": "equality",
-    "actuator": "actuator",
-}
-
-
 def _check_numbers(model: Any, shown: str) -> None:
     """Refuse numbers that are not finite: MuJoCo only warns, and every step would reset every world."""
     for field in dir(model):
@@ -142,25 +207,31 @@ def _check_numbers(model: Any, shown: str) -> None:
         if not isinstance(array, np.ndarray) or array.dtype.kind != "f" or np.isfinite(array).all():
             continue
         index = int(np.argwhere(~np.isfinite(array))[0][0])
-        element = int(model.dof_jntid[index]) if kind == "dof" else index
-        name = name_of(
-            model,
-            getattr(mujoco.mjtObj, f"mjOBJ_{_KINDS[kind].upper()}") if kind != "dof" else mujoco.mjtObj.mjOBJ_JOINT,
-            element,
-        )
-        shown_kind = "joint" if kind == "dof" else _KINDS[kind]
-        raise ValueError(f"{shown}: {shown_kind} {name}: {value} is not a finite number; give it one")
+        element = "joint" if kind == "dof" else _KINDS[kind]
+        name = name_of(model, kind_of(element), int(model.dof_jntid[index]) if kind == "dof" else index)
+        raise ValueError(f"{shown}: {element} {name}: {value} is not a finite number; give it one")
 
 
+URDF_UNREAD = (("limit", "velocity"), ("mimic", "joint"))
+"""Attributes of URDF, by element, that are read as no number here."""
+URDF_LIMITS = ("lower", "upper", "effort")
 URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
 
-def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> Any:
-    """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals."""
+def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> tuple[Any, str]:
+    """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals.
+
+    Returns:
+        The specification, and what was taken of what is only seen.
+    """
     root = robot_files.urdf_root(file.source, shown)
     _check_tree(root, shown)
+    for element in (*root.findall("link"), *root.findall("joint")):
+        _check_urdf_numbers(element, shown)
     for joint in root.iter("joint"):
-        _check_urdf_joint(joint, shown, notes)
+        _check_urdf_joint(joint, shown)
+    notes += _unlimited(root)
+    looks = "visuals" if root.find("link/visual") is not None else ""
     for link in root.iter("link"):
         for visual in link.findall("visual"):
             link.remove(visual)
@@ -184,7 +255,7 @@ def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> Any:
     compiler.attrib.update(strippath="false", fusestatic="false", discardvisual="true")
     spec = robot_files.parse_mjcf(ElementTree.tostring(root, encoding="unicode"), shown)
     _add_mimics(spec, root)
-    return spec
+    return spec, looks
 
 
 def _check_tree(root: ElementTree.Element, shown: str) -> None:
@@ -201,14 +272,47 @@ def _check_tree(root: ElementTree.Element, shown: str) -> None:
         above[link] = joint.get("name", "")
 
 
-def _check_urdf_joint(joint: ElementTree.Element, shown: str, notes: list[str]) -> None:
+def _check_urdf_numbers(element: ElementTree.Element, shown: str) -> None:
+    """Refuse numbers of a link or a joint that are not finite, and negative masses, by its name."""
+    where = f"{shown}: {element.tag} {element.get('name')}"
+    for tag in ("mass", "inertia", "origin", "axis", "dynamics", "limit", "mimic"):
+        for found in element.iter(tag):
+            for name, text in found.attrib.items():
+                numbers = [_number(word) for word in text.split() if (tag, name) not in URDF_UNREAD]
+                if not np.isfinite(numbers).all():
+                    raise ValueError(f"{where}: {name}={text!r} of its <{tag}> is not a finite number; give it one")
+                if tag == "mass" and min(numbers, default=0.0) < 0.0:
+                    raise ValueError(f"{where}: its mass is {text}; give it one greater than 0")
+
+
+def _number(word: str) -> float:
+    """A number, or 0 for another word, which MuJoCo's parser refuses or does not read."""
+    try:
+        return float(word)
+    except ValueError:
+        return 0.0
+
+
+def _check_urdf_joint(joint: ElementTree.Element, shown: str) -> None:
     name, kind = joint.get("name"), joint.get("type")
-    if kind is None:
-        return  # a joint of a <transmission>
-    if kind not in URDF_JOINTS:
+    if kind is not None and kind not in URDF_JOINTS:  # else a joint of a <transmission>
         raise ValueError(f"{shown}: joint {name} is of type {kind!r}; URDF has {', '.join(URDF_JOINTS)}")
-    if kind in ("revolute", "prismatic") and joint.find("limit") is None:
-        notes.append(f"joint {name}: a {kind} joint of URDF needs a <limit>; without it the joint turns without end")
+
+
+def _unlimited(root: ElementTree.Element) -> Iterator[str]:
+    """Which joints of a URDF file have no limits, though URDF wants some, or a negative one."""
+    unlimited, negative = [], []
+    for joint in root.iter("joint"):
+        limit, name = joint.find("limit"), str(joint.get("name"))
+        lower, upper, effort = (0.0 if limit is None else _number(limit.get(word, "0")) for word in URDF_LIMITS)
+        if joint.get("type") in ("revolute", "prismatic") and lower == upper == 0.0:
+            unlimited.append(name)
+        if effort < 0.0:
+            negative.append(name)
+    if unlimited:
+        yield f"joints without <limit>, or whose lower and upper are both 0, move without end, as in MuJoCo: {some(unlimited)}"
+    if negative:
+        yield f"a negative effort is no limit, as in MuJoCo: joint {some(negative)}"
 
 
 def _add_mimics(spec: Any, root: ElementTree.Element) -> None:

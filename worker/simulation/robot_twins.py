@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable
 from functools import cached_property
 from typing import Any
 
-import mujoco
 import newton
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation import carriers
-from worker.simulation.robot_elements import Pairs, kind_of, name_of, names_of, paired, plain, short
+from worker.simulation.robot_connections import Ends, equality_ends, pair_ends, tendon_ends, wrapped_geoms
+from worker.simulation.robot_elements import Pairs, count_of, kind_of, name_of, names_of, paired, plain, short
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
+
+OTHER = -2
+"""Stands for the index in the file of an element that the file does not have."""
 
 
 class Twins:
@@ -40,6 +45,8 @@ class Twins:
         self.dofs = _column(solver.mjc_jnt_to_newton_dof)
         """Index of the first degree of freedom of each joint of :attr:`built` among the builder's."""
         self._shapes = _column(solver.mjc_geom_to_newton_shape)
+        self._site_shapes = _column(solver._mjc_site_to_newton_shape)
+        self._in_file: dict[str, dict[int, int]] = {}
 
     def name(self, kind: str, index: int) -> str:
         """Kind and name of an element of the file."""
@@ -75,21 +82,15 @@ class Twins:
 
     @cached_property
     def geoms(self) -> Pairs:
-        """The geoms that can touch: Newton leaves out those that are only seen."""
+        """The geoms that can touch or that tendons wrap: Newton leaves out those that are only seen."""
         model, built = self.file, self.built
-        explicit = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
-        able = [
-            geom
-            for geom in range(model.ngeom)
-            if model.geom_contype[geom] or model.geom_conaffinity[geom] or geom in explicit
-        ]
-        file_names = names_of(model, "geom", able)
+        file_names, there = names_of(model, "geom", _effective(model)), _effective(built)
         pairs: Pairs = {}
         for body, twin in self.bodies.items():
             names = {
-                geom: plain(short(self._builder.shape_label[shape]))
-                for geom, shape in enumerate(self._shapes)
-                if built.geom_bodyid[geom] == twin and (built.geom_contype[geom] or built.geom_conaffinity[geom])
+                geom: plain(short(self._builder.shape_label[self._shapes[geom]]))
+                for geom in there
+                if built.geom_bodyid[geom] == twin
             }
             pairs |= paired({geom: name for geom, name in file_names.items() if model.geom_bodyid[geom] == body}, names)
         return pairs
@@ -116,24 +117,50 @@ class Twins:
 
     @cached_property
     def tendons(self) -> Pairs:
-        """The tendons."""
-        return self._by_name("tendon", "ntendon")
+        """The tendons: by name, then by their paths, since Newton keeps no order among their kinds."""
+        names = [name or None for name in names_of(self.file, "tendon", range(self.file.ntendon)).values()]
+        built = [plain(short(name_of(self.built, kind_of("tendon"), index))) for index in range(self.built.ntendon)]
+        return _matched((names, built), self._both("tendon"))
 
     @cached_property
     def equalities(self) -> Pairs:
-        """The equalities."""
-        return self._by_name("equality", "neq")
+        """The equalities, which have no names in Newton: by their kinds and ends, then by their kinds."""
+        ends, kinds = self._both("equality"), (self.file.eq_type.tolist(), self.built.eq_type.tolist())
+        typed = tuple(list(zip(*each, strict=True)) for each in zip(kinds, ends, strict=True))
+        return _matched((typed[0], typed[1]), kinds)
 
-    def _by_name(self, kind: str, count: str) -> Pairs:
-        """Elements by their names, of the file or made, since Newton keeps no order among their kinds; the others in their order."""
-        file, built = (
-            {index: plain(short(name_of(model, kind_of(kind), index))) for index in range(getattr(model, count))}
-            for model in (self.file, self.built)
+    @cached_property
+    def contact_pairs(self) -> Pairs:
+        """The contact pairs, by their geoms."""
+        file, built = ([frozenset(ends) for ends in each] for each in self._both("pair"))
+        return _matched((file, built))
+
+    def _both(self, kind: str) -> tuple[list[Ends], list[Ends]]:
+        """Ends of all elements of a kind in both models, by the file's indices."""
+        ends = ENDS[kind]
+        return (
+            [ends(self.file, index) for index in range(count_of(self.file, kind))],
+            [self.in_file(ends(self.built, index)) for index in range(count_of(self.built, kind))],
         )
-        pairs = paired(file, built)
-        rest = [index for index in file if index not in pairs]
-        others = [index for index in built if index not in pairs.values()]
-        return pairs | dict(zip(rest, others, strict=False))
+
+    def in_file(self, ends: Ends) -> Ends:
+        """Ends in the built model by the indices of the same elements in the file; :data:`OTHER` where it has none."""
+        return tuple((kind, self._indices(kind).get(index, OTHER) if index >= 0 else -1) for kind, index in ends)
+
+    def _indices(self, kind: str) -> dict[int, int]:
+        """Index in the file by that in the built model."""
+        if kind == "site" and kind not in self._in_file:
+            sites = {shape: site for site, shape in self.sites.items() if shape is not None}
+            self._in_file[kind] = {site: sites.get(shape, OTHER) for site, shape in enumerate(self._site_shapes)}
+        elif kind not in self._in_file:
+            pairs = {"body": "bodies", "joint": "joints", "geom": "geoms", "tendon": "tendons"}.get(kind)
+            self._in_file[kind] = {twin: index for index, twin in getattr(self, pairs).items()} if pairs else {}
+        return self._in_file[kind]
+
+    def shown_end(self, end: tuple[str, int]) -> str:
+        """Name of an end, by its index in the file."""
+        kind, index = end
+        return {OTHER: f"another {kind}", -1: "nothing"}.get(index) or self.name(*end)
 
     def columns(self) -> tuple[list[int], list[int]]:
         """Indices of the same coordinates in ``qpos`` of :attr:`file` and of :attr:`built`."""
@@ -164,15 +191,34 @@ class Twins:
 
     def joined(self) -> set[frozenset[int]]:
         """Pairs of bodies of :attr:`file` that an equality joins, by what they are welded to."""
-        model, weld = self.file, self.file.body_weldid
-        site, body = int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_BODY)
-        pairs = set()
-        for kind, first, second in zip(model.eq_objtype, model.eq_obj1id, model.eq_obj2id, strict=True):
-            if kind == site:
-                first, second = model.site_bodyid[[first, second]]
-            if kind in (site, body):
-                pairs.add(frozenset((int(weld[first]), int(weld[second]))))
-        return pairs
+        ends = (equality_ends(self.file, equality) for equality in range(self.file.neq))
+        return {
+            frozenset(int(self.file.body_weldid[body]) for _, body in pair) for pair in ends if pair[0][0] == "body"
+        }
+
+
+ENDS: dict[str, Callable[[Any, int], Ends]] = {"tendon": tendon_ends, "equality": equality_ends, "pair": pair_ends}
+"""What says the ends of an element, by its kind."""
+
+
+def _effective(model: Any) -> list[int]:
+    """The geoms that do anything: they touch by their masks or in a contact pair, or a tendon wraps them."""
+    named = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist(), *wrapped_geoms(model)}
+    return sorted(named | {int(geom) for geom in (model.geom_contype | model.geom_conaffinity).nonzero()[0]})
+
+
+def _matched(*keys: tuple[Iterable[Hashable], Iterable[Hashable]]) -> Pairs:
+    """Pair the elements whose first keys are equal, then of the rest those whose next ones are; equal keys in their order."""
+    pairs: Pairs = {}
+    for there, here in keys:
+        taken, rest = set(pairs.values()), defaultdict(list)
+        for twin, key in enumerate(here):
+            if twin not in taken:
+                rest[key].append(twin)
+        for index, key in enumerate(there):
+            if index not in pairs and rest[key]:
+                pairs[index] = rest[key].pop(0)
+    return pairs
 
 
 def _finalized(builder: newton.ModelBuilder) -> newton.Model:

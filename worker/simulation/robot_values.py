@@ -32,6 +32,13 @@ def matrix(quaternion: Any) -> Any:
     return found.reshape(3, 3)
 
 
+def quaternion(matrix: Any) -> Any:
+    """Quaternion wxyz of a rotation matrix, shape ``(4,)``."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix, np.float64).ravel())
+    return found
+
+
 def inertia(model: Any, body: int) -> Any:
     """Moments of inertia about the centre of mass in the body's own frame [kg m^2], shape ``(3, 3)``."""
     rotation = matrix(model.body_iquat[body])
@@ -69,6 +76,11 @@ def extent(model: Any, geom: int) -> Any:
     }
     half = np.diag(np.square(half_sizes.get(kind, size)))
     return np.vstack([position, axes @ half @ axes.T])
+
+
+def has_mask(model: Any, geom: int) -> bool:
+    """Whether a geom can touch others by its masks."""
+    return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
 
 
 def touching(model: Any) -> Any:
