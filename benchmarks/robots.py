@@ -7,8 +7,8 @@ For each file of the packages below:
     without contacts; a robot that these leave at rest begins with a small random velocity of each joint;
 (c) the same of Muster's own step, in float32 on the processor, at the end of that second.
 
-Where (b) is greater than its limit, the table also has the difference of the file's model from itself with each value rounded to
-float32, which is how Newton holds them.
+Where (b) is greater than its limit, the table also has *float32*: the greatest difference of the file's model from four copies of
+it, in which each value differs by up to one unit in the last place of a float32, which is how Newton holds values.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation.robot_twins import Twins
-from worker.simulation.robot_values import freedoms, without_contacts
+from worker.simulation.robot_values import UNLIMITED, freedoms, without_contacts
 from worker.simulation.worlds import Worlds
 from worker.tasks import EffortActuator, Robot
 
@@ -58,8 +58,10 @@ PARTS = (
     "primitives.xml",
 )
 """Files that are parts of others, or hold no robot."""
-_ROUNDED = ("body", "jnt", "dof", "geom", "site", "tendon", "wrap", "eq", "actuator", "qpos0", "qpos")
+HELD = ("body", "jnt", "dof", "geom", "site", "tendon", "wrap", "eq", "actuator", "qpos0")
 """Kinds of a model's values that Newton holds in float32."""
+ULP = 2.0**-23
+UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 EXACT, OWN = 1e-5, 1e-3
 """Limits of (b) and (c) [m, rad]."""
 OUT = Path(__file__).with_suffix(".md")
@@ -75,7 +77,7 @@ class Row:
     freedoms: int = 0
     engine: float | None = None
     own: float | None = None
-    rounding: float | None = None
+    float32: float | None = None
 
 
 def folder(package: str, build: Path) -> Path:
@@ -142,12 +144,23 @@ def measure(name: str, path: Path) -> Row:
                 first.qvel[there.jnt_dofadr[joint]] = second.qvel[here.jnt_dofadr[twin]] = speeds[joint]
     columns = twins.columns()
     path_there, path_here = second_of(there, first, controls), second_of(here, second, controls)
+    count = len(path_there)
+    if count < steps_of(there):
+        row.detail = (
+            f"{row.detail}; unstable in MuJoCo after {count * there.opt.timestep:.2g} s, compared until then".strip(
+                "; "
+            )
+        )
     row.engine = difference(path_there[:, columns[0]], path_here[:, columns[1]])
     if not row.engine <= EXACT:
-        row.rounding = difference(path_there, second_of(rounded(there), first, controls))
+        row.float32 = max(
+            difference(path_there, second_of(disturbed(there, seed), first, controls)) for seed in range(4)
+        )
+        row.detail = "; ".join([row.detail, *(note for note in reading.notes if "noslip" in note)]).strip("; ")
     try:
         last = in_muster(robot, twins, there, second.qvel, controls)
-        row.own = difference(path_there[-1, columns[0]], last[columns[1]])
+        if count == steps_of(there):
+            row.own = difference(path_there[-1, columns[0]], last[columns[1]])
     except (ValueError, NotImplementedError) as error:
         row.detail = f"{row.detail}; not stepped by Muster: {error}".strip("; ")
     return row
@@ -159,29 +172,36 @@ def _short(text: object, path: Path) -> str:
 
 
 def second_of(model: Any, begin: Any, controls: Any) -> Any:
-    """The coordinates of one second in MuJoCo's C engine from ``begin`` on, shape ``(steps, nq)``, float64."""
+    """The coordinates of one second in MuJoCo's C engine from ``begin`` on, shape ``(steps, nq)``, float64.
+
+    It ends where a joint's force passes Newton's limit, or where MuJoCo finds the simulation unstable and would begin anew.
+    """
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = begin.qpos, begin.qvel, controls
     path = np.empty((steps_of(model), model.nq))
     for step in range(len(path)):
         mujoco.mj_step(model, data)
+        unlimited = float(np.abs(data.qfrc_actuator).max(initial=0.0)) < UNLIMITED
+        if not unlimited or any(data.warning[kind].number for kind in UNSTABLE):
+            return path[:step]
         path[step] = data.qpos
     return path
 
 
 def difference(first: Any, second: Any) -> float:
-    """The greatest difference of two arrays' elements, divided by the first where that is greater than 1; infinite for NaN."""
-    differences = np.abs(first - second) / np.maximum(1.0, np.abs(first))
+    """The greatest difference of two paths, as far as both go, divided by the first where that is greater than 1; infinite for NaN."""
+    both = list(zip(first, second, strict=False))
+    differences = [np.abs(one - other) / np.maximum(1.0, np.abs(one)) for one, other in both]
     return float(np.nan_to_num(differences, nan=np.inf).max(initial=0.0))
 
 
-def rounded(model: Any) -> Any:
-    """A model whose values are rounded to float32."""
-    other = without_contacts(model)
+def disturbed(model: Any, seed: int) -> Any:
+    """A copy of a model without contacts, each value of which differs by up to :data:`ULP` of it."""
+    random, other = np.random.default_rng(seed), without_contacts(model)
     for name in dir(other):
-        array = getattr(other, name) if name.partition("_")[0] in _ROUNDED else None
+        array = getattr(other, name) if name.partition("_")[0] in HELD else None
         if isinstance(array, np.ndarray) and array.dtype == np.float64:
-            array[...] = array.astype(np.float32)
+            array *= 1.0 + ULP * random.uniform(-1.0, 1.0, array.shape)
     return other
 
 
@@ -223,8 +243,8 @@ def page(rows: list[Row]) -> str:
         f"{sum(row.state == 'refused' for row in rows)} are refused by name, {sum(not row.freedoms and row.state != 'refused' for row in rows)} "
         f"hold nothing that moves. The other {len(further)} have equal values, too, but move further apart than {EXACT:g} in the C engine.",
         "",
-        "Why these do: Newton holds a model's values in float32, and their motion enlarges the rounding. *float32* is the difference of "
-        "the file's own model from itself with its values rounded.",
+        "Why these do: their motion enlarges the rounding of values, which Newton holds in float32, or the note in their row. *float32* is "
+        "the greatest difference of the file's own model from four copies with values that differ by up to 1.2e-7 of themselves.",
         "",
         "Versions of the packages: " + ", ".join(f"{name} {version}" for name, (version, *_) in PACKAGES.items()) + ".",
         "",
@@ -232,7 +252,7 @@ def page(rows: list[Row]) -> str:
         "|---|---|--:|--:|--:|--:|---|",
     ]
     for row in rows:
-        numbers = ["" if value is None else f"{value:.1e}" for value in (row.engine, row.rounding, row.own)]
+        numbers = ["" if value is None else f"{value:.1e}" for value in (row.engine, row.float32, row.own)]
         lines.append(
             f"| {row.file} | {row.state} | {row.freedoms or ''} | {' | '.join(numbers)} | {row.detail.replace('|', '/')} |"
         )
