@@ -19,7 +19,6 @@ def _deliver(
     controls: wp.array2d[wp.float32],
     delays: wp.array[wp.int32],
     computed: wp.array[wp.int32],
-    references: wp.array[wp.float32],
     history: wp.array3d[wp.float32],
     pushes: wp.array2d[wp.int32],
     targets: wp.array2d[wp.float32],
@@ -42,7 +41,7 @@ def _deliver(
         count -= depth  # more than a full ring says nothing more, and the number must not run over
     pushes[world, actuator] = count
     if computed[row] != 0:
-        targets[world, actuator] = value + references[actuator]
+        targets[world, actuator] = value
         inputs[world, actuator] = 0.0
     else:
         inputs[world, actuator] = value
@@ -86,9 +85,6 @@ class Drives:
         self._pushes = wp.zeros(shape, dtype=wp.int32, device=device)
         explicit = attributes.explicit.numpy().reshape(shape)[0] != 0
         joints = np.where(explicit, compiled.actuator_trnid[:, 0], 0)
-        # MuJoCo counts a joint's position from its reference, Newton and a task from the joint's own zero
-        references = np.where(explicit, compiled.qpos0[compiled.jnt_qposadr[joints]], 0.0)
-        self._references = wp.array(references, dtype=wp.float32, device=device)
 
         def rows(columns: Any, width: int) -> wp.array[wp.uint32]:
             of_worlds = np.arange(world_count)[:, None] * width + columns
@@ -123,7 +119,6 @@ class Drives:
                 self.controls,
                 self._attributes.delay,
                 self._attributes.explicit,
-                self._references,
                 self._history,
                 self._pushes,
                 self._targets,

@@ -20,6 +20,8 @@ class RobotArrays:
         actuators: Column of each joint's actuator in ``controls``, -1 where it has none, shape ``(joints,)``.
         defaults: Default position of each joint [m, rad], shape ``(joints,)``.
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none, shape ``(joints,)``.
+        references: What each joint's position is in its file where it is 0 here, MJCF's ``ref`` [m, rad], shape ``(joints,)``; the
+            position inputs of actuators count as the file does.
         efforts: Greatest force or torque of each joint's actuator [N, N m], infinite where it is not limited, shape ``(joints,)``.
         gains: Force or torque on each joint per unit of its actuator's input, gear times gain [N, N m], shape ``(joints,)``; 1 without an
             actuator.
@@ -35,6 +37,7 @@ class RobotArrays:
     actuators: wp.array[wp.int32]
     defaults: wp.array[wp.float32]
     ranges: wp.array[wp.vec2]
+    references: wp.array[wp.float32]
     efforts: wp.array[wp.float32]
     gains: wp.array[wp.float32]
     encoder_bias: wp.array2d[wp.float32]

@@ -368,6 +368,10 @@ def _inertia_axes(twins: Twins) -> Iterator[Difference]:
 
 def _notes(twins: Twins) -> Iterator[str]:
     file, built = twins.file, twins.built
+    single = [joint for joint in range(file.njnt) if freedoms(file, joint) == 1]
+    if shifted := [joint for joint in single if file.qpos0[file.jnt_qposadr[joint]]]:
+        names = some([f"{twins.name('joint', each)}: {file.qpos0[file.jnt_qposadr[each]]:.6g}" for each in shifted])
+        yield f"positions and limits of joints count from their ref in the file, which is 0 here ({names})"
     pairs = [(geom, twin) for geom, twin in twins.geoms.items() if has_mask(file, geom)]
     bare = [geom for geom, twin in pairs if file.geom_margin[geom] and not built.geom_margin[twin]]
     if bare:

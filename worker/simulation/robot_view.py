@@ -115,6 +115,7 @@ class RobotView:
             (_limit(template.joint_limit_lower[dof], -1), _limit(template.joint_limit_upper[dof], 1))
             for dof in self.dofs
         ]
+        self.references = [float(_value(template, "mujoco:dof_ref", dof)) for dof in self.dofs]
         columns = actuators_of_dofs(template)
         self.actuators = [columns.get(dof, -1) for dof in self.dofs]
         self.efforts = [
@@ -202,7 +203,7 @@ class RobotView:
         arrays.start = self.start
         for name in ("coordinates", "dofs", "actuators"):
             setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.int32, device=device))
-        for name in ("defaults", "efforts", "gains"):
+        for name in ("defaults", "references", "efforts", "gains"):
             setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.float32, device=device))
         ranges = np.array(self.ranges, np.float32).reshape(-1, 2)
         arrays.ranges = wp.array(ranges, dtype=wp.vec2, device=device)

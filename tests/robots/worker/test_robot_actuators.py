@@ -111,10 +111,12 @@ def test_explicit_motors_see_the_state_of_each_physics_step():
     np.testing.assert_allclose(worlds.arrays.joint_qd.numpy()[0], velocity, rtol=1e-4)
 
 
-def test_an_explicit_motor_counts_from_the_joints_zero():
-    """A joint whose reference is not 0: at the position that is asked for there is no force."""
-    _, worlds = wheels(ExplicitPDActuator("*", 10.0, 0.0), left='ref="17.188733853924695"')
-    forces = force_of(worlds, (0.25, 0.25), (0.25, 0.25))
+@pytest.mark.parametrize("kind", [PositionActuator, ExplicitPDActuator])
+def test_inputs_count_as_the_file_does(kind: type[Actuator]):
+    """A joint with a ref of 0.3 rad: at the position that is asked for there is no force."""
+    view, worlds = wheels(kind("*", 10.0, 0.0), left='ref="17.188733853924695"')
+    np.testing.assert_allclose(view.references, [0.3, 0.0], rtol=1e-6)
+    forces = force_of(worlds, (0.25 + 0.3, 0.25), (0.25, 0.25))
     np.testing.assert_allclose(forces, 0.0, atol=1e-5)
 
 

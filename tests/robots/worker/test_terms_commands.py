@@ -79,20 +79,20 @@ def test_actions_write_the_input_of_their_joints_actuator(rig: Rig) -> None:
     columns, coordinates = rig.robot.actuators.numpy(), rig.robot.coordinates.numpy()
     for joint in range(JOINTS - 1):
         bias, effort = rig.robot.encoder_bias.numpy()[:, joint], rig.robot.efforts.numpy()[joint]
-        gain = rig.robot.gains.numpy()[joint]
+        gain, rest = (numbers.numpy()[joint] for numbers in (rig.robot.gains, rig.robot.references))
         low, high = rig.robot.ranges.numpy()[joint]
         here = rig.q[:, coordinates[joint]]
         for name, numbers, wanted in (
             ("effort", {"value": 1.7}, 1.7),
             ("limited_effort", {"value": 0.4}, 0.4 * effort / gain),
             ("limited_effort", {"value": -7.0}, -effort / gain),
-            ("position_target", {"value": 0.3}, 0.3 - bias),
-            ("limited_position_target", {"value": 9.0, "soft_factor": 0.8}, high - 0.1 * (high - low) - bias),
-            ("relative_position_target", {"value": 0.2}, here + 0.2),
-            ("share_of_range_target", {"value": -0.5}, low + 0.25 * (high - low) - bias),
-            ("share_of_range_target", {"value": 3.0}, high - bias),
-            ("two_positions_target", {"value": -0.1, "closed": 0.1, "opened": 0.9}, 0.1 - bias),
-            ("two_positions_target", {"value": 0.0, "closed": 0.1, "opened": 0.9}, 0.9 - bias),
+            ("position_target", {"value": 0.3}, 0.3 - bias + rest),
+            ("limited_position_target", {"value": 9.0, "soft_factor": 0.8}, high - 0.1 * (high - low) - bias + rest),
+            ("relative_position_target", {"value": 0.2}, here + 0.2 + rest),
+            ("share_of_range_target", {"value": -0.5}, low + 0.25 * (high - low) - bias + rest),
+            ("share_of_range_target", {"value": 3.0}, high - bias + rest),
+            ("two_positions_target", {"value": -0.1, "closed": 0.1, "opened": 0.9}, 0.1 - bias + rest),
+            ("two_positions_target", {"value": 0.0, "closed": 0.1, "opened": 0.9}, 0.9 - bias + rest),
             ("velocity_target", {"value": -2.0}, -2.0),
             ("two_velocities_target", {"value": -1.0, "closing": -3.0, "opening": 3.0}, -3.0),
         ):
@@ -105,13 +105,13 @@ def test_actions_write_the_input_of_their_joints_actuator(rig: Rig) -> None:
 
 def test_a_smoothed_target_begins_where_the_joint_is(rig: Rig) -> None:
     rig.episodes.memory.zero_()
-    joint, bias = 2, rig.robot.encoder_bias.numpy()[:, 2]
+    joint, bias, rest = 2, rig.robot.encoder_bias.numpy()[:, 2], rig.robot.references.numpy()[2]
     target = rig.q[:, rig.robot.coordinates.numpy()[joint]] + bias
     for value in (1.0, -0.5):
         rig.call(actions.smoothed_position_target, joint, value=value, memory=20, share=0.3)
         target = 0.3 * value + 0.7 * target
         column = rig.robot.actuators.numpy()[joint]
-        np.testing.assert_allclose(rig.worlds.controls.numpy()[:, column], target - bias, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(rig.worlds.controls.numpy()[:, column], target - bias + rest, rtol=1e-5, atol=1e-6)
 
 
 def test_terms_of_actions_are_their_formulas(rig: Rig) -> None:

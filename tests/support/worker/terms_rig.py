@@ -85,6 +85,7 @@ def robot(random: np.random.Generator, *, joints: int, coordinate: int, dof: int
     if joints:
         lower[-1], upper[-1], efforts[-1] = -np.inf, np.inf, np.inf
     arrays.ranges = array(np.stack([lower, upper], axis=1).reshape(-1, 2), wp.vec2)
+    arrays.references = array(random.uniform(-0.5, 0.5, joints))
     arrays.efforts = array(efforts)
     arrays.gains = array(random.choice([-1.0, 1.0], joints) * random.uniform(0.5, 3, joints))
     arrays.encoder_bias = array(random.uniform(-0.1, 0.1, (WORLDS, joints)))

@@ -217,7 +217,7 @@ def move_frame(worlds: WorldArrays, bodies: BodyArrays, robot: RobotArrays, chai
         ends = chain.ranges[index]
         target = wp.clamp(wp.clamp(target, place - chain.max_step, place + chain.max_step), ends[0], ends[1])
         chain.targets[world, index] = target
-        worlds.controls[world, robot.actuators[joint]] = target
+        worlds.controls[world, robot.actuators[joint]] = target + robot.references[joint]
     for column in range(ik.wanted.shape[1]):
         ik.wanted[world, column] = 0.0
 

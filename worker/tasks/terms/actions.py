@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def aim(worlds: WorldArrays, robot: RobotArrays, world: int, joint: int, target: float):
     """Write a position target, in the encoder's coordinates, to a joint's actuator [m, rad]."""
-    worlds.controls[world, robot.actuators[joint]] = target - robot.encoder_bias[world, joint]
+    worlds.controls[world, robot.actuators[joint]] = target - robot.encoder_bias[world, joint] + robot.references[joint]
 
 
 @needs(kind="effort")
@@ -83,7 +83,8 @@ def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays
     mjlab: RelativeJointPositionAction (which adds to the position in every physics step). Isaac Lab: RelativeJointPositionAction (as
     mjlab's).
     """
-    worlds.controls[world, robot.actuators[joint]] = worlds.joint_q[world, robot.coordinates[joint]] + value
+    here = worlds.joint_q[world, robot.coordinates[joint]]
+    worlds.controls[world, robot.actuators[joint]] = here + value + robot.references[joint]
 
 
 @needs(kind="position", ranges=True)

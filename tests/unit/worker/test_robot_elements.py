@@ -1,0 +1,218 @@
+"""Elements of robot files that can't be held are refused by name; what has nothing to do with the motion is noted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.worker.robot_texts import BOX, HINGE, SECOND, mjcf, read, twins
+
+URDF = """<robot name="r"><link name="base"/><link name="a"><inertial><origin xyz=".5 0 0"/><mass value="1"/>
+<inertia ixx="{xx}" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="{kind}"><parent link="base"/><child link="a"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>{limit}</joint>
+{more}</robot>"""
+LIMIT = '<limit lower="-0.3" upper="0.3" effort="5" velocity="3"/>'
+
+
+def urdf(kind: str = "revolute", limit: str = LIMIT, more: str = "", xx: float = 0.01) -> str:
+    return URDF.format(kind=kind, limit=limit, more=more, xx=xx)
+
+
+def test_limits_of_a_urdf_joint_are_as_stiff_as_mujoco_s() -> None:
+    reading = read(urdf())
+    assert [(each.element, each.field) for each in reading.corrected] == [("joint j", "solref")]
+    np.testing.assert_allclose(twins(reading).built.jnt_solref, [[0.02, 1.0]], rtol=1e-6)
+
+
+def test_impossible_inertias_of_a_urdf_file_are_corrected_by_name() -> None:
+    (note,) = read(urdf(xx=1.0)).notes
+    assert note.startswith("body a: no body has the principal moments of inertia ") and "0.34 0.34 0.34" in note
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ('value="1"', 'value="inf"', r"link a: value='inf' of its <mass> is not a finite number"),
+        ('value="1"', 'value="nan"', r"link a: value='nan' of its <mass> is not a finite number"),
+        ('value="1"', 'value="-1"', r"link a: its mass is -1; give it one greater than 0"),
+        ('iyy=".01"', 'iyy="inf"', r"link a: iyy='inf' of its <inertia> is not a finite number"),
+        ('lower="-0.3"', 'lower="nan"', r"joint j: lower='nan' of its <limit> is not a finite number"),
+    ],
+)
+def test_impossible_numbers_of_a_urdf_file_are_refused_by_link_or_joint(before: str, after: str, words: str) -> None:
+    with pytest.raises(ValueError, match=rf"^robot: its XML: {words}"):
+        read(urdf().replace(before, after))
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        (
+            urdf(limit=LIMIT.replace("-0.3", "0.5")),
+            "a range without values is no limit, as in MuJoCo: joint j (0.5 to 0.3)",
+        ),
+        (
+            urdf(limit='<limit effort="5" velocity="3"/>'),
+            "joints without <limit>, or whose lower and upper are both 0, move without end, as in MuJoCo: j",
+        ),
+        (urdf(limit=LIMIT.replace("5", "-5")), "a negative effort is no limit, as in MuJoCo: joint j"),
+        (
+            mjcf(f'<joint name="j" axis="0 1 0" range="30 -30"/>{BOX}'),
+            "a range without values is no limit, as in MuJoCo: joint j (30 to -30)",
+        ),
+        (
+            mjcf(HINGE + BOX, '<actuator><motor joint="j" ctrlrange="1 -1"/></actuator>'),
+            "a ctrlrange without values is no limit, as in MuJoCo: actuator actuator_0 (1 to -1)",
+        ),
+    ],
+)
+def test_a_range_without_values_is_noted(file: str, words: str) -> None:
+    assert read(file).notes == (words,)
+
+
+def test_visuals_that_a_rebuilt_urdf_robot_loses_are_noted() -> None:
+    visual = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
+    empty = urdf(limit=LIMIT.replace("-0.3", "0.5")).replace('<link name="a">', f'<link name="a">{visual}')
+    assert read(empty).notes[-1] == "pictures lack the visuals of the file, since MuJoCo's compiled model has none"
+    assert not read(urdf().replace('<link name="a">', f'<link name="a">{visual}')).notes
+
+
+@pytest.mark.parametrize(
+    ("asset", "missing"),
+    [
+        ('<texture name="t" type="2d" file="nope.png"/><material name="m" texture="t"/>', "nope.png"),
+        ('<material name="m" texture="t"/>', "t"),
+        ('<material name="m"><layer texture="t" role="rgb"/></material>', "t"),
+        ('<skin name="s" file="nope.skn"/><material name="m"/>', "nope.skn"),
+    ],
+)
+def test_a_missing_texture_or_skin_is_noted(asset: str, missing: str) -> None:
+    painted = mjcf(HINGE + BOX.replace("/>", ' material="m"/>'), before=f"<asset>{asset}</asset>")
+    reading = read(painted)
+    assert reading.notes == (f"pictures lack textures or skins that the file names and that are missing ({missing})",)
+
+
+@pytest.mark.parametrize(("geom", "is_lost"), [("mesh", True), ("box", False)])
+def test_textures_that_a_rebuilt_robot_loses_are_noted(geom: str, is_lost: bool) -> None:
+    assets = (
+        '<texture name="t" type="2d" builtin="flat" width="8" height="8"/><material name="m" texture="t"/>'
+        '<mesh name="v" vertex="0 0 0 .1 0 0 0 .2 0 0 0 .3"/>'
+    )
+    seen = f'<geom type="{geom}" size=".1 .1 .1" material="m" mass="1" contype="0" conaffinity="0"/>'
+    spring = '<joint name="j" axis="0 1 0" springdamper=".1 1"/>'
+    reading = read(mjcf(spring + seen.replace('"mesh"', '"mesh" mesh="v"'), before=f"<asset>{assets}</asset>"))
+    assert reading.corrected and bool(reading.notes) == is_lost
+    assert all("pictures lack the textures of the file" in note for note in reading.notes)
+
+
+def test_a_light_with_a_texture_is_no_part_of_a_robot() -> None:
+    texture = '<asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/></asset>'
+    assert not read(mjcf(f'{HINGE}{BOX}<light texture="t"/>', before=texture)).notes
+
+
+def test_flags_that_only_report_do_not_make_another_robot() -> None:
+    assert not read(mjcf(HINGE + BOX, before='<option><flag energy="enable" fwdinv="enable"/></option>')).corrected
+
+
+def test_a_missing_height_field_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"its height field nope\.png is missing"):
+        read(mjcf(HINGE + BOX, before='<asset><hfield name="h" file="nope.png" size="1 1 1 1"/></asset>'))
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+@pytest.mark.parametrize(
+    "rest",
+    [
+        '<actuator><motor joint="j"/></actuator>',
+        '<tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="k" coef="1"/></fixed></tendon>',
+        '<equality><joint joint1="k" joint2="j"/></equality>',
+    ],
+)
+def test_a_root_s_joint_that_the_file_needs_is_not_taken(fixed: bool, rest: str) -> None:
+    with pytest.raises(ValueError, match=rf"fixed={fixed} would take the joint j of the root b, .*; leave fixed out"):
+        read(mjcf(HINGE + BOX + SECOND, rest), fixed=fixed)
+
+
+def test_a_root_may_be_fixed_or_free() -> None:
+    motor = '<actuator><motor joint="k"/></actuator>'
+    free, hinged = mjcf(f'<freejoint name="j"/>{BOX}{SECOND}', motor), mjcf(HINGE + BOX + SECOND, motor)
+    coordinates = {}
+    for name, file in (("free", free), ("hinged", hinged)):
+        for fixed in (True, False):
+            reading = read(file, fixed=fixed)
+            coordinates[name, fixed] = twins(reading).built.nq
+    assert coordinates == {("free", True): 1, ("free", False): 8, ("hinged", True): 1, ("hinged", False): 8}
+    driven = mjcf(f'<freejoint name="j"/>{BOX}{SECOND}', '<actuator><motor joint="j" gear="1 0 0 0 0 0"/></actuator>')
+    assert twins(read(driven, fixed=False)).built.nu == 1
+
+
+def test_a_mocap_body_stays_where_the_root_moves_freely() -> None:
+    target = f'<mujoco><worldbody><body name="m" mocap="true"/><body name="b">{BOX}</body></worldbody></mujoco>'
+    assert twins(read(target, fixed=False)).built.nq == 7
+
+
+def test_a_mimic_joint_follows() -> None:
+    link = '<link name="c"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    joint = f'<joint name="k" type="revolute"><parent link="a"/><child link="c"/><axis xyz="0 1 0"/>{LIMIT}<mimic joint="j" multiplier="-2"/></joint>'
+    reading = read(urdf(more=link + joint))
+    np.testing.assert_allclose(twins(reading).built.eq_data[0, :2], [0.0, -2.0])
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        (
+            mjcf(HINGE + BOX, '<actuator><motor joint="jj"/></actuator>'),
+            r"unknown transmission target 'jj'.*did you mean j\?",
+        ),
+        (
+            mjcf(HINGE + BOX, '<actuator><position joint="j" kp="nan"/></actuator>'),
+            r"kp='nan' of <position name=''> is not a number",
+        ),
+        (
+            mjcf(f'{HINGE}<geom size=".1" mass="0"/>'),
+            r"moving bodies must be larger than mjMINVAL Element name 'b'.*give that body",
+        ),
+        (mjcf(f'{HINGE}<geom size=".1" mass="-1"/>'), r"negative in geom .*give a value of 0 or more"),
+        (
+            mjcf(f'<joint name="j" axis="0 1 0" damping=".5 .2"/>{BOX}'),
+            r"another robot here: joint j: dampingpoly is \(0 0\), in the file \(0.2 0\)\. Give damping one number",
+        ),
+        (
+            mjcf(HINGE + BOX, '<actuator><position joint="j" kp="20" nsample="8" delay=".01"/></actuator>'),
+            r"actuator actuator_0: delay is 0, in the file 0.01, and 1 more\. Declare the delay in the task",
+        ),
+        (
+            mjcf(f'<joint name="j" type="ball" range="0 1" limited="true"/>{BOX}'),
+            r"joint j: limited is False, in the file True",
+        ),
+        (
+            mjcf(f'<joint name="j" type="free" damping=".1"/>{BOX}'),
+            r"joint j: damping is \(0 0 0 0 0 0\), in the file \(0.1 0.1",
+        ),
+        (urdf("spherical"), r"joint j is of type 'spherical'; URDF has revolute, continuous"),
+        (
+            urdf(more='<joint name="k" type="fixed"><parent link="base"/><child link="a"/></joint>'),
+            r"link a closes a loop: the joints j and k both move it; leave out one",
+        ),
+        (
+            mjcf(f'{HINGE}<inertial pos="0 0 0" mass="nan" diaginertia="1 1 1"/>'),
+            r"mass='nan' of <inertial name=''> in body b is not a number",
+        ),
+        (
+            mjcf(
+                HINGE + BOX, '<actuator><motor joint="j" group="3"/></actuator>', '<option actuatorgroupdisable="3"/>'
+            ),
+            r"option: disableactuator is 0, in the file 8",
+        ),
+        (
+            mjcf(HINGE + BOX, before='<option density="1000"/>'),
+            r"body b: axes of inertia is .*Give the body an <inertial> of three different moments",
+        ),
+        ("", r"a robot needs a file"),
+    ],
+)
+def test_what_can_t_be_held_is_refused_by_the_name_of_its_element(file: str, words: str) -> None:
+    with pytest.raises(ValueError, match=rf"^robot: .*{words}") as caught:
+        read(file)
+    assert "\n" not in str(caught.value)
