@@ -184,8 +184,8 @@ def test_a_driver_or_an_actor_that_dies_before_anything_was_started_costs_no_att
     state = Folder.of(bench.home / "home", bench.job).state(waiting.gang)
     driver = json.loads(state.read_text())["driver"]
     os.kill(driver, signal.SIGKILL)
-    await_end(driver)
-    assert bench.engine.observe(waiting)[0].words.startswith("its driver died before it had started anything (")
+    died = "its driver died before it had started anything ("
+    wait_for(lambda: bench.engine.observe(waiting)[0].words.startswith(died), 10, "its end is seen")
     bench.engine.stop(other, 1.0)
     wait_for(lambda: bench.engine.observe(waiting) and bench.log().count("ready") == 2, 60, "another one starts it")
     assert bench.stopped(waiting) == [143, 143]

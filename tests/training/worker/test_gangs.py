@@ -358,8 +358,8 @@ def start_frames_follow_the_failures_of_all_ranks(gang: Gang, store: Path) -> An
     return {"own": own, "others": loop.incident._others["motion"].tolist()}
 
 
-def test_start_frames_follow_the_failures_of_all_ranks(results: list[Any]) -> None:
-    first, second = results
+def test_start_frames_follow_the_failures_of_all_ranks(told: list[Any]) -> None:
+    first, second = told
     assert first["others"] == second["own"] and second["others"] == first["own"]
     assert first["own"] != second["own"] and min(sum(first["own"]), sum(second["own"])) > 0
 
