@@ -250,7 +250,7 @@ def test_a_server_that_can_t_be_made_leaves_nothing_open(tmp_path: Path, monkeyp
 
 def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Path) -> None:
     engine = RayEngine.__new__(RayEngine)  # no cluster is needed for what gangs hold
-    engine.home, engine._lock, engine._grown = tmp_path, threading.Lock(), {}
+    engine.home, engine._lock, engine._grown, engine._tries = tmp_path, threading.Lock(), {}, {}
     stop = threading.Event()
     handles = (Handle("ray", f"job{number}/1/1", 1, {"hosts": ["ray/+1"]}) for number in itertools.count(1))
     stopped: list[Handle] = []
