@@ -6,7 +6,7 @@
 Each training is a separate process; ``keeping.jsonl`` gets a line whenever one has made a two-hundredth of its iterations. Trainings
 that it or ``keeping.json`` already holds whole are left out, so an interrupted benchmark continues where it stopped. Every spec is trained ``default``, with
 the settings that a new job gets; and on request as ``then``, with those of runs that began before limits existed, by ``stock`` rsl_rl, or
-with other settings: ``--by 'name={"min_std": 0.05}'``. Where matplotlib is missing there is no picture.
+with other settings: ``--by 'name={"min_std": 0.05}'``. Without matplotlib, only the picture is left out.
 """
 
 from __future__ import annotations

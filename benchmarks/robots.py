@@ -193,7 +193,7 @@ def difference(first: Any, second: Any) -> float:
 
 
 def disturbed(model: Any, seed: int) -> Any:
-    """A copy of a model without contacts, each value of which differs by up to :data:`ULP` of it."""
+    """Copy a model without contacts, and change each of its values by a random share of up to :data:`ULP`."""
     random, other = np.random.default_rng(seed), without_contacts(model)
     for name in dir(other):
         array = getattr(other, name) if name.partition("_")[0] in HELD else None

@@ -13,7 +13,8 @@ import numpy as np
 from shared_store.wording import nearest
 from worker.simulation.patterns import find
 from worker.simulation.randomization_kernels import CENTER, INERTIA, MASS, PAYLOAD
-from worker.simulation.robot_view import UNLIMITED_EFFORT, RobotView
+from worker.simulation.robot_values import UNLIMITED
+from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
 from worker.tasks.randomize import Randomize
 
@@ -268,7 +269,7 @@ def _effort_limits(model: mujoco.MjModel, actuator: int, element: int, where: st
             Change("actuator_forcerange", 2 * actuator + 1, element, factor=1.0 / gear, least=0.0),
         ]
     joint = int(model.actuator_trnid[actuator, 0])
-    if model.jnt_actfrclimited[joint] and model.jnt_actfrcrange[joint, 1] < UNLIMITED_EFFORT:
+    if model.jnt_actfrclimited[joint] and model.jnt_actfrcrange[joint, 1] < UNLIMITED:
         changes += [
             Change("jnt_actfrcrange", 2 * joint, element, factor=-1.0, greatest=0.0),
             Change("jnt_actfrcrange", 2 * joint + 1, element, factor=1.0, least=0.0),

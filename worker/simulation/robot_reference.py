@@ -141,7 +141,7 @@ def _empty_ranges(model: Any) -> Iterator[str]:
             for index in empty
         ]
         if names:
-            yield f"a {limit}range without values is no limit, as in MuJoCo: {some(names)}"
+            yield f"MuJoCo ignores an empty {limit}range: {some(names)}"
 
 
 def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
@@ -312,7 +312,7 @@ def _unlimited(root: ElementTree.Element) -> Iterator[str]:
     if unlimited:
         yield f"joints without <limit>, or whose lower and upper are both 0, move without end, as in MuJoCo: {some(unlimited)}"
     if negative:
-        yield f"a negative effort is no limit, as in MuJoCo: joint {some(negative)}"
+        yield f"MuJoCo ignores a negative effort: joint {some(negative)}"
 
 
 def _add_mimics(spec: Any, root: ElementTree.Element) -> None:

@@ -19,10 +19,8 @@ from worker.simulation.carriers import is_carrier
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.robot_elements import short
+from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.worlds import Worlds
-
-UNLIMITED_EFFORT = 1e6
-"""Effort limits of Newton's builder from this value on (its default) mean no limit [N, N m]."""
 
 Patterns = str | Iterable[str]
 
@@ -244,10 +242,10 @@ def actuator_value(template: newton.ModelBuilder, attribute: str, actuator: int)
     return _value(template, f"mujoco:{attribute}", actuator)
 
 
-def _value(template: newton.ModelBuilder, attribute: str, actuator: int) -> Any:
+def _value(template: newton.ModelBuilder, attribute: str, index: int) -> Any:
     attributes = template.custom_attributes[attribute]
     values: Any = attributes.values
-    value = values.get(actuator) if isinstance(values, dict) else values[actuator] if values else None
+    value = values.get(index) if isinstance(values, dict) else values[index] if values else None
     return attributes.default if value is None else value
 
 
@@ -270,7 +268,7 @@ def actuators_of_dofs(template: newton.ModelBuilder) -> dict[int, int]:
 def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
     """Effective force limit of an actuator: the least of its own range, the range of a motor's input, and the joint's."""
     joint_limit = float(template.joint_effort_limit[dof])
-    limits = [joint_limit if joint_limit < UNLIMITED_EFFORT else math.inf]
+    limits = [joint_limit if joint_limit < UNLIMITED else math.inf]
     if actuator >= 0:
         gear = abs(float(actuator_value(template, "actuator_gear", actuator)[0]))
         if is_limited(template, "force", actuator):

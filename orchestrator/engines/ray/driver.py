@@ -82,8 +82,7 @@ class Driver:
             self._await_place(gang)
         elif gang.phase == "starting":
             gang.listen(0.1)
-            lost = any(not node["running"] and node["code"] is None for node in gang.nodes)
-            if lost and gang.placings < _PLACINGS:
+            if gang.lost and gang.placings < _PLACINGS:
                 gang.place_again()
             elif not gang.is_over and all("facts" in node for node in gang.nodes):
                 addresses = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes()}

@@ -62,6 +62,11 @@ class DrivenGang:
             self.told = json.loads(json.dumps(state))
 
     @property
+    def lost(self) -> set[int]:
+        """Indices of nodes that ended without an exit code."""
+        return {index for index, node in enumerate(self.nodes) if not node["running"] and node["code"] is None}
+
+    @property
     def is_over(self) -> bool:
         return not any(node["running"] for node in self.nodes)
 
@@ -97,7 +102,7 @@ class DrivenGang:
 
     def place_again(self) -> None:
         """Have the gang placed anew: an actor was lost before any command was started, so the attempt has not begun."""
-        lost = next(index for index, node in enumerate(self.nodes) if not node["running"])
+        lost = min(self.lost)
         self.why = (
             f"node {lost} on {self.plan['nodes'][lost]['host']}: {self.nodes[lost]['detail']}; it is placed again"
         )
@@ -137,7 +142,7 @@ class DrivenGang:
             self.fail(f"no free port from {first_port(self.name)} on {addresses[main]}")
             return
         self.phase, self.why = "running", ""
-        self.tell()  # before anything is started: whoever finds another phase may start the gang again
+        self.tell()  # before it starts anything: the engine starts a gang again if it finds an earlier phase
         for index in sorted(range(len(self.nodes)), key=lambda index: index != main):
             node = self.plan["nodes"][index]
             contract = dataclasses.replace(
@@ -162,7 +167,7 @@ class DrivenGang:
     def stop(self, grace: float) -> None:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
         self.phase, self.why, self.deadline = "stopping", "", time.monotonic() + grace + _ENDING
-        lost = {index for index, node in enumerate(self.nodes) if not node["running"] and node["code"] is None}
+        lost = self.lost
         self.asked = {ref: told for ref, told in self.asked.items() if told[1] not in lost}
         for index, actor in enumerate(self.actors):
             if index not in lost:  # nobody is there to answer

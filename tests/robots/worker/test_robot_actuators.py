@@ -113,7 +113,7 @@ def test_explicit_motors_see_the_state_of_each_physics_step():
 
 @pytest.mark.parametrize("kind", [PositionActuator, ExplicitPDActuator])
 def test_inputs_count_as_the_file_does(kind: type[Actuator]):
-    """A joint with a ref of 0.3 rad: at the position that is asked for there is no force."""
+    """At its target, a joint with a ref of 0.3 rad feels no force."""
     view, worlds = wheels(kind("*", 10.0, 0.0), left='ref="17.188733853924695"')
     np.testing.assert_allclose(view.references, [0.3, 0.0], rtol=1e-6)
     forces = force_of(worlds, (0.25 + 0.3, 0.25), (0.25, 0.25))

@@ -49,20 +49,20 @@ def test_impossible_numbers_of_a_urdf_file_are_refused_by_link_or_joint(before: 
     [
         (
             urdf(limit=LIMIT.replace("-0.3", "0.5")),
-            "a range without values is no limit, as in MuJoCo: joint j (0.5 to 0.3)",
+            "MuJoCo ignores an empty range: joint j (0.5 to 0.3)",
         ),
         (
             urdf(limit='<limit effort="5" velocity="3"/>'),
             "joints without <limit>, or whose lower and upper are both 0, move without end, as in MuJoCo: j",
         ),
-        (urdf(limit=LIMIT.replace("5", "-5")), "a negative effort is no limit, as in MuJoCo: joint j"),
+        (urdf(limit=LIMIT.replace("5", "-5")), "MuJoCo ignores a negative effort: joint j"),
         (
             mjcf(f'<joint name="j" axis="0 1 0" range="30 -30"/>{BOX}'),
-            "a range without values is no limit, as in MuJoCo: joint j (30 to -30)",
+            "MuJoCo ignores an empty range: joint j (30 to -30)",
         ),
         (
             mjcf(HINGE + BOX, '<actuator><motor joint="j" ctrlrange="1 -1"/></actuator>'),
-            "a ctrlrange without values is no limit, as in MuJoCo: actuator actuator_0 (1 to -1)",
+            "MuJoCo ignores an empty ctrlrange: actuator actuator_0 (1 to -1)",
         ),
     ],
 )
