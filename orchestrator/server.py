@@ -19,7 +19,7 @@ import uvicorn
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
 from orchestrator.api.http.auth import is_loopback
-from orchestrator.api.http.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
+from orchestrator.api.http.connections import Connection, Connections, Seldom, Serving, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit
 from orchestrator.api.native.automatic import AutomaticEvaluations
 from orchestrator.console import add_console
@@ -165,13 +165,13 @@ class Server:
             log_level="warning",
             access_log=False,
             timeout_graceful_shutdown=2,
-            backlog=BACKLOG,
+            backlog=connections.backlog,
             proxy_headers=bool(trusted_proxies),
             forwarded_allow_ips=list(trusted_proxies),
         )
         logging.getLogger("uvicorn.error").addFilter(_INVALID)
         logging.getLogger("asyncio").addFilter(_NO_DESCRIPTOR)
-        self._uvicorn = uvicorn.Server(config)
+        self._uvicorn = Serving(config)
         self._thread = threading.Thread(
             target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True
         )

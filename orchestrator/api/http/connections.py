@@ -15,6 +15,7 @@ import socket
 import time
 from typing import Any
 
+import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from orchestrator.api.http.callers import Caller
@@ -27,8 +28,8 @@ _FLUSH_TIMEOUT = 60.0
 """Seconds without any progress after which a connection that has something to send is cut off."""
 _UNSENT = 128 << 10
 """Bytes of answers that the kernel keeps for a client that does not read; by itself it would keep MBs."""
-BACKLOG = 128
-"""Connections that are accepted at once, and so how far the most may be exceeded for a moment."""
+_BACKLOG = 128
+"""Connections that the kernel keeps until they are accepted; so many are accepted at once, at most."""
 _PIECE = 16 << 10
 """Bytes that are parsed at once. A head of more than h11's limit (64 KiB) and one piece is always refused."""
 _MOST_DESCRIPTORS = 65_536
@@ -53,8 +54,13 @@ class Connections:
     """The open connections of one server; used in its event loop only."""
 
     def __init__(self, descriptors: int) -> None:
-        """``descriptors``: the limit of open files. Half are for connections; the rest starts jobs and serves the database."""
+        """``descriptors``: the limit of open files. Half are for connections; the rest starts jobs and serves the database.
+
+        A burst exceeds the half for a moment. asyncio accepts ``backlog`` connections in a turn of its loop, counts them two turns
+        later, and closes those that give way a turn after that. So four times ``backlog`` are at most a quarter of ``descriptors``.
+        """
         self.most = max(16, min(descriptors // 2, _MOST_CONNECTIONS))
+        self.backlog = max(4, min(descriptors // 16, _BACKLOG))
         self.most_of_a_peer = self.most * 3 // 4
         self._peers: dict[str, int] = {}
         self._waiting: dict[str, dict[Connection, None]] = {}
@@ -235,6 +241,15 @@ class Connection(H11Protocol):
 
     def _should_upgrade(self) -> bool:
         return False  # there is no websocket here, and uvicorn would log each attempt
+
+
+class Serving(uvicorn.Server):
+    """uvicorn's server; asyncio has one number for the connections accepted at once and for those that the kernel keeps."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for each in sockets or ():
+            each.listen(_BACKLOG)
 
 
 class Seldom(logging.Filter):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
+import signal
 import socket
 import threading
 import time
@@ -80,6 +81,28 @@ def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp
         log = server.errors.read_text()
         assert "have waited longest for their client are closed" in log
         assert len(log.splitlines()) < 10 and "Traceback" not in log, log[:2000]
+
+
+class Scarce(Limited):
+    """A server with hardly any open files."""
+
+    command = ("prlimit", "--nofile=256:256", MUSTER)
+
+
+def test_a_burst_of_connections_leaves_descriptors_for_the_rest(tmp_path: Path) -> None:
+    with Scarce(tmp_path / "home") as server, contextlib.ExitStack() as stack:
+        assert server.process is not None
+        address = httpx.URL(server.url)
+        for _ in range(3):
+            server.process.send_signal(signal.SIGSTOP)  # all of them wait in the kernel when it goes on
+            for _ in range(300):
+                connection = stack.enter_context(socket.socket())
+                connection.setblocking(False)
+                connection.connect_ex((address.host, address.port or 0))
+            server.process.send_signal(signal.SIGCONT)
+            with httpx.Client(base_url=server.url, timeout=60, trust_env=False) as fresh:
+                assert fresh.get("/healthz").json()["status"] == "ok"
+        assert "out of system resource" not in server.errors.read_text()
 
 
 @pytest.mark.parametrize("sent", [b"", HALF, HALF + b"ngth: 100\r\n\r\n{"])
