@@ -16,7 +16,7 @@ WINDOW = 20
 FALLEN = 0.7
 """Share of the gain, from the first mean to the best, below which a training counts as fallen."""
 ENDS_BELOW = 0.9
-"""Share of the best mean below which its end is compared with it."""
+"""The same share for its end."""
 PATIENCE = 50
 """Iterations for which it must stay fallen."""
 STUCK = 20
@@ -68,17 +68,17 @@ class Watch:
             return None
         return sum(count * reward for count, reward in self._window) / sum(count for count, _ in self._window)
 
-    def _lost(self, least: float) -> float | None:
-        """The present mean, if it is below ``least`` and below the best by more than noise."""
+    def _lost(self, share: float) -> float | None:
+        """The present mean, if it is below ``share`` of the gain, and below the best by more than noise."""
         mean = self._mean()
-        if mean is None:
+        if mean is None or self._first is None:
             return None
+        least = self._first + share * (self._best - self._first)
         noise = statistics.stdev(reward for _, reward in self._window) / math.sqrt(WINDOW)
         return mean if mean < least and self._best - mean > 3.0 * noise else None
 
     def _fallen(self, record: Mapping[str, Any]) -> str:
-        first = self._best if self._first is None else self._first
-        mean = self._lost(first + FALLEN * (self._best - first))
+        mean = self._lost(FALLEN)
         if mean is None:
             return ""
         return (
@@ -87,7 +87,7 @@ class Watch:
         )
 
     def _ended(self) -> str:
-        mean = self._lost(self._best - (1.0 - ENDS_BELOW) * abs(self._best))
+        mean = self._lost(ENDS_BELOW)
         if mean is None:
             return ""
         return (

@@ -65,6 +65,8 @@ def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
         "it ended below its best: mean return 18.50, and 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
     ]
     assert not any(begun(watch(60), [*RISE, *([20.0] * 20)]))
+    shifted = [900.0 + value for value in (*RISE, *([15.0] * 20))]
+    assert "ended below" in begun(watch(60), shifted)[-1][0], "the gain counts, wherever the returns begin"
 
 
 @pytest.mark.parametrize(("deviation", "reported"), [(0.003, True), (0.05, False), (0.0, False), (None, False)])
