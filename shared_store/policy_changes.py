@@ -11,16 +11,20 @@ from shared_store.policy_contract import LARGEST, Action, Contract, Group, Robot
 
 CLOSE = 1e-6
 """Relative difference up to which two numbers count as equal: recompiling a model rounds."""
+_OF_ROBOT = ("scale", "offset", "default_position", "stiffness", "damping", "effort_limit")
+"""Values of actions and observations that may follow from a robot's file."""
 
 
-def differences(before: Contract, now: Contract, *, ranges: bool = False) -> list[str]:
+def differences(before: Contract, now: Contract, *, ranges: bool = False, of_robot: bool = True) -> list[str]:
     """The points in which a policy of ``before`` would misunderstand ``now``, one line each; empty if both mean the same.
 
     Args:
         before: The contract of the policy's training.
         now: The contract that it would meet.
         ranges: Also compare properties of the training: ranges and durations of commands, delays.
+        of_robot: Also compare values that may follow from a robot's file, such as the scale and the damping of an action.
     """
+    left_out = () if of_robot else _OF_ROBOT
     lines = []
     if before.control_hz != now.control_hz:
         lines.append(f"the control rate {before.control_hz:g} Hz became {now.control_hz:g} Hz")
@@ -29,9 +33,9 @@ def differences(before: Contract, now: Contract, *, ranges: bool = False) -> lis
         if there is None:
             lines.append(f"the observation group {group.name} is gone")
         else:
-            lines += _group_differences(group, there, ranges)
+            lines += _group_differences(group, there, ranges, left_out)
     lines += [f"the observation group {group.name} is new" for group in now.groups if not before.group(group.name)]
-    lines += _named(_actions(before), _actions(now), "action")
+    lines += _named(_actions(before, left_out), _actions(now, left_out), "action")
     lines += _command_differences(before, now, ranges)
     old, new = ({state.name: state.shape for state in each.states} for each in (before, now))
     if old != new:
@@ -80,11 +84,11 @@ def brief(lines: Sequence[str], most: int = 5) -> str:
     return "; ".join(lines[:most]) + more
 
 
-def _group_differences(before: Group, now: Group, ranges: bool) -> list[str]:
+def _group_differences(before: Group, now: Group, ranges: bool, left_out: Sequence[str]) -> list[str]:
     of = "" if before.name == "policy" else f" of {before.name}"
     lines = []
     if before.terms and now.terms:
-        lines = _named(_columns(before, ranges), _columns(now, ranges), f"observation{of}")
+        lines = _named(_columns(before, ranges, left_out), _columns(now, ranges, left_out), f"observation{of}")
     if before.image and now.image:
         old, new = (_flat(dataclasses.asdict(each)) for each in (before.image, now.image))
         lines += [f"image{of}: {line}" for line in _changed(old, new)]
@@ -95,7 +99,7 @@ def _group_differences(before: Group, now: Group, ranges: bool) -> list[str]:
     return lines
 
 
-def _columns(group: Group, ranges: bool) -> dict[str, dict[str, Any]]:
+def _columns(group: Group, ranges: bool, left_out: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The meaning of each number of a group, by its label, in order."""
     found = {}
     for term in group.terms:
@@ -115,21 +119,21 @@ def _columns(group: Group, ranges: bool) -> dict[str, dict[str, Any]]:
         for back in range(term.history - 1, -1, -1):
             for index, name in enumerate(term.names):
                 label = name if name == term.name else f"{term.name}/{name}"
+                values = {"scale": term.scale[index], "offset": term.offset[index]}
                 found[f"{label} ({back} steps ago)" if back else label] = {
                     **common,
                     "unit": term.units[index],
-                    "scale": term.scale[index],
-                    "offset": term.offset[index],
+                    **{name: value for name, value in values.items() if name not in left_out},
                     **({"element": term.elements[index // each]} if each else {}),
                     **({"range": term.ranges[index]} if ranges and term.ranges else {}),
                 }
     return found
 
 
-def _actions(contract: Contract) -> dict[str, dict[str, Any]]:
+def _actions(contract: Contract, left_out: Sequence[str]) -> dict[str, dict[str, Any]]:
     if not contract.actions:
         return {name: {} for name in contract.action_names}
-    fields = [field.name for field in dataclasses.fields(Action) if field.name not in ("name", "range")]
+    fields = [field.name for field in dataclasses.fields(Action) if field.name not in ("name", "range", *left_out)]
     return {action.name: {name: getattr(action, name) for name in fields} for action in contract.actions}
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,6 @@ import torch
 import warp
 
 from shared_store.bundles import DamagedBundle, read_contract, verify
-from shared_store.policy_changes import brief, differences
 from shared_store.policy_contract import Contract
 from shared_store.wording import counted
 from worker.accepting import CHANGED_ROBOTS
@@ -263,7 +263,7 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
         UserError: The bundle is damaged, its task is not here, means something else by now, or has no declared robot; or the robot
             changed, and ``accept`` is false.
     """
-    from worker.learning.setup import check_robots
+    from worker.learning.setup import check_fit, check_robots
     from worker.tasks import find_task
     from worker.tasks.declared import DeclaredTask
     from worker.tasks.policy_contract import policy_contract, same_policy
@@ -281,11 +281,10 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
         raise UserError(f"task {contract.task} declares no robot; a task of kernels by hand can't be a simulated robot")
     if task.discrete or any(action.rule or not action.scale for action in contract.actions):
         raise UserError(f"task {contract.task}: joint commands can't be turned back into its actions")
-    if lines := differences(contract, same_policy(policy_contract(task, contract.task), contract)):
-        raise UserError(f"bundle {bundle} does not fit task {contract.task} as it is now: {brief(lines)}")
-    if changes := check_robots(contract, task, f"bundle {bundle}", accept=accept):
+    now, of = same_policy(policy_contract(task, contract.task), contract), f"bundle {bundle}"
+    if changes := check_fit(contract, now, of, check_robots(contract, task, of, accept=accept)):
         print(f"warning: {changes}", flush=True)
-    return SimulatedRobot(task, contract, messages)
+    return SimulatedRobot(task, replace(contract, actions=now.actions), messages)
 
 
 def main() -> int:

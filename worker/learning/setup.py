@@ -249,16 +249,35 @@ def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any
     facts = checkpoint.manifest
     name, then = facts["task"], contract_from(facts, checkpoint.name)
     accept = bool(section.get("accept_changed_robot"))
-    if changes := check_robots(then, task, f"checkpoint {checkpoint.name}", accept=accept):
-        print(f"warning: {changes}", flush=True)
+    of = f"checkpoint {checkpoint.name}"
+    changes = check_robots(then, task, of, accept=accept)
     if then:
-        now = same_policy(policy_contract(task, name), then)
-        if lines := differences(then, now):
-            raise UserError(
-                f"checkpoint {checkpoint.name} does not fit task {name} as it is now: {brief(lines)}; use the task's code of that time"
-            )
+        changes = check_fit(then, same_policy(policy_contract(task, name), then), of, changes)
     elif (had := spaces_from(facts["policy"])) != (has := spaces_of(task)):
-        raise UserError(
-            f"checkpoint {checkpoint.name} does not fit task {name} as it is now: it had {had}, it has {has}"
-        )
+        raise UserError(f"{of} does not fit task {name} as it is now: it had {had}, it has {has}")
+    if changes:
+        print(f"warning: {changes}", flush=True)
     return changes
+
+
+def check_fit(then: Contract, now: Contract, of: str, changes: str) -> str:
+    """Check that a policy means the same in its task as it is now.
+
+    Args:
+        then: The policy's contract.
+        now: That of the task as it is now.
+        of: The owner of the policy: ``"checkpoint 00000100-e1"``.
+        changes: Accepted changes of the robots, in a sentence: values that may follow from them may differ. Empty without any.
+
+    Returns:
+        ``changes``, and such values.
+
+    Raises:
+        UserError: The meaning of the observations, actions or commands changed.
+    """
+    if lines := differences(then, now, of_robot=not changes):
+        raise UserError(
+            f"{of} does not fit task {then.task} as it is now: {brief(lines)}; use the task's code of that time"
+        )
+    follows = differences(then, now)
+    return f"{changes}; {brief(follows)}" if follows else changes

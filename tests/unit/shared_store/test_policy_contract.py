@@ -177,6 +177,22 @@ def test_added_removed_and_moved_names_are_reported_by_name() -> None:
     assert renamed == ["observation 4: speed is gone", "observation 4: speed/pace is new"]
 
 
+def test_values_that_follow_from_a_robot_s_file_can_be_left_out_and_meanings_can_not() -> None:
+    def changed(found: dict[str, Any]) -> None:
+        found["actions"][0].update(
+            stiffness=30.0, damping=1.0, scale=0.5, offset=0.4, default_position=0.4, effort_limit=20.0
+        )
+        terms_of(found)[0].update(offset=[0.4, -0.4])
+
+    there = read(document(changed))
+    assert len(differences(CONTRACT, there)) == 10 and differences(CONTRACT, there, of_robot=False) == []
+    other = read(document(lambda found: found["actions"][0].update(kind="effort", unit="N m", damping=1.0)))
+    assert differences(CONTRACT, other, of_robot=False) == [
+        "action 0: left_knee kind position became effort",
+        "action 0: left_knee unit rad became N m",
+    ]
+
+
 def test_numbers_that_a_compiler_rounded_are_no_change_and_many_differences_are_shortened() -> None:
     assert after(lambda found: found["actions"][0].update(stiffness=20.0000005)) == []
     wider: Callable[[dict[str, Any]], Any] = lambda found: found["commands"][0].update(ranges=[[-2.0, 2.0]])  # noqa: E731
