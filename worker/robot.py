@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from worker.simulation.robot import Robot
+from worker.simulation.robot_connections import Ends, equality_ends, tendon_ends
 from worker.simulation.robot_elements import kind_of, name_of, short, word_of
 from worker.simulation.robot_judge import Difference
 from worker.simulation.robot_reading import AnotherRobot, Reading
@@ -40,6 +41,11 @@ def describe(file: str, reading: Reading) -> dict[str, Any]:
     """
     builder, view = reading.builder, RobotView(reading.builder, "")
     reference = reading.reference
+    model = reference.model if reference else None
+    actuators = _actuators(model) if model else _drives(builder, view)
+    notes = [*reading.notes, *view.beyond_limits()]
+    if view.joint_names and not actuators:
+        notes.append("it has no actuators: a task declares some, or has passive=True")
     return {
         "file": file,
         "mass": reading.identity.mass,
@@ -49,12 +55,14 @@ def describe(file: str, reading: Reading) -> dict[str, Any]:
             {"name": name, "mass": builder.body_mass[body]}
             for name, body in zip(view.body_names, view.bodies, strict=True)
         ],
-        "joints": [_joint(builder, view, joint) for joint in range(len(view.joint_names))],
-        "actuators": _actuators(reference.model) if reference else _drives(builder, view),
+        "joints": [*(_joint(builder, view, joint) for joint in range(len(view.joint_names))), *_balls(model)],
+        "actuators": actuators,
+        "tendons": _tendons(model),
+        "equalities": _equalities(model),
         "sensors": [{"name": name, "kind": kind} for name, kind in reference.sensors] if reference else [],
         "sites": view.site_names,
         "corrected": [_difference(each) for each in reading.corrected],
-        "notes": [*reading.notes, *view.beyond_limits()],
+        "notes": notes,
     }
 
 
@@ -80,6 +88,60 @@ def _is_linear(builder: newton.ModelBuilder, dof: int) -> bool:
     return dof - builder.joint_qd_start[joint] < builder.joint_dof_dim[joint][0]
 
 
+def _balls(model: Any) -> list[dict[str, Any]]:
+    """Joints of three degrees of freedom, which have no position that a number could say; none of a USD file."""
+    joints = range(model.njnt) if model else ()
+    nothing = dict.fromkeys(("lower", "upper", "default", "effort_limit"))
+    return [
+        {
+            **nothing,
+            "name": name_of(model, kind_of("joint"), joint),
+            "kind": "ball",
+            "stiffness": float(model.jnt_stiffness[joint]),
+            "damping": float(model.dof_damping[model.jnt_dofadr[joint]]),
+            "armature": float(model.dof_armature[model.jnt_dofadr[joint]]),
+            "friction_loss": float(model.dof_frictionloss[model.jnt_dofadr[joint]]),
+        }
+        for joint in joints
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
+    ]
+
+
+def _tendons(model: Any) -> list[dict[str, Any]]:
+    """The tendons of a compiled model; none of a USD file."""
+    found = []
+    for tendon in range(model.ntendon) if model else ():
+        lower, upper = model.tendon_range[tendon] if model.tendon_limited[tendon] else (None, None)
+        found.append(
+            {
+                "name": name_of(model, kind_of("tendon"), tendon),
+                "connects": _named(model, tendon_ends(model, tendon)),
+                "lower": None if lower is None else float(lower),
+                "upper": None if upper is None else float(upper),
+                "stiffness": float(model.tendon_stiffness[tendon]),
+                "damping": float(model.tendon_damping[tendon]),
+            }
+        )
+    return found
+
+
+def _equalities(model: Any) -> list[dict[str, Any]]:
+    """The equalities of a compiled model; none of a USD file."""
+    return [
+        {
+            "name": name_of(model, kind_of("equality"), equality),
+            "kind": word_of(mujoco.mjtEq, model.eq_type[equality]),
+            "connects": _named(model, equality_ends(model, equality)),
+            "active": bool(model.eq_active0[equality]),
+        }
+        for equality in (range(model.neq) if model else ())
+    ]
+
+
+def _named(model: Any, ends: Ends) -> list[str]:
+    return [f"{kind} {name_of(model, kind_of(kind), index)}" for kind, index in ends if kind != "pulley" and index >= 0]
+
+
 def _actuators(model: Any) -> list[dict[str, Any]]:
     """Those of a compiled model, ``mujoco.MjModel``."""
     found = []
@@ -98,8 +160,8 @@ def _actuators(model: Any) -> list[dict[str, Any]]:
                 name_of(model, kind_of("actuator"), actuator),
                 f"{kind} {name_of(model, kind_of(target), int(model.actuator_trnid[actuator, 0]))}",
                 model.actuator_gear[actuator],
-                model.actuator_gainprm[actuator],
-                model.actuator_biasprm[actuator],
+                (model.actuator_gaintype[actuator], model.actuator_gainprm[actuator]),
+                (model.actuator_biastype[actuator], model.actuator_biasprm[actuator]),
                 word_of(mujoco.mjtDyn, model.actuator_dyntype[actuator]),
                 limits,
             )
@@ -123,8 +185,8 @@ def _drives(builder: newton.ModelBuilder, view: RobotView) -> list[dict[str, Any
                 short(value("actuator_label")) or joint,
                 f"joint {joint}",
                 value("actuator_gear"),
-                value("actuator_gainprm"),
-                value("actuator_biasprm"),
+                (value("actuator_gaintype"), value("actuator_gainprm")),
+                (value("actuator_biastype"), value("actuator_biasprm")),
                 dynamics,
                 limits,
             )
@@ -132,18 +194,36 @@ def _drives(builder: newton.ModelBuilder, view: RobotView) -> list[dict[str, Any
     return found
 
 
+Numbers = tuple[int, Any]
+"""Kind of a gain or bias, and its numbers."""
+
+
 def _actuator(
-    name: str, target: str, gear: Any, gain: Any, bias: Any, dynamics: str, limits: dict[str, Any]
+    name: str, target: str, gear: Any, gain: Numbers, bias: Numbers, dynamics: str, limits: dict[str, Any]
 ) -> dict[str, Any]:
-    """Source of the names: MuJoCo's documentation, actuation model; its force is ``gain input + b0 + b1 length + b2 velocity``."""
+    """Source of the names: MuJoCo's documentation, actuation model; its force is ``gain input + b0 + b1 length + b2 velocity``.
+
+    None stands for what such an actuator has not: a damper's force is ``-damping input velocity``, a muscle's depends on its length.
+    """
+    kind, numbers = word_of(mujoco.mjtGain, gain[0]), gain[1]
+    biases = [0.0] * 3 if bias[0] == mujoco.mjtBias.mjBIAS_NONE else [float(each) for each in bias[1][:3]]
+    if kind == "affine":
+        described = {
+            "gain": float(numbers[0]),
+            "bias": biases,
+            "stiffness": -float(numbers[1]),
+            "damping": -float(numbers[2]),
+        }
+    elif kind == "fixed":
+        described = {"gain": float(numbers[0]), "bias": biases, "stiffness": -biases[1], "damping": -biases[2]}
+    else:
+        described = dict.fromkeys(("gain", "bias", "stiffness", "damping"))
     return {
         "name": name,
         "drives": target,
         "gear": float(gear[0]),
-        "gain": float(gain[0]),
-        "bias": [float(bias[index]) for index in range(3)],
-        "stiffness": -float(bias[1]) or 0.0,
-        "damping": -float(bias[2]) or 0.0,
+        **{word: number or 0.0 if isinstance(number, float) else number for word, number in described.items()},
+        "law": kind,
         "dynamics": dynamics,
         **{f"{word}_range": None if pair is None else [float(each) for each in pair] for word, pair in limits.items()},
     }

@@ -14,7 +14,7 @@ from rich.text import Text
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.recordings import check_output
 from orchestrator.cli.tasks import ask_worker
-from orchestrator.cli.terminal import Console, echo, echo_json
+from orchestrator.cli.terminal import Console, echo, echo_json, print_cut
 from orchestrator.domain.errors import SpecError
 from shared_store.wording import counted
 
@@ -69,7 +69,7 @@ def robot(
 ) -> None:
     """Show a robot's file as a task would load it, beside MuJoCo's own reading.
 
-    It lists joints, limits, masses, actuators and sensors, and with -o it draws the default pose. MuJoCo's compiled model judges the file,
+    It lists joints, limits, masses, actuators, tendons, equalities and sensors, and with -o it draws the default pose. MuJoCo's compiled model judges the file,
     and USD's schema a USD file: what Newton's importer reads otherwise is corrected, and what can't be held is refused by name.
     --fixed, --ignore and --accept are Robot's arguments fixed, ignore and accept.
     """
@@ -105,11 +105,7 @@ def _print(found: dict[str, Any], compare: bool) -> None:
                 each["name"],
                 each["kind"],
                 _range(each["lower"], each["upper"]),
-                f"{each['default']:.4g}",
-                f"{each['stiffness']:.4g}",
-                f"{each['damping']:.4g}",
-                f"{each['armature']:.4g}",
-                "" if each["effort_limit"] is None else f"{each['effort_limit']:.4g}",
+                *(_number(each[name]) for name in ("default", "stiffness", "damping", "armature", "effort_limit")),
             )
             for each in found["joints"]
         ],
@@ -117,19 +113,38 @@ def _print(found: dict[str, Any], compare: bool) -> None:
     _table("BODIES", ("NAME", "MASS [kg]"), [(each["name"], f"{each['mass']:.6g}") for each in found["bodies"]])
     _table(
         "ACTUATORS",
-        ("NAME", "DRIVES", "GEAR", "GAIN", "STIFFNESS", "DAMPING", "DYNAMICS", "CONTROL", "FORCE"),
+        ("NAME", "DRIVES", "GEAR", "GAIN", "STIFFNESS", "DAMPING", "CONTROL", "FORCE", "DYNAMICS"),
         [
             (
                 each["name"],
                 each["drives"],
-                f"{each['gear']:.4g}",
-                f"{each['gain']:.4g}",
-                f"{each['stiffness']:.4g}",
-                f"{each['damping']:.4g}",
-                each["dynamics"],
+                *(_number(each[name]) for name in ("gear", "gain", "stiffness", "damping")),
                 *("" if each[name] is None else _range(*each[name]) for name in ("control_range", "force_range")),
+                each["dynamics"],
             )
             for each in found["actuators"]
+        ],
+    )
+    _table(
+        "TENDONS",
+        ("NAME", "LIMITS [rad, m]", "STIFFNESS", "DAMPING", "CONNECTS"),
+        [
+            (
+                each["name"],
+                _range(each["lower"], each["upper"]),
+                _number(each["stiffness"]),
+                _number(each["damping"]),
+                ", ".join(each["connects"]),
+            )
+            for each in found["tendons"]
+        ],
+    )
+    _table(
+        "EQUALITIES",
+        ("NAME", "KIND", "CONNECTS"),
+        [
+            (each["name"], each["kind"] if each["active"] else f"{each['kind']}, off", ", ".join(each["connects"]))
+            for each in found["equalities"]
         ],
     )
     _table(
@@ -138,10 +153,11 @@ def _print(found: dict[str, Any], compare: bool) -> None:
         [(each["name"], each["kind"]) for each in found["sensors"]],
     )
     if found["corrected"] and not compare:
-        count, first = counted(len(found["corrected"]), "value"), found["corrected"][0]
-        echo(
-            f"\ncorrected: {count} that Newton's importer reads otherwise, such as {first['field']} of {first['element']} (--compare lists all)"
-        )
+        first = found["corrected"][0]
+        what = f"{counted(len(found['corrected']), 'value')} that Newton's importer reads otherwise, such as {first['field']} of {first['element']}"
+        if first["element"] == "file":
+            what = "Newton's importer can't read the file, so the robot is built from MuJoCo's compiled model"
+        echo(f"\ncorrected: {what} (--compare lists all)")
     if compare:
         _print_differences("CORRECTED", found["corrected"])
     for note in found["notes"]:
@@ -155,7 +171,11 @@ def _print_differences(title: str, differences: list[dict[str, str]]) -> None:
         echo(f"\n{title}: nothing; Newton's importer reads the robot that its file says")
         return
     rows = [(each["element"], each["field"], each["here"], each["file"]) for each in differences]
-    _table(title, ("ELEMENT", "VALUE", "NEWTON", "FILE"), rows)
+    _table(title, ("ELEMENT", "VALUE", "NEWTON", "FILE"), rows, fold=True)
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
 
 
 def _range(lower: float | None, upper: float | None) -> str:
@@ -164,13 +184,17 @@ def _range(lower: float | None, upper: float | None) -> str:
     return " to ".join("-" if each is None else f"{each:.4g}" for each in (lower, upper))
 
 
-def _table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+def _table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]], fold: bool = False) -> None:
+    """``fold``: long cells take several lines, and nothing is cut."""
     if not rows:
         return
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left", title_style="")
+    table = Table(box=None, pad_edge=False)
     for column in columns:
-        table.add_column(Text(column), overflow="fold", no_wrap=column == "NAME")
+        table.add_column(Text(column), overflow="fold", no_wrap=not fold)
     for row in rows:
         table.add_row(*row)
-    echo("")
-    Console(highlight=False).print(table)
+    echo(f"\n{title}")
+    if fold:
+        Console(highlight=False).print(table)
+    else:
+        print_cut(table)

@@ -92,7 +92,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
         )
         facts["learning"] = in_words(progress)
-        facts["warning"] = "; ".join(map(one_line, warnings_of(progress, detail["run"])))
+        facts["warning"] = f"\n{'':16}".join(map(one_line, warnings_of(progress, detail["run"])))
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = in_one_line(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))

@@ -51,7 +51,7 @@ class RobotView:
         defaults: Default position of each joint [m, rad].
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none.
         efforts: Greatest force of each joint's actuator [N, N m], infinite where it is not limited.
-        gains: Force on each joint per unit of its actuator's input, gear times gain [N, N m]; 1 without an actuator.
+        gains: Force on each joint per unit of its actuator's input, gear times gain [N, N m]; 1 without an actuator of such a gain.
         inputs: What each joint's actuator takes: ``"effort"``, ``"position"`` or ``"velocity"``; empty without one, or of another kind.
         bodies: Column of each body in ``BodyArrays``.
         sites: Index of each site among the shapes of a world.
@@ -273,15 +273,15 @@ def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
         gear = abs(float(actuator_value(template, "actuator_gear", actuator)[0]))
         if is_limited(template, "force", actuator):
             limits.append(gear * max(map(abs, actuator_value(template, "actuator_forcerange", actuator))))
-        if not int(actuator_value(template, "actuator_biastype", actuator)) and is_limited(template, "ctrl", actuator):
+        if is_motor(template, actuator) and is_limited(template, "ctrl", actuator):
             gain = abs(float(actuator_value(template, "actuator_gainprm", actuator)[0]))
             limits.append(gear * gain * max(map(abs, actuator_value(template, "actuator_ctrlrange", actuator))))
     return float(min(limits))
 
 
 def _gain(template: newton.ModelBuilder, actuator: int) -> float:
-    """Force on the joint per unit of input; 1 without an actuator."""
-    if actuator < 0:
+    """Force on the joint per unit of input; 1 without an actuator whose force is proportional to it."""
+    if actuator < 0 or not has_fixed_gain(template, actuator):
         return 1.0
     gear = float(actuator_value(template, "actuator_gear", actuator)[0])
     return gear * float(actuator_value(template, "actuator_gainprm", actuator)[0]) or 1.0
@@ -293,13 +293,26 @@ def _input(template: newton.ModelBuilder, actuator: int) -> Input | Literal[""]:
         return ""
     if "muster:explicit" in template.custom_attributes and _value(template, "muster:explicit", actuator):
         return "position"
-    if not int(actuator_value(template, "actuator_biastype", actuator)):
+    if not has_fixed_gain(template, actuator):
+        return ""
+    if is_motor(template, actuator):
         return "effort"
     gain = float(actuator_value(template, "actuator_gainprm", actuator)[0])
     _, position, velocity, *_ = map(float, actuator_value(template, "actuator_biasprm", actuator))
     if position:
         return "position" if math.isclose(position, -gain, rel_tol=1e-5) else ""
     return "velocity" if math.isclose(velocity, -gain, rel_tol=1e-5) else ""
+
+
+def has_fixed_gain(template: newton.ModelBuilder, actuator: int) -> bool:
+    """Whether an actuator's force is proportional to its input, unlike a damper's or a muscle's."""
+    return int(actuator_value(template, "actuator_gaintype", actuator)) == mujoco.mjtGain.mjGAIN_FIXED
+
+
+def is_motor(template: newton.ModelBuilder, actuator: int) -> bool:
+    """Whether an actuator's force depends on its input alone."""
+    is_unbiased = int(actuator_value(template, "actuator_biastype", actuator)) == mujoco.mjtBias.mjBIAS_NONE
+    return bool(is_unbiased and has_fixed_gain(template, actuator))
 
 
 def is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:

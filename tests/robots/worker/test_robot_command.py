@@ -53,6 +53,27 @@ def test_it_lists_what_can_t_be_held(tmp_path: Path) -> None:
     assert found.stderr.count("\n") == 1
 
 
+MUSCLES = """<mujoco><worldbody><body name="b"><joint name="k"/><geom size=".1"/><site name="s"/><body pos="0 0 1">
+<joint name="j" type="ball" damping=".2"/><geom size=".1"/><site name="t"/></body></body></worldbody><tendon><spatial name="rope" range="0 3">
+<site site="s"/><site site="t"/></spatial></tendon><equality><joint name="held" joint1="k" active="false"/></equality><actuator>
+<damper name="brake" joint="k" kv="2" ctrlrange="0 1"/><muscle name="muscle" tendon="rope" force="100" lengthrange="0 2"/></actuator></mujoco>"""
+
+
+def test_it_shows_tendons_equalities_balls_and_only_the_numbers_that_an_actuator_has(tmp_path: Path) -> None:
+    (tmp_path / "muscles.xml").write_text(MUSCLES)
+    shown = json.loads(command(tmp_path, "muscles.xml", "--json").stdout)
+    hinge, ball = shown["joints"]
+    assert hinge["effort_limit"] is None and (ball["name"], ball["kind"], ball["damping"]) == ("j", "ball", 0.2)
+    brake, muscle = shown["actuators"]
+    assert (brake["gain"], brake["stiffness"], brake["damping"], brake["law"]) == (0.0, 0.0, 2.0, "affine")
+    assert (muscle["gain"], muscle["stiffness"], muscle["damping"], muscle["law"]) == (None, None, None, "muscle")
+    (rope,), (held,) = shown["tendons"], shown["equalities"]
+    assert (rope["connects"], rope["lower"], rope["upper"]) == (["site s", "site t"], 0.0, 3.0)
+    assert (held["name"], held["kind"], held["connects"], held["active"]) == ("held", "joint", ["joint k"], False)
+    text = command(tmp_path, "muscles.xml").stdout
+    assert "rope" in text and "joint, off" in text and "2 joints" in text
+
+
 USD = """#usda 1.0
 (
     metersPerUnit = 1
