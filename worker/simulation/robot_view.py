@@ -306,13 +306,13 @@ def _input(template: newton.ModelBuilder, actuator: int) -> Input | Literal[""]:
 
 def has_fixed_gain(template: newton.ModelBuilder, actuator: int) -> bool:
     """Whether an actuator's force is proportional to its input, unlike a damper's or a muscle's."""
-    return int(actuator_value(template, "actuator_gaintype", actuator)) == mujoco.mjtGain.mjGAIN_FIXED
+    return bool(int(actuator_value(template, "actuator_gaintype", actuator)) == mujoco.mjtGain.mjGAIN_FIXED)
 
 
 def is_motor(template: newton.ModelBuilder, actuator: int) -> bool:
     """Whether an actuator's force depends on its input alone."""
     is_unbiased = int(actuator_value(template, "actuator_biastype", actuator)) == mujoco.mjtBias.mjBIAS_NONE
-    return bool(is_unbiased and has_fixed_gain(template, actuator))
+    return is_unbiased and has_fixed_gain(template, actuator)
 
 
 def is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:
