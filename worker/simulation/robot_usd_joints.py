@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from pxr import UsdPhysics
 
+from shared_store.wording import nearest
 from worker.simulation.robot_elements import some
 from worker.simulation.robot_usd_stage import PLACE, Stage, authored, plain, same, same_pose
 from worker.simulation.robot_view import actuator_value, actuators_of_dofs
@@ -37,12 +38,16 @@ def faults(both: Stage) -> Iterator[str]:
     pairs: dict[tuple[str, ...], str] = {}
     for prim in _joints(both):
         joint, path = UsdPhysics.Joint(prim), str(prim.GetPath())
-        owners = [both.owner(each.GetTargets()) for each in (joint.GetBody0Rel(), joint.GetBody1Rel())]
+        targets = [relation.GetTargets() for relation in (joint.GetBody0Rel(), joint.GetBody1Rel())]
+        owners = [both.owner(each) for each in targets]
         ends = tuple(sorted(str(each.GetPath()) for each in owners if each))
         index, twin = both.joints.get(path), pairs.setdefault(ends, path)
+        lost = [str(end) for each in targets for end in each if not both.stage.GetPrimAtPath(end)]
         off = [end for end in ends if not _enabled(both.stage.GetPrimAtPath(end))]
         limits = [authored(prim, f"physics:{word}Limit") for word in ("lower", "upper")]
-        if off:
+        if lost:
+            yield f"joint {path} holds {lost[0]}, which does not exist; {nearest(lost[0], sorted(both.bodies))}"
+        elif off:
             yield f"joint {path} holds the body {off[0]}, which is disabled (physics:rigidBodyEnabled = 0)"
         elif joint.GetExcludeFromArticulationAttr().Get():
             both.note(f"joint {path} closes a loop, in which its limits and its drive are not held")

@@ -117,6 +117,7 @@ def test_what_the_schema_says_is_left_alone(tmp_path: Path) -> None:
             {},
             r"joint /robot/j has 0 degrees of freedom, in the file 6",
         ),
+        ({"body1 = </robot/arm>": "body1 = </robot/arn>"}, {}, r"joint /robot/j holds /robot/arn, .*; did you mean /robot/arm"),
         ({}, {"arm": "bool physics:rigidBodyEnabled = 0"}, r"joint /robot/j holds the body /robot/arm, which is disab"),
         ({}, {"arm": "bool physics:kinematicEnabled = 1"}, r"/robot/arm'\) is kinematic .* Only root bodies"),
         (
