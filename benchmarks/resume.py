@@ -1,6 +1,7 @@
 """Cost of saving, and time of a restart: ``python -m benchmarks.resume`` (``make bench-resume``).
 
-Trainings go through the real command and controller on a fresh home directory; the table goes to ``resume.md``. Kernels come from
+Trainings go through the real command and controller on a fresh home directory; the table goes to ``resume.md``. With ``--gpus`` only the
+restart is measured, with 4,096 worlds on each of two GPUs; its table goes to ``resume_gpu.md``. Kernels come from
 ``$WARP_CACHE_PATH`` if it is set; otherwise they are compiled first, which is not measured.
 """
 
@@ -31,6 +32,8 @@ from worker.learning.shards import read_file
 
 ANT = "job_specs/ant.yaml"
 KILLS = 3
+ON_GPUS = ("train.worlds=4096", "resources.gpus=1", "resources.memory=16GiB")
+"""Changes of the spec: each node has a GPU."""
 BIG = 256
 """Size of a synthetic state for the rates [MB]."""
 
@@ -105,10 +108,10 @@ class Restarts(Bench):
         loaded = seconds(resumed["time"])
         return stopped, loaded, load, Restart(decided - killed, stopped - decided, 0.0, 0.0, load, first - loaded)
 
-    def restarts(self) -> list[Restart]:
-        """Kill a rank of a gang of two Ants :data:`KILLS` times."""
+    def restarts(self, *changes: str) -> list[Restart]:
+        """Kill a rank of a gang of two Ants :data:`KILLS` times; ``changes`` of its spec."""
         job = self.submit(
-            "train.iterations=100000", "checkpoint.every=5", f"retry.attempts={KILLS + 1}", "train.worlds=64"
+            "train.iterations=100000", "checkpoint.every=5", f"retry.attempts={KILLS + 1}", "train.worlds=64", *changes
         )
         run = self.home / "store" / "runs" / job["run"]
         seen = [self.kill_and_wait(job["id"], job["run"], attempt) for attempt in range(1, KILLS + 1)]
@@ -181,25 +184,28 @@ def rates(home: Path) -> list[tuple[str, str]]:
     ]
 
 
-def measure(home: Path) -> tuple[list[tuple[str, str]], list[Restart]]:
-    """All rows about saving, and the restarts."""
+def measure(home: Path, gpus: bool) -> tuple[list[tuple[str, str]], list[Restart]]:
+    """All rows about saving, of which there are none with ``gpus``, and the restarts."""
     (home / "muster").mkdir()
     bench = Restarts(home / "muster")
+    changes = ON_GPUS if gpus else ()
     try:
-        bench.run(ANT, "nodes=1", "train.iterations=1", "train.worlds=64")
-        rows = bench.saving()
-        restarts = bench.restarts()
+        bench.run(ANT, "nodes=1", "train.iterations=1", "train.worlds=64", *changes)
+        rows = [] if gpus else bench.saving()
+        restarts = bench.restarts(*changes)
     finally:
         bench.close()
-    return rows + rates(home / "rates"), restarts
+    return rows if gpus else rows + rates(home / "rates"), restarts
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_option(parser)
-    watch = Watch(parser.parse_args().loaded_anyway)
+    parser.add_argument("--gpus", action="store_true", help="the restart on two GPUs")
+    options = parser.parse_args()
+    watch = Watch(options.loaded_anyway)
     with tempfile.TemporaryDirectory() as directory:
-        rows, restarts = measure(Path(directory))
+        rows, restarts = measure(Path(directory), options.gpus)
     parts = {
         "detection: SIGKILL → the controller has decided": "detection",
         "stop: → no process of the gang is left": "stop",
@@ -209,14 +215,18 @@ def main() -> None:
         "→ the first resumed iteration is logged": "first",
         "**in all (goal < 15 s)**": "total",
     }
-    table = ["| what | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
+    table = ["| what | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows), ""] if rows else []
+    worlds = "4,096 worlds on a GPU each" if options.gpus else "64 worlds"
     head = " | ".join(f"kill {number}" for number in range(1, len(restarts) + 1))
-    gang = [f"| Ant, 2 nodes × 64 worlds, warm kernels | {head} |", "|---|" + "--:|" * len(restarts)]
+    gang = [f"| Ant, 2 nodes × {worlds}, warm kernels | {head} |", "|---|" + "--:|" * len(restarts)]
     for name, part in parts.items():
         gang.append(f"| {name} | " + " | ".join(f"{getattr(each, part):.2f} s" for each in restarts) + " |")
-    intro = f"`make bench-resume` on {machine()}. Before it: {told([watch.start])}"
-    text = "\n".join(["# Saving and resuming", "", intro, "", *table, "", "SIGKILL of rank 1:", "", *gang, ""])
-    (REPOSITORY / "benchmarks" / "resume.md").write_text(text)
+    command, name = (
+        ("python -m benchmarks.resume --gpus", "resume_gpu.md") if options.gpus else ("make bench-resume", "resume.md")
+    )
+    intro = f"`{command}` on {machine()}. Before it: {told([watch.start])}"
+    text = "\n".join(["# Saving and resuming", "", intro, "", *table, "SIGKILL of rank 1:", "", *gang, ""])
+    (REPOSITORY / "benchmarks" / name).write_text(text)
     print(text)
 
 
