@@ -91,7 +91,7 @@ class Watch:
         if mean is None:
             return ""
         return (
-            f"it ended below its best: mean return {mean:.2f}, and {self._best:.2f} at iteration {self._best_at}; "
+            f"it ended below its best: its mean return is {mean:.2f}; it was {self._best:.2f} at iteration {self._best_at}; "
             f"try its best checkpoint: muster evaluate {THIS_RUN}best"
         )
 
@@ -99,7 +99,7 @@ class Watch:
         deviation = record.get("action_std")
         if not _is_finite(deviation) or not 0.0 < float(deviation or 0.0) < DEAD:  # 0: the actions are choices
             return ""
-        return f"it no longer explores: the standard deviation of the actions is {deviation:.1g}; raise min_std, or the weight of the entropy"
+        return f"it no longer explores: the standard deviation of the actions is {deviation:.1g}; raise init_std, min_std or the weight of the entropy"
 
     def _stuck(self, record: Mapping[str, Any]) -> str:
         settings, kl, rate = self._settings, record.get("kl"), record.get("learning_rate")

@@ -62,7 +62,7 @@ def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
     found = begun(watch(60), [*RISE, *([18.5] * 20)])
     assert not any(found[:-1])
     assert found[-1] == [
-        "it ended below its best: mean return 18.50, and 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
+        "it ended below its best: its mean return is 18.50; it was 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
     ]
     assert not any(begun(watch(60), [*RISE, *([20.0] * 20)]))
     shifted = [900.0 + value for value in (*RISE, *([15.0] * 20))]
