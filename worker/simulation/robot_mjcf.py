@@ -361,6 +361,9 @@ class _Writer:
             values[f"{limit}range"] = getattr(model, f"actuator_{limit}range")[actuator]
         if model.actuator_actnum[actuator]:
             values["actdim"] = model.actuator_actnum[actuator]
+        if transmission in ("joint", "jointinparent", "tendon"):
+            values["damping"] = (model.actuator_damping[actuator], *model.actuator_dampingpoly[actuator])
+            values["armature"] = model.actuator_armature[actuator]
         _add(
             section,
             "general",

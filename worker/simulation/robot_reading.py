@@ -31,6 +31,7 @@ from worker.simulation.robot_judge import Comparison, Difference
 from worker.simulation.robot_reference import Reference
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs
+from worker.simulation.solver import mark_sliders
 
 RAW_SOLREF = 1
 """Newton's mode of a joint that passes the ``solref`` of its limit to MuJoCo unchanged."""
@@ -149,7 +150,7 @@ def read(source: Source) -> Reading:
         corrected = found.differences
     except (ValueError, KeyError, RuntimeError, IndexError) as error:
         corrected = (Difference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
-        found, is_readable = Comparison(corrected, (), {}), False
+        found, is_readable = Comparison(corrected, (), {}, ()), False
     else:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
@@ -168,6 +169,7 @@ def read(source: Source) -> Reading:
         builder = _imported(source, file, floating)  # as the training had it
         accepted = (*reference.notes, AS_IMPORTED.format(refusal))
         return Reading(builder, reference, corrected, accepted, identity(builder, None))
+    mark_sliders(builder, found.sliders)
     return Reading(builder, reference, corrected, tuple(notes), identity(builder, model))
 
 
