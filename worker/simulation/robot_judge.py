@@ -20,6 +20,7 @@ from worker.simulation.robot_connections import (
     tendon_ends,
     tendon_numbers,
 )
+from worker.simulation.robot_dynamics import RELATIVE, dynamics
 from worker.simulation.robot_elements import count_of, some, word_of
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
@@ -33,21 +34,18 @@ from worker.simulation.robot_values import (
     inertia,
     length,
     matrix,
-    move_joint,
     shown_value,
     touching,
 )
 
-RELATIVE = 1e-6
-"""Two values are equal up to this share of the greater one: Newton computes in float32."""
 ROUNDING = 1e-4
 """Up to this share of the greater one, a difference is of no consequence to a policy."""
 FAR = 10.0
 """Ends of an equality are compared this much less sharply: their places add up along chains of bodies."""
-ACCELERATION = 1e-3
-"""Accelerations in the same state are equal up to this share of the greatest one."""
 ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV")
 """Flags that a task's solver options set, that nothing here reads, that only report, or that are compared in another way."""
+FLAT = ("mesh", "cylinder")
+"""Geoms of which MuJoCo-Warp finds several contacts with others than planes only if ``multiccd`` is enabled."""
 COUNTS = {
     "coordinates": "nq",
     "degrees of freedom": "nv",
@@ -139,7 +137,7 @@ def compare(
         counting = (
             [each for each in found if not matches(each, accept)]
             if found
-            else [*_softness(twins), *_accelerations(twins, options)]
+            else [Difference(*each) for each in dynamics(twins, options)]
         )
         bodies = {body: twins.body_indices[twin] for body, twin in twins.bodies.items() if body}
         return Comparison(tuple(counting), tuple(_notes(twins)), bodies, tuple(twins.sliders))
@@ -349,46 +347,6 @@ def _options(twins: Twins) -> Iterator[Difference]:
                 yield Difference("option", f"{name} {word}", bool(mine & int(bit)), bool(theirs & int(bit)))
 
 
-def _softness(twins: Twins) -> Iterator[Difference]:
-    """Bodies of other inverse weights, by which MuJoCo scales how soft contacts and equalities are."""
-    rounding = RELATIVE * twins.file.body_invweight0.max(0)
-    for body, twin in twins.bodies.items():
-        mine, theirs = twins.built.body_invweight0[twin], twins.file.body_invweight0[body]
-        if not (np.abs(mine - theirs) <= rounding + ACCELERATION * np.maximum(mine, theirs)).all():
-            yield Difference(twins.name("body", body), "softness of contacts", mine, theirs)
-
-
-def _accelerations(twins: Twins, options: bool) -> Iterator[Difference]:
-    """What no field shows: the first joint with another acceleration in one of three states, without contacts."""
-    random = np.random.default_rng(0)
-    file, built = twins.free_of_contacts(options)
-    for trial in range(3):
-        first, second = mujoco.MjData(file), mujoco.MjData(built)
-        for joint, twin in twins.joints.items():
-            move_joint(((file, first, joint), (built, second, twin)), 0.1 * trial, random)
-        first.ctrl[:] = second.ctrl[:] = random.uniform(-0.5, 0.5, file.nu)
-        first.act[:] = second.act[:] = random.uniform(0.0, 0.5, file.na)
-        mujoco.mj_forward(file, first)
-        mujoco.mj_forward(built, second)
-        scale = max(1.0, float(np.abs(first.qacc).max(initial=0.0)))
-        for joint, twin in twins.joints.items():
-            width = freedoms(file, joint)
-            theirs = first.qacc[file.jnt_dofadr[joint] :][:width]
-            mine = second.qacc[built.jnt_dofadr[twin] :][:width]
-            if not (np.abs(theirs - mine) <= ACCELERATION * scale).all():
-                unexplained = Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
-                yield next(_inertia_axes(twins), unexplained)
-                return
-
-
-def _inertia_axes(twins: Twins) -> Iterator[Difference]:
-    """Bodies whose drag differs, since a medium acts on the axes of their inertias: Newton keeps no axes of equal moments."""
-    for body, twin in twins.bodies.items() if twins.file.opt.density else ():
-        theirs, mine = matrix(twins.file.body_iquat[body]), matrix(twins.built.body_iquat[twin])
-        if twins.file.body_mass[body] and (np.abs(theirs.T @ mine).max(0) < 1.0 - RELATIVE).any():
-            yield Difference(twins.name("body", body), "axes of inertia", mine, theirs)
-
-
 def _notes(twins: Twins) -> Iterator[str]:
     file, built = twins.file, twins.built
     single = [joint for joint in range(file.njnt) if freedoms(file, joint) == 1]
@@ -400,6 +358,14 @@ def _notes(twins: Twins) -> Iterator[str]:
     if bare:
         names = some([twins.name("geom", geom) for geom in bare])
         yield f"contacts begin where geoms touch, not at the margin of the file ({names}): MuJoCo-Warp has none between boxes"
+    flat = [geom for geom, _ in pairs if word_of(mujoco.mjtGeom, file.geom_type[geom]) in FLAT]
+    multiccd = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+    if flat and built.opt.disableflags & multiccd and not file.opt.disableflags & multiccd:
+        names = some([twins.name("geom", geom) for geom in flat])
+        yield (
+            f"where meshes and cylinders touch each other, boxes or capsules, they have one contact, in MuJoCo several ({names}); "
+            'solver_options={"enable_multiccd": True} finds them all'
+        )
     apart = [pair for pair, mine in _pairs_of_geoms(twins) if not mine and _stay_apart(twins, pair)]
     if apart:
         names = some([" and ".join(twins.name("geom", geom) for geom in pair) for pair in apart])

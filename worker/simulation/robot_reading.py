@@ -44,6 +44,7 @@ REMEDIES = {
     "fluid": "Leave out fluidshape",
     "anchor2": "Let both sites of the equality be at one place in the first pose of the file",
     "axes of inertia": "Give the body an <inertial> of three different moments, on whose axes the medium's drag acts",
+    "greatest force of actuators": "Newton limits the force on a joint: choose smaller gears or gains",
     "acceleration in the same state": "No single value shows why: leave out parts of the file until it is read",
 }
 """What to do about a value that Newton can't hold, by its field."""
@@ -256,7 +257,7 @@ def _line(error: Exception) -> str:
 
 def _rewritten(file: RobotFile, model: Any, shown: str) -> str:
     try:
-        return robot_mjcf.write(model, integrator=robot_files.names_integrator(file.source))
+        return robot_mjcf.write(model, named=robot_files.named_options(file.source))
     except ValueError as error:
         raise ValueError(f"{shown}: {error}") from error
 

@@ -230,6 +230,12 @@ class Twins:
             parent = int(self.built.body_parentid[parent])
         return above
 
+    def held_bodies(self) -> set[int]:
+        """Bodies of :attr:`file` with geoms that can touch, or that an equality joins."""
+        ends = (end for equality in range(self.file.neq) for end in equality_ends(self.file, equality))
+        touching = {int(self.file.geom_bodyid[geom]) for geom in self.geoms}
+        return (touching | {body for kind, body in ends if kind == "body"}) & set(self.bodies)
+
     def joined(self) -> set[frozenset[int]]:
         """Pairs of bodies of :attr:`file` that an equality joins, by what they are welded to."""
         ends = (equality_ends(self.file, equality) for equality in range(self.file.neq))
