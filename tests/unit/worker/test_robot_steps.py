@@ -12,6 +12,7 @@ from newton.solvers import SolverMuJoCo
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, mjcf, read, twins
 from worker.simulation.robot import Robot
+from worker.simulation.solver import Solver
 from worker.simulation.worlds import Worlds
 
 ARMATURES = {
@@ -122,8 +123,29 @@ def test_a_noslip_solver_does_not_refuse_a_robot() -> None:
 
 
 def test_a_value_that_is_not_stepped_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    from worker.simulation.solver import Solver
-
     monkeypatch.setattr(Solver, "_add_rotors", lambda *_: None)
     with pytest.raises(ValueError, match=r"joint j: armature is 0, in the file 0\.8"):
         read(ARMATURES["of a motor"])
+
+
+MESH = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1 1 1 1"/></asset>'
+SPRING = HINGE.replace("/>", ' springdamper=".1 1"/>')
+"""A joint for which a file is rewritten."""
+
+
+@pytest.mark.parametrize("joint", [HINGE, SPRING], ids=["as it is", "rewritten"])
+@pytest.mark.parametrize(("flag", "is_on"), [("", False), ('<option><flag multiccd="enable"/></option>', True)])
+def test_a_file_that_enables_multiccd_keeps_it_and_another_gets_a_note(joint: str, flag: str, is_on: bool) -> None:
+    reading = read(mjcf(f'{joint}<geom type="mesh" mesh="m"/>', before=flag + MESH))
+    assert bool(reading.corrected) == (joint == SPRING)
+    assert bool(twins(reading).built.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)) != is_on
+    assert any("enable_multiccd" in note and "geom_0" in note for note in reading.notes) != is_on
+
+
+def test_a_robot_of_boxes_and_spheres_has_no_note_of_multiccd() -> None:
+    assert not read(mjcf(f'{HINGE}<geom type="box" size=".1 .1 .1"/><geom size=".1"/>')).notes
+
+
+def test_a_force_beyond_newtons_limit_is_named() -> None:
+    with pytest.raises(ValueError, match=r"joint j: greatest force of actuators is 1e\+06.*choose smaller gears"):
+        read(mjcf(HINGE + BOX, '<actuator><motor joint="j" gear="5e6"/></actuator>'))
