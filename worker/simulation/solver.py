@@ -176,7 +176,9 @@ class Solver(SolverMuJoCo):
     def kinds(self) -> Any:
         """How the weights of each body are found, as :func:`amended_weights` takes it, shape ``(bodies,)``."""
         moves, turns = (self.mj_model.body_invweight0 > _LEAST).T
-        kinds = np.where(turns & ~moves, _STAYS, np.where(moves & ~turns, _KEEPS_ITS_TURN, _KEPT))
+        kinds = np.where(turns & ~moves, _STAYS, _KEPT)
+        if (self.mj_model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)).any():  # nothing else reads weights of rotations
+            kinds[moves & ~turns] = _KEEPS_ITS_TURN
         kinds[self.sliders()] = _SLIDER
         return kinds
 
