@@ -46,7 +46,8 @@ class Stepped:
             return compiled
         shape, values = compiled.shape, getattr(self._model, name)
         found = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
-        return found[0].reshape(shape) if found.size and found.ndim > len(shape) else found.reshape(shape)
+        found = found[0] if found.size and found.ndim > len(shape) else found
+        return found.reshape(shape).astype(compiled.dtype)
 
 
 class Twins:
