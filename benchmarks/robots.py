@@ -4,7 +4,7 @@ For each file of the packages below:
 
 (a) whether every compared value of the model is the file's, within 1e-6 of the greater one;
 (b) the greatest difference of a coordinate in one second of MuJoCo's C engine, with the file's own integrator, under fixed controls,
-    without contacts; a robot that these leave at rest begins with a small random velocity of each joint;
+    without contacts and noslip; a robot that these leave at rest begins with a small random velocity of each joint;
 (c) the same of Muster's own step, in float32 on the processor, at the end of that second.
 
 Where (b) is greater than its limit, the table also has *float32*: the greatest difference of the file's model from four copies of
@@ -153,7 +153,6 @@ def measure(name: str, path: Path) -> Row:
         row.float32 = max(
             difference(path_there, second_of(disturbed(there, seed), first, controls)) for seed in range(4)
         )
-        row.detail = "; ".join([row.detail, *(note for note in reading.notes if "noslip" in note)]).strip("; ")
     try:
         last = in_muster(robot, twins, there, second.qvel, controls)
         if row.seconds == 1.0:
@@ -241,7 +240,7 @@ def page(rows: list[Row]) -> str:
         f"nothing moves, and {sum(row.seconds < 1.0 for row in rows)} move without bound. The other {len(moving) - len(equal)} have equal "
         f"values, too, but move further apart than {EXACT:g} in the C engine.",
         "",
-        "Why these do: their motion enlarges the rounding of values, which Newton holds in float32, or the note in their row. *float32* is "
+        "Why these do: their motion enlarges the rounding of values, which Newton holds in float32. *float32* is "
         "the greatest difference of the file's own model from four copies with values that differ by up to 1.2e-7 of themselves.",
         "",
         "Versions of the packages: " + ", ".join(f"{name} {version}" for name, (version, *_) in PACKAGES.items()) + ".",

@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from worker.simulation.solver import amended_weights, is_marked
 from worker.simulation.worlds import Worlds
 
 wp.set_module_options({"enable_backward": False})
@@ -33,6 +34,7 @@ class Tree:
         first_dofs: First degree of freedom of each body, shape ``(bodies,)``.
         dof_counts: Degrees of freedom of each body, shape ``(bodies,)``.
         welded: Whether a body is welded to the world, shape ``(bodies,)``.
+        kinds: How the weights of each body are found (:meth:`worker.simulation.solver.Solver.kinds`), shape ``(bodies,)``.
         positions: Of the bodies' frames [m], shape ``(bodies,)``.
         rotations: Of the bodies' frames, shape ``(bodies,)``.
         axes: Angular and then linear velocity for each unit of joint velocity, shape ``(dofs,)``.
@@ -44,6 +46,7 @@ class Tree:
     first_dofs: wp.array[wp.int32]
     dof_counts: wp.array[wp.int32]
     welded: wp.array[wp.bool]
+    kinds: wp.array[wp.int32]
     positions: wp.array[wp.vec3]
     rotations: wp.array[wp.quat]
     axes: wp.array[wp.spatial_vectorf]
@@ -168,6 +171,10 @@ def _weigh(changed: wp.array[wp.bool], tree: Tree, scratch: Scratch, inertials: 
         weights = wp.vec2(0.0, 0.0)
         if not tree.welded[body]:
             weights = _weight_of_body(tree, inertials, world, body, answer)
+            weights = amended_weights(tree.kinds[body], inertials.masses[world, body], weights)
+        if is_marked(tree.kinds[body]):
+            for own in range(tree.dof_counts[body]):
+                scratch.diagonal[world, tree.first_dofs[body] + own] = weights[0]
         inertials.body_weights[world, body] = weights
     for dof in range(tree.axes.shape[0]):
         total = float(0.0)
@@ -199,6 +206,7 @@ class InverseWeights:
             return
         device, worlds_there = worlds.model.device, worlds.world_count
         self._tree = _tree(model, solver.mjw_model.qpos0.numpy()[0], device)
+        self._tree.kinds = wp.array(solver.kinds(), dtype=wp.int32, device=device)
         self._scratch = Scratch()
         self._scratch.matrices = wp.zeros((worlds_there, model.nbody), dtype=wp.spatial_matrixf, device=device)
         self._scratch.forces = wp.zeros((worlds_there, model.nv), dtype=wp.spatial_vectorf, device=device)

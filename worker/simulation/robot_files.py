@@ -159,10 +159,12 @@ def parse_mjcf(source: str, shown: str) -> Any:
     return spec
 
 
-def names_integrator(source: str) -> bool:
-    """Whether an MJCF file, or the text of one, names its integrator; files that it includes are not looked at."""
+def named_options(source: str) -> set[str]:
+    """Which of ``integrator`` and ``multiccd`` an MJCF file, or the text of one, sets; files that it includes are not looked at."""
     text = source if source.lstrip().startswith("<") else Path(source).read_text(encoding="utf-8")
-    return any(option.get("integrator") for option in ElementTree.fromstring(text).iter("option"))
+    root = ElementTree.fromstring(text)
+    named = {"integrator" for option in root.iter("option") if option.get("integrator")}
+    return named | {"multiccd" for flag in root.iter("flag") if flag.get("multiccd") == "enable"}
 
 
 def _not_a_number(text: str) -> str:

@@ -20,6 +20,7 @@ from worker.simulation.robot_connections import (
     tendon_ends,
     tendon_numbers,
 )
+from worker.simulation.robot_dynamics import RELATIVE, dynamics
 from worker.simulation.robot_elements import count_of, some, word_of
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
@@ -27,26 +28,24 @@ from worker.simulation.robot_values import (
     effort,
     extent,
     freedoms,
+    from_actuators,
     gravity,
     has_mask,
     inertia,
     length,
     matrix,
-    move_joint,
     shown_value,
     touching,
 )
 
-RELATIVE = 1e-6
-"""Two values are equal up to this share of the greater one: Newton computes in float32."""
 ROUNDING = 1e-4
 """Up to this share of the greater one, a difference is of no consequence to a policy."""
 FAR = 10.0
 """Ends of an equality are compared this much less sharply: their places add up along chains of bodies."""
-ACCELERATION = 1e-3
-"""Accelerations in the same state are equal up to this share of the greatest one."""
 ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV")
 """Flags that a task's solver options set, that nothing here reads, that only report, or that are compared in another way."""
+FLAT = ("mesh", "cylinder")
+"""Geoms of which MuJoCo-Warp finds several contacts with others than planes only if ``multiccd`` is enabled."""
 COUNTS = {
     "coordinates": "nq",
     "degrees of freedom": "nv",
@@ -60,14 +59,16 @@ COUNTS = {
 }
 """What is counted, and its field of ``mujoco.MjModel``."""
 TENDON = (
-    "num limited range actfrclimited actfrcrange margin stiffness stiffnesspoly damping dampingpoly armature frictionloss "
-    "lengthspring solref_lim solimp_lim solref_fri solimp_fri length0"
+    "num limited range actfrclimited actfrcrange margin stiffness stiffnesspoly frictionloss lengthspring "
+    "solref_lim solimp_lim solref_fri solimp_fri length0"
 )
 ACTUATOR = (
     "trntype gear dyntype gaintype biastype gainprm biasprm ctrllimited forcelimited actlimited actnum actearly cranklength "
-    "delay history damping dampingpoly armature"
+    "delay history"
 )
 """Compared fields of ``mujoco.MjModel``, without their prefixes."""
+SHARED = ("damping", "dampingpoly", "armature")
+"""Those of joints and tendons to which actuators add."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +110,13 @@ class Comparison:
         differences: Empty where the robot is what its file says.
         notes: What contacts have otherwise, which Newton or MuJoCo-Warp can't hold, one sentence each.
         bodies: Index of each body of the file among the builder's bodies.
+        sliders: Indices of the builder's bodies that only slide.
     """
 
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
     bodies: dict[int, int]
+    sliders: tuple[int, ...]
 
 
 def compare(
@@ -131,9 +134,13 @@ def compare(
         twins = Twins(reference, builder)
         found = [difference for check in CHECKS for difference in check(twins)]
         found += _options(twins) if options else ()
-        counting = [each for each in found if not matches(each, accept)] if found else [*_accelerations(twins)]
+        counting = (
+            [each for each in found if not matches(each, accept)]
+            if found
+            else [Difference(*each) for each in dynamics(twins, options)]
+        )
         bodies = {body: twins.body_indices[twin] for body, twin in twins.bodies.items() if body}
-        return Comparison(tuple(counting), tuple(_notes(twins)), bodies)
+        return Comparison(tuple(counting), tuple(_notes(twins)), bodies, tuple(twins.sliders))
 
 
 def matches(difference: Difference, patterns: Sequence[str]) -> bool:
@@ -152,7 +159,7 @@ def _counts(twins: Twins) -> Iterator[Difference]:
 
 
 def _bodies(twins: Twins) -> Iterator[Difference]:
-    file, built, size = twins.file, twins.built, length(twins.file)
+    file, built, size = twins.file, twins.stepped, length(twins.file)
     for body, twin in twins.bodies.items():
         if not body:
             continue
@@ -169,7 +176,8 @@ def _bodies(twins: Twins) -> Iterator[Difference]:
 
 
 def _joints(twins: Twins) -> Iterator[Difference]:
-    file, built = twins.file, twins.built
+    file, built = twins.file, twins.stepped
+    shares = {name: from_actuators(file, name)[0] for name in SHARED}
     for joint, twin in twins.joints.items():
         element = twins.name("joint", joint)
         kind, other = (word_of(mujoco.mjtJoint, model.jnt_type[each]) for model, each in ((file, joint), (built, twin)))
@@ -188,15 +196,15 @@ def _joints(twins: Twins) -> Iterator[Difference]:
             yield from _fields(twins, "jnt", joint, twin, "range margin solref solimp")
         yield from _unequal(element, "actuatorfrcrange", effort(built, twin), effort(file, joint))
         first, second = file.jnt_dofadr[joint], built.jnt_dofadr[twin]
-        for name in ("damping", "dampingpoly", "armature", "frictionloss", "solref", "solimp"):
+        for name in (*SHARED, "frictionloss", "solref", "solimp"):
             count = freedoms(file, joint)
             if name not in ("solref", "solimp") or file.dof_frictionloss[first]:
-                mine, theirs = getattr(built, f"dof_{name}"), getattr(file, f"dof_{name}")
+                mine, theirs = getattr(built, f"dof_{name}"), getattr(file, f"dof_{name}") + shares.get(name, 0.0)
                 yield from _unequal(element, name, mine[second : second + count], theirs[first : first + count])
 
 
 def _geoms(twins: Twins) -> Iterator[Difference]:
-    file, built = twins.file, twins.built
+    file, built = twins.file, twins.stepped
     for geom in set(range(file.ngeom)) - set(twins.geoms):
         if has_mask(file, geom):
             yield Difference(twins.name("geom", geom), "existence", "missing", "there")
@@ -235,7 +243,7 @@ def _pairs(twins: Twins) -> Iterator[Difference]:
         if pair not in twins.contact_pairs:
             yield Difference(element, "existence", "missing", "there")
             continue
-        models = (twins.built, twins.contact_pairs[pair]), (twins.file, pair)
+        models = (twins.stepped, twins.contact_pairs[pair]), (twins.file, pair)
         for name in ("dim", "friction", "solref", "solimp", "margin", "gap"):
             mine, theirs = (getattr(model, f"pair_{name}")[index] for model, index in models)
             yield from _unequal(element, name, mine, theirs)
@@ -275,12 +283,16 @@ def _stay_apart(twins: Twins, pair: tuple[int, int]) -> bool:
 
 
 def _tendons(twins: Twins) -> Iterator[Difference]:
+    shares = {name: from_actuators(twins.file, name)[1] for name in SHARED}
     for tendon, twin in twins.tendons.items():
         yield from _fields(twins, "tendon", tendon, twin, TENDON)
-        there, here = tendon_ends(twins.file, tendon), twins.in_file(tendon_ends(twins.built, twin))
+        for name, share in shares.items():
+            mine, theirs = getattr(twins.stepped, f"tendon_{name}"), getattr(twins.file, f"tendon_{name}") + share
+            yield from _unequal(twins.name("tendon", tendon), name, mine[twin], theirs[tendon])
+        there, here = tendon_ends(twins.file, tendon), twins.in_file(tendon_ends(twins.stepped, twin))
         element, mine, theirs = (
             twins.name("tendon", tendon),
-            *(tendon_numbers(model, index) for model, index in ((twins.built, twin), (twins.file, tendon))),
+            *(tendon_numbers(model, index) for model, index in ((twins.stepped, twin), (twins.file, tendon))),
         )
         yield from _ends(twins, element, [f"path {index}" for index in range(len(there))], here, there)
         yield from _unequal(element, "coefficients", mine, theirs)
@@ -294,7 +306,7 @@ def _ends(twins: Twins, element: str, words: Sequence[str], here: Ends, there: E
 
 
 def _actuators(twins: Twins) -> Iterator[Difference]:
-    file, built = twins.file, twins.built
+    file, built = twins.file, twins.stepped
     for actuator in range(min(file.nu, built.nu)):
         yield from _fields(twins, "actuator", actuator, actuator, ACTUATOR)
         for limit in ("ctrl", "force", "act"):
@@ -310,7 +322,7 @@ def _actuators(twins: Twins) -> Iterator[Difference]:
 
 
 def _equalities(twins: Twins) -> Iterator[Difference]:
-    file, built = twins.file, twins.built
+    file, built = twins.file, twins.stepped
     for equality, twin in twins.equalities.items():
         element = twins.name("equality", equality)
         yield from _fields(twins, "eq", equality, twin, "active0 solref solimp")
@@ -335,37 +347,6 @@ def _options(twins: Twins) -> Iterator[Difference]:
                 yield Difference("option", f"{name} {word}", bool(mine & int(bit)), bool(theirs & int(bit)))
 
 
-def _accelerations(twins: Twins) -> Iterator[Difference]:
-    """What no field shows: the first joint with another acceleration in one of three states, without contacts."""
-    random = np.random.default_rng(0)
-    file, built = twins.free_of_contacts()
-    for trial in range(3):
-        first, second = mujoco.MjData(file), mujoco.MjData(built)
-        for joint, twin in twins.joints.items():
-            move_joint(((file, first, joint), (built, second, twin)), 0.1 * trial, random)
-        first.ctrl[:] = second.ctrl[:] = random.uniform(-0.5, 0.5, file.nu)
-        first.act[:] = second.act[:] = random.uniform(0.0, 0.5, file.na)
-        mujoco.mj_forward(file, first)
-        mujoco.mj_forward(built, second)
-        scale = max(1.0, float(np.abs(first.qacc).max(initial=0.0)))
-        for joint, twin in twins.joints.items():
-            width = freedoms(file, joint)
-            theirs = first.qacc[file.jnt_dofadr[joint] :][:width]
-            mine = second.qacc[built.jnt_dofadr[twin] :][:width]
-            if not (np.abs(theirs - mine) <= ACCELERATION * scale).all():
-                unexplained = Difference(twins.name("joint", joint), "acceleration in the same state", mine, theirs)
-                yield next(_inertia_axes(twins), unexplained)
-                return
-
-
-def _inertia_axes(twins: Twins) -> Iterator[Difference]:
-    """Bodies whose drag differs, since a medium acts on the axes of their inertias: Newton keeps no axes of equal moments."""
-    for body, twin in twins.bodies.items() if twins.file.opt.density else ():
-        theirs, mine = matrix(twins.file.body_iquat[body]), matrix(twins.built.body_iquat[twin])
-        if twins.file.body_mass[body] and (np.abs(theirs.T @ mine).max(0) < 1.0 - RELATIVE).any():
-            yield Difference(twins.name("body", body), "axes of inertia", mine, theirs)
-
-
 def _notes(twins: Twins) -> Iterator[str]:
     file, built = twins.file, twins.built
     single = [joint for joint in range(file.njnt) if freedoms(file, joint) == 1]
@@ -377,6 +358,14 @@ def _notes(twins: Twins) -> Iterator[str]:
     if bare:
         names = some([twins.name("geom", geom) for geom in bare])
         yield f"contacts begin where geoms touch, not at the margin of the file ({names}): MuJoCo-Warp has none between boxes"
+    flat = [geom for geom, _ in pairs if word_of(mujoco.mjtGeom, file.geom_type[geom]) in FLAT]
+    multiccd = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+    if flat and built.opt.disableflags & multiccd and not file.opt.disableflags & multiccd:
+        names = some([twins.name("geom", geom) for geom in flat])
+        yield (
+            f"where meshes and cylinders touch each other, boxes or capsules, they have one contact, in MuJoCo several ({names}); "
+            'solver_options={"enable_multiccd": True} finds them all'
+        )
     apart = [pair for pair, mine in _pairs_of_geoms(twins) if not mine and _stay_apart(twins, pair)]
     if apart:
         names = some([" and ".join(twins.name("geom", geom) for geom in pair) for pair in apart])
@@ -387,7 +376,7 @@ def _fields(twins: Twins, kind: str, index: int, twin: int, names: str) -> Itera
     element = twins.name({"jnt": "joint", "eq": "equality"}.get(kind, kind), index)
     for name in names.split():
         field = f"{kind}_{name}"
-        yield from _unequal(element, name, getattr(twins.built, field)[twin], getattr(twins.file, field)[index])
+        yield from _unequal(element, name, getattr(twins.stepped, field)[twin], getattr(twins.file, field)[index])
 
 
 def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0) -> Iterator[Difference]:

@@ -6,6 +6,7 @@ elements and of their meaning: MuJoCo's XML reference.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 from xml.etree import ElementTree
 
@@ -32,7 +33,7 @@ _GAINS = Words(mujoco.mjtGain, "fixed affine muscle user")
 _BIASES = Words(mujoco.mjtBias, "none affine muscle user")
 
 
-def write(model: Any, *, integrator: bool = False) -> str:
+def write(model: Any, *, named: Collection[str] = ()) -> str:
     """Write a compiled model as MJCF.
 
     Of several joints of a body all but the last move carriers (:mod:`worker.simulation.carriers`), so that each keeps its own place,
@@ -40,8 +41,8 @@ def write(model: Any, *, integrator: bool = False) -> str:
 
     Args:
         model: The compiled model, ``mujoco.MjModel``.
-        integrator: Whether the file names its integrator. Where it does not, the compiled model has MuJoCo's default, Euler, and the
-            worlds' default holds.
+        named: Which of ``integrator`` and ``multiccd`` the file sets. Of others the compiled model has MuJoCo's defaults, and the
+            worlds' defaults hold.
 
     Returns:
         The XML. Angles are in radians, and each number is written with all its digits.
@@ -49,13 +50,13 @@ def write(model: Any, *, integrator: bool = False) -> str:
     Raises:
         ValueError: An element is of a kind that Newton's models don't have.
     """
-    return _Writer(model, integrator).write()
+    return _Writer(model, named).write()
 
 
 class _Writer:
-    def __init__(self, model: Any, integrator: bool) -> None:
+    def __init__(self, model: Any, named: Collection[str]) -> None:
         self.model = model
-        self.integrator = integrator
+        self.named = named
         self.bodies: dict[int, Element] = {}
         self.names: dict[str, list[str]] = {}
 
@@ -96,7 +97,7 @@ class _Writer:
 
     def _write_options(self, root: Element) -> None:
         options = self.model.opt
-        chosen = {"integrator": _INTEGRATORS.of(options.integrator, "option")} if self.integrator else {}
+        chosen = {"integrator": _INTEGRATORS.of(options.integrator, "option")} if "integrator" in self.named else {}
         if options.solver == int(mujoco.mjtSolver.mjSOL_CG):
             chosen["solver"] = "CG"
         element = _add(
@@ -123,6 +124,8 @@ class _Writer:
                     flags[bit.name.partition("_")[2].lower()] = off
         for name in ("sleep", "gravity", "multiccd"):
             flags.pop(name, None)
+        if "multiccd" in self.named:
+            flags["multiccd"] = "enable"
         _add(element, "flag", **flags)
 
     def _write_mesh(self, asset: Element, mesh: int) -> None:
@@ -361,6 +364,9 @@ class _Writer:
             values[f"{limit}range"] = getattr(model, f"actuator_{limit}range")[actuator]
         if model.actuator_actnum[actuator]:
             values["actdim"] = model.actuator_actnum[actuator]
+        if transmission in ("joint", "jointinparent", "tendon"):
+            values["damping"] = (model.actuator_damping[actuator], *model.actuator_dampingpoly[actuator])
+            values["armature"] = model.actuator_armature[actuator]
         _add(
             section,
             "general",

@@ -31,6 +31,7 @@ from worker.simulation.robot_judge import Comparison, Difference
 from worker.simulation.robot_reference import Reference
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs
+from worker.simulation.solver import mark_sliders
 
 RAW_SOLREF = 1
 """Newton's mode of a joint that passes the ``solref`` of its limit to MuJoCo unchanged."""
@@ -43,6 +44,7 @@ REMEDIES = {
     "fluid": "Leave out fluidshape",
     "anchor2": "Let both sites of the equality be at one place in the first pose of the file",
     "axes of inertia": "Give the body an <inertial> of three different moments, on whose axes the medium's drag acts",
+    "greatest force of actuators": "Newton limits the force on a joint: choose smaller gears or gains",
     "acceleration in the same state": "No single value shows why: leave out parts of the file until it is read",
 }
 """What to do about a value that Newton can't hold, by its field."""
@@ -149,7 +151,7 @@ def read(source: Source) -> Reading:
         corrected = found.differences
     except (ValueError, KeyError, RuntimeError, IndexError) as error:
         corrected = (Difference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
-        found, is_readable = Comparison(corrected, (), {}), False
+        found, is_readable = Comparison(corrected, (), {}, ()), False
     else:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
@@ -168,6 +170,7 @@ def read(source: Source) -> Reading:
         builder = _imported(source, file, floating)  # as the training had it
         accepted = (*reference.notes, AS_IMPORTED.format(refusal))
         return Reading(builder, reference, corrected, accepted, identity(builder, None))
+    mark_sliders(builder, found.sliders)
     return Reading(builder, reference, corrected, tuple(notes), identity(builder, model))
 
 
@@ -254,7 +257,7 @@ def _line(error: Exception) -> str:
 
 def _rewritten(file: RobotFile, model: Any, shown: str) -> str:
     try:
-        return robot_mjcf.write(model, integrator=robot_files.names_integrator(file.source))
+        return robot_mjcf.write(model, named=robot_files.named_options(file.source))
     except ValueError as error:
         raise ValueError(f"{shown}: {error}") from error
 

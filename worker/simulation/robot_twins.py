@@ -7,17 +7,47 @@ from collections.abc import Callable, Hashable, Iterable
 from functools import cached_property
 from typing import Any
 
+import mujoco_warp
 import newton
-from newton.solvers import SolverMuJoCo
+import numpy as np
+import warp as wp
 
 from worker.simulation import carriers
 from worker.simulation.robot_connections import Ends, equality_ends, pair_ends, tendon_ends, wrapped_geoms
 from worker.simulation.robot_elements import Pairs, count_of, kind_of, name_of, names_of, paired, plain, short
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
+from worker.simulation.solver import Solver, is_slider, weigh_sliders
 
 OTHER = -2
 """Stands for the index in the file of an element that the file does not have."""
+MEDIUM_AND_FLAGS = ("gravity", "wind", "density", "viscosity", "disableflags", "enableflags", "disableactuator")
+"""Options of ``mujoco.MjModel`` that change accelerations, and that a task need not take from the file."""
+
+
+class Stepped:
+    """A compiled model with the arrays that MuJoCo-Warp steps, which knows fewer of them.
+
+    Args:
+        model: The compiled model, ``mujoco.MjModel``.
+
+    Raises:
+        AttributeError: MuJoCo-Warp has no array of that name.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._compiled = model
+        with wp.ScopedDevice("cpu"):
+            self._model: Any = mujoco_warp.put_model(model)
+
+    def __getattr__(self, name: str) -> Any:
+        compiled = getattr(self._compiled, name)
+        if not isinstance(compiled, np.ndarray):
+            return compiled
+        shape, values = compiled.shape, getattr(self._model, name)
+        found = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+        found = found[0] if found.size and found.ndim > len(shape) else found
+        return found.reshape(shape).astype(compiled.dtype)
 
 
 class Twins:
@@ -30,12 +60,13 @@ class Twins:
     Attributes:
         file: The file's compiled model, ``mujoco.MjModel``.
         built: The compiled model of the builder, ``mujoco.MjModel``.
+        stepped: The values of the same model that MuJoCo-Warp steps.
     """
 
     def __init__(self, reference: Any, builder: newton.ModelBuilder) -> None:
         self.file, self._builder = reference, builder
         model = _finalized(builder)
-        solver = SolverMuJoCo(
+        solver = Solver(
             model, use_mujoco_cpu=True, separate_worlds=False, kinematic_switchable_roots=False, disable_sensors=True
         )
         carriers.unload(model, solver)
@@ -47,6 +78,11 @@ class Twins:
         self._shapes = _column(solver.mjc_geom_to_newton_shape)
         self._site_shapes = _column(solver._mjc_site_to_newton_shape)
         self._in_file: dict[str, dict[int, int]] = {}
+        sliders = [twin for body, twin in self.bodies.items() if is_slider(reference, body)]
+        weigh_sliders(self.built, sliders)
+        self.sliders = [self.body_indices[twin] for twin in sliders]
+        """Indices among the builder's bodies of those that MuJoCo finds to be sliders."""
+        self.stepped = Stepped(self.built)
 
     def name(self, kind: str, index: int) -> str:
         """Kind and name of an element of the file."""
@@ -173,10 +209,16 @@ class Twins:
             built += range(self.built.jnt_qposadr[twin], self.built.jnt_qposadr[twin] + width)
         return file, built
 
-    def free_of_contacts(self) -> tuple[Any, Any]:
-        """Copies of :attr:`file` and :attr:`built` with the same options, in which nothing touches."""
+    def free_of_contacts(self, options: bool = True) -> tuple[Any, Any]:
+        """Copies of :attr:`file` and :attr:`built` with the same options, in which nothing touches.
+
+        Args:
+            options: Whether the medium and the flags may differ; else the file's copy has the built ones.
+        """
         file, built = without_contacts(self.file), without_contacts(self.built)
         built.opt.gravity = gravity(file)
+        for name in () if options else MEDIUM_AND_FLAGS:
+            setattr(file.opt, name, getattr(built.opt, name))
         built.opt.timestep, built.opt.integrator = file.opt.timestep, file.opt.integrator
         return file, built
 
@@ -188,6 +230,12 @@ class Twins:
             above.append(parent)
             parent = int(self.built.body_parentid[parent])
         return above
+
+    def held_bodies(self) -> set[int]:
+        """Bodies of :attr:`file` with geoms that can touch, or that an equality joins."""
+        ends = (end for equality in range(self.file.neq) for end in equality_ends(self.file, equality))
+        touching = {int(self.file.geom_bodyid[geom]) for geom in self.geoms}
+        return (touching | {body for kind, body in ends if kind == "body"}) & set(self.bodies)
 
     def joined(self) -> set[frozenset[int]]:
         """Pairs of bodies of :attr:`file` that an equality joins, by what they are welded to."""

@@ -77,4 +77,4 @@ def judge(
     robot_usd_bodies.compare(both)
     robot_usd_joints.compare(both)
     counting = [each for each in both.differences if not matches(each, accept)]
-    return Comparison(tuple(counting), tuple(both.notes), {}), tuple(both.corrected)
+    return Comparison(tuple(counting), tuple(both.notes), {}, ()), tuple(both.corrected)

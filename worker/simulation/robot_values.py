@@ -78,6 +78,25 @@ def extent(model: Any, geom: int) -> Any:
     return np.vstack([position, axes @ half @ axes.T])
 
 
+def from_actuators(model: Any, name: str) -> tuple[Any, Any]:
+    """What actuators add to the ``damping``, ``dampingpoly`` or ``armature`` of their joints and tendons, by the square of their gears.
+
+    Source: MuJoCo's XML reference, actuator, ``damping`` and ``armature``.
+
+    Returns:
+        Of the degrees of freedom and of the tendons, shapes ``(nv, ...)`` and ``(ntendon, ...)``, in the units of the value.
+    """
+    values = getattr(model, f"actuator_{name}")
+    dofs, tendons = (np.zeros((count, *values.shape[1:])) for count in (model.nv, model.ntendon))
+    for actuator in np.flatnonzero(values.reshape(model.nu, -1).any(1)) if model.nu else ():
+        target, share = model.actuator_trnid[actuator, 0], values[actuator] * model.actuator_gear[actuator, 0] ** 2
+        if model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_TENDON):
+            tendons[target] += share
+        else:  # MuJoCo accepts these values with a joint or a tendon alone
+            dofs[model.dof_jntid == target] += share
+    return dofs, tendons
+
+
 def has_mask(model: Any, geom: int) -> bool:
     """Whether a geom can touch others by its masks."""
     return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
@@ -105,10 +124,11 @@ def touching(model: Any) -> Any:
 
 
 def without_contacts(model: Any) -> Any:
-    """A copy of a model without contacts, in which the other constraints are solved exactly."""
+    """A copy of a model without contacts, in which the other constraints are solved exactly, and alone: MuJoCo-Warp has no noslip solver."""
     copied = copy.copy(model)
     copied.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     copied.opt.solver, copied.opt.tolerance, copied.opt.iterations = int(mujoco.mjtSolver.mjSOL_NEWTON), 1e-10, 200
+    copied.opt.noslip_iterations = 0
     return copied
 
 

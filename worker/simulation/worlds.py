@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import mujoco_warp
@@ -17,6 +17,7 @@ from shared_store.wording import nearest
 from worker.simulation.carriers import keep_inertias, unload
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives
+from worker.simulation.solver import Solver
 from worker.simulation.terrain import Terrain
 from worker.simulation.terrain_arrays import Ground
 
@@ -122,42 +123,6 @@ _SET_HERE: Mapping[str, Any] = {"disable_sensors": True, "kinematic_switchable_r
 """Solver options that a task can't set: neither MuJoCo's sensors nor kinematic roots are used, and both cost time in every step."""
 
 
-class _Solver(SolverMuJoCo):
-    """Takes all substeps between one push of Newton's state to MuJoCo and one pull back: substeps don't need Newton's coordinates."""
-
-    # which Newton declares as optional: its constructor sets them
-    mjc_body_to_newton: wp.array2d[wp.int32]
-    mjc_dof_to_newton_dof: wp.array2d[wp.int32]
-    mjc_geom_to_newton_shape: wp.array2d[wp.int32]
-    substeps = 1
-    before_substep: Sequence[Callable[[], None]] = ()
-    after_substep: Sequence[Callable[[], None]] = ()
-
-    def _mujoco_warp_step(self) -> None:
-        for _ in range(self.substeps):
-            for launch in self.before_substep:
-                launch()
-            super()._mujoco_warp_step()
-            for launch in self.after_substep:
-                launch()
-
-    @staticmethod
-    def _preserved_masks_cover_collision_filters(
-        model: newton.Model, selected_shapes: Any, collision_type: Any, collision_affinity: Any, body_filters: Any
-    ) -> bool:
-        """Newton checks whether masks alone exclude all filtered pairs, and replaces the masks if they don't.
-
-        In MuJoCo shapes fixed to the world never collide with the world, whatever their masks, so such pairs (the base of an arm and the
-        ground) are no reason to replace masks.
-        """
-        of_shapes = {int(body) for body in model.shape_body.numpy()[selected_shapes]}
-        fixed = sorted(of_shapes & _fixed_bodies(model))
-        filters = [*body_filters, *((first, second) for first in fixed for second in fixed)]
-        return SolverMuJoCo._preserved_masks_cover_collision_filters(
-            model, selected_shapes, collision_type, collision_affinity, filters
-        )
-
-
 class Worlds:
     """Identical, independent worlds that step together.
 
@@ -217,7 +182,7 @@ class Worlds:
             # of height fields that can't collide with each other; those of a terrain don't
             warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")
             self.model = scene.finalize(device=device)
-        self.solver = _Solver(self.model, **_SET_HERE, **solver_options)
+        self.solver = Solver(self.model, **_SET_HERE, **solver_options)
         unload(self.model, self.solver)
         self.solver.substeps = substeps
         self.after_substep: list[Callable[[], None]] = []
@@ -299,16 +264,6 @@ class Worlds:
     def update_shapes(self) -> None:
         """Move the shapes that cameras see to the poses computed by :meth:`update_bodies`."""
         self.model.bvh_refit_shapes(self.state)
-
-
-def _fixed_bodies(model: newton.Model) -> set[int]:
-    """Bodies connected to the world only by fixed joints."""
-    fixed = {-1}
-    joints = zip(model.joint_type.numpy(), model.joint_parent.numpy(), model.joint_child.numpy(), strict=True)
-    for kind, parent, child in joints:  # parents come first
-        if kind == newton.JointType.FIXED and int(parent) in fixed:
-            fixed.add(int(child))
-    return fixed
 
 
 def _check_options(options: Mapping[str, Any]) -> None:
