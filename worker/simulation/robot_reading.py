@@ -82,8 +82,8 @@ class Reading:
     Attributes:
         builder: Holds the robot alone, with the actuators of its file; the controls are their inputs.
         reference: MuJoCo's compiled model of the file; None for a USD file.
-        corrected: What Newton's importer had read otherwise, and is right now, or is accepted.
-        notes: What else a user should know of it, one sentence each.
+        corrected: What Newton's importer had read otherwise, and is right now.
+        notes: What else a user should know of it, one sentence each: accepted differences, for one.
         identity: By which a policy knows the robot again.
     """
 
@@ -168,7 +168,9 @@ def read(source: Source) -> Reading:
         builder = _imported(source, file, floating)  # as the training had it
         accepted = (*reference.notes, AS_IMPORTED.format(refusal))
         return Reading(builder, reference, corrected, accepted, identity(builder, None))
-    return Reading(builder, reference, corrected, tuple(notes), identity(builder, model))
+    notes += [f"accepted: {each}" for each in found.accepted]
+    own = identity(builder, model, options=source.options, accepted=found.accepted)
+    return Reading(builder, reference, corrected, tuple(notes), own)
 
 
 def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str) -> Reading:
@@ -181,7 +183,8 @@ def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str)
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
         notes = (AS_IMPORTED.format(refusal),)
-    return Reading(builder, None, corrected, notes, identity(builder, None))
+    notes += tuple(f"accepted: {each}" for each in found.accepted)
+    return Reading(builder, None, corrected, notes, identity(builder, None, accepted=found.accepted))
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
