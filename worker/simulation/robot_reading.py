@@ -147,7 +147,7 @@ def read(source: Source) -> Reading:
         builder = _imported(source, file, floating)
         found = _compared(source, builder, model)
         corrected = found.differences
-    except (ValueError, KeyError, RuntimeError, IndexError) as error:
+    except Exception as error:  # whatever an importer stumbles over, MuJoCo's model is there
         corrected = (Difference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
         found, is_readable = Comparison(corrected, (), {}), False
     else:
@@ -240,7 +240,7 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
                     schema_resolvers=list(robot_usd.SCHEMAS),
                     parse_mujoco_options=source.options,
                 )
-    except (ValueError, KeyError, RuntimeError) as error:
+    except Exception as error:
         raise ValueError(f"{shown(source.file)} can't be read: {_line(error)}") from error
     if not builder.body_count:
         raise ValueError(f"{shown(source.file)} has no body that could be a robot's")
@@ -251,7 +251,7 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
 
 def _line(error: Exception) -> str:
     """An error in one line, of OpenUSD's only what they say."""
-    text = " ".join(str(error).split())
+    text = " ".join(str(error).split()) or type(error).__name__
     return "; ".join(re.findall(r" : '(.+?)'(?= Error in '|$)", text)) or text
 
 
