@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import logging
 import re
 import warnings
 from collections.abc import Iterator
@@ -206,15 +207,19 @@ def _not_a_number(text: str) -> str:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[list[str]]:
-    """Keep MuJoCo's parser and compiler from printing, and yield what they warn of."""
+    """Keep MuJoCo's parser and compiler and Newton's importers from printing, and yield what MuJoCo warns of."""
     warned: list[str] = []
+    before, logger = mujoco.get_mju_user_warning(), logging.getLogger("newton")
+    level = logger.level
     mujoco.set_mju_user_warning(warned.append)
+    logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield warned
     finally:
-        mujoco.set_mju_user_warning(None)
+        logger.setLevel(level)
+        mujoco.set_mju_user_warning(before)
 
 
 def _check_mjcf_assets(spec: Any, shown: str) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fnmatch
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,8 +216,7 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what the importer leaves out or changes is found by comparison
+        with robot_files.quiet():  # what the importer leaves out or changes is found by comparison
             if file.format == "mjcf":
                 builder.add_mjcf(
                     file.source,
