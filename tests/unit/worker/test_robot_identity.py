@@ -70,7 +70,7 @@ CHANGES = {
         {"joint": 'frictionloss="1" solreffriction=".2 1"'},
         "joint j: solreffriction 0.02 1 became 0.2 1",
     ),
-    "swapped names": ({"first": "q", "second": "p"}, "actuator p: drives j became k; actuator q: drives k became j"),
+    "swapped names": ({"first": "q", "second": "p"}, "actuator q: drives k became j; actuator p: drives j became k"),
     "heights": ({"height": "0.5"}, "geom hills: shape and place 0 0 0 1 0 0 0 1 0 0 0 1 1 1 0.2 0.1 0 1 0 1 became"),
 }
 
