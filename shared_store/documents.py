@@ -35,7 +35,9 @@ def parse(kind: Any, value: Any, where: str) -> Any:
             raise DocumentError(f"{where}: expected one of {', '.join(map(repr, arguments))}, found {shown(value)}")
         return value
     if origin in (Union, types.UnionType):
-        return None if value is None else parse(arguments[0], value, where)
+        if value is None and types.NoneType in arguments:
+            return None
+        return value if isinstance(value, str) and str in arguments else parse(arguments[0], value, where)
     if origin is tuple:
         lengths = (len(value),) if isinstance(value, list) and arguments[-1] is Ellipsis else (len(arguments),)
         if not isinstance(value, list) or len(value) not in lengths:

@@ -63,19 +63,24 @@ def robot_changes(before: Sequence[RobotModel], now: Sequence[RobotModel]) -> li
 
 
 def _element_changes(before: RobotModel, now: RobotModel) -> Iterator[str]:
-    """The bodies, joints and actuators that changed, as far as contracts name their values."""
+    """The elements that changed, as far as contracts name their values."""
     old, new = before.elements, now.elements
     known = {name.partition(" ")[0] for name in old} & {name.partition(" ")[0] for name in new}
-    for element in {**old, **new}:
-        if element.partition(" ")[0] not in known:
+    both_whole = "model" in known
+    for element in {**new, **old}:
+        if not both_whole and element.partition(" ")[0] not in known:
             continue  # read from another kind of file, or by an older Muster
         if (element in old) != (element in new):
             yield f"{element} is {'new' if element in new else 'gone'}"
             continue
-        for name in {**old[element], **new[element]}:
+        for name in {**new[element], **old[element]}:
             pair = old[element].get(name, 0.0), new[element].get(name, 0.0)
             if not _same(*pair):
-                yield f"{element}: {name} {pair[0]:g} became {pair[1]:g}"
+                yield f"{element}: {name} {_shown(pair[0])} became {_shown(pair[1])}"
+
+
+def _shown(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def brief(lines: Sequence[str], most: int = 5) -> str:

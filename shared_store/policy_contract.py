@@ -214,16 +214,16 @@ class RobotModel(_Part):
     name: str
     """Its name in the task."""
     digest: str
-    """SHA-256 of the numbers of its compiled model, each rounded."""
+    """SHA-256 of :attr:`elements`; of a USD file, of further values of its model, too."""
     mass: float
     """Total mass [kg]."""
     joints: int
     """Number of joints, a free root among them."""
     actuators: int
     """Number of actuators in the file."""
-    elements: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
-    """By kind and name, such as ``body pole``, the values of each body, joint and actuator by which a change is named, in SI units;
-    those that are 0 are left out. Empty: unknown."""
+    elements: Mapping[str, Mapping[str, float | str]] = dataclasses.field(default_factory=dict)
+    """By kind and name, such as ``body pole``, what its file says of each element, rounded, in SI units: numbers, words, and several
+    numbers as words. Those that are 0 are left out. Empty: unknown."""
 
 
 @dataclass(frozen=True)

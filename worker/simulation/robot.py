@@ -120,6 +120,9 @@ class Robot:
             return robot_reading.read(source)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
+        except Exception as error:  # of a library that reads the file
+            words = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise ValueError(f"{self.name}: {robot_reading.shown(self.file)} can't be read: {words}") from error
 
     def _set_joints(self, own: newton.ModelBuilder, view: RobotView) -> None:
         for values, starts, argument in (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import logging
+import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,6 +22,8 @@ from worker.simulation.robot_elements import plain
 
 FORMATS = {".xml": "", ".mjcf": "mjcf", ".urdf": "urdf", ".usd": "usd", ".usda": "usd", ".usdc": "usd", ".usdz": "usd"}
 """Format of a file by its ending, or of an ``.xml`` file by its first element."""
+
+XACRO = "it has macros of xacro; expand it with xacro first: xacro FILE > robot.urdf"
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,19 @@ def read(file: str | Path) -> RobotFile:
 
 
 def _text_of(path: Path, shown: str) -> str:
+    """The text of an XML file, in the encoding that it declares."""
+    content = path.read_bytes()
+    declared = re.match(rb"\s*<\?xml[^>]*encoding=[\"']([\w.-]+)", content)
+    encoding = declared.group(1).decode() if declared else "utf-8-sig"
     try:
-        return path.read_text(encoding="utf-8")
+        return content.decode(encoding)
+    except LookupError as error:
+        raise ValueError(
+            f"{shown}: the file declares the encoding {encoding}, which is unknown; write it in UTF-8"
+        ) from error
     except UnicodeDecodeError as error:
-        raise ValueError(f"{shown}: the file is not text in UTF-8 ({error.reason} at byte {error.start})") from error
+        words = f"{encoding.removesuffix('-sig').upper()} ({error.reason} at byte {error.start})"
+        raise ValueError(f"{shown}: the file is not text in {words}; declare its encoding in its first line") from error
 
 
 def _path(file: str) -> Path:
@@ -137,6 +150,8 @@ def _root(text: str, shown: str) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
+        if "unbound prefix" in str(error) and "<xacro:" in text:
+            raise ValueError(f"{shown}: {XACRO}") from error
         raise ValueError(f"{shown}: is not XML: {error}") from error
 
 
@@ -149,7 +164,7 @@ def parse_mjcf(source: str, shown: str) -> Any:
     is_text = source.lstrip().startswith("<")
     try:
         with quiet() as warned:
-            spec = (mujoco.MjSpec.from_string if is_text else mujoco.MjSpec.from_file)(source)
+            spec = (mujoco.MjSpec.from_string if is_text else _spec_of_file)(source)
     except ValueError as error:
         raise ValueError(f"{shown}: {' '.join(str(error).split())}") from error
     if any("NaN" in text for text in warned):
@@ -159,9 +174,20 @@ def parse_mjcf(source: str, shown: str) -> Any:
     return spec
 
 
+def _spec_of_file(path: str) -> Any:
+    """An MJCF file as MuJoCo parses it, which takes every text for UTF-8."""
+    try:
+        Path(path).read_bytes().decode("utf-8")
+    except UnicodeDecodeError:
+        spec = mujoco.MjSpec.from_string(_text_of(Path(path), path))
+        spec.modelfiledir = str(Path(path).parent)
+        return spec
+    return mujoco.MjSpec.from_file(path)
+
+
 def named_options(source: str) -> set[str]:
     """Which of ``integrator`` and ``multiccd`` an MJCF file, or the text of one, sets; files that it includes are not looked at."""
-    text = source if source.lstrip().startswith("<") else Path(source).read_text(encoding="utf-8")
+    text = source if source.lstrip().startswith("<") else _text_of(Path(source), source)
     root = ElementTree.fromstring(text)
     named = {"integrator" for option in root.iter("option") if option.get("integrator")}
     return named | {"multiccd" for flag in root.iter("flag") if flag.get("multiccd") == "enable"}
@@ -183,15 +209,19 @@ def _not_a_number(text: str) -> str:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[list[str]]:
-    """Keep MuJoCo's parser and compiler from printing, and yield what they warn of."""
+    """Keep MuJoCo's parser and compiler and Newton's importers from printing, and yield what MuJoCo warns of."""
     warned: list[str] = []
+    before, logger = mujoco.get_mju_user_warning(), logging.getLogger("newton")
+    level = logger.level
     mujoco.set_mju_user_warning(warned.append)
+    logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield warned
     finally:
-        mujoco.set_mju_user_warning(None)
+        logger.setLevel(level)
+        mujoco.set_mju_user_warning(before)
 
 
 def _check_mjcf_assets(spec: Any, shown: str) -> None:
@@ -204,8 +234,11 @@ def _check_mjcf_assets(spec: Any, shown: str) -> None:
 
 
 def urdf_root(source: str, shown: str) -> ElementTree.Element:
-    """The ``<robot>`` of a URDF file or text."""
-    return _root(source if source.lstrip().startswith("<") else _text_of(Path(source), shown), shown)
+    """The ``<robot>`` of a URDF file or text. Raises ValueError where it has macros of xacro, which are not expanded."""
+    root = _root(source if source.lstrip().startswith("<") else _text_of(Path(source), shown), shown)
+    if any("xacro" in str(element.tag).rpartition("}")[0] for element in root.iter()):
+        raise ValueError(f"{shown}: {XACRO}")
+    return root
 
 
 def urdf_mesh(source: str, name: str, shown: str) -> Path:

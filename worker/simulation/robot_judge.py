@@ -111,12 +111,14 @@ class Comparison:
         notes: What contacts have otherwise, which Newton or MuJoCo-Warp can't hold, one sentence each.
         bodies: Index of each body of the file among the builder's bodies.
         sliders: Indices of the builder's bodies that only slide.
+        accepted: Differences that do not count.
     """
 
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
     bodies: dict[int, int]
-    sliders: tuple[int, ...]
+    sliders: tuple[int, ...] = ()
+    accepted: tuple[Difference, ...] = ()
 
 
 def compare(
@@ -134,13 +136,11 @@ def compare(
         twins = Twins(reference, builder)
         found = [difference for check in CHECKS for difference in check(twins)]
         found += _options(twins) if options else ()
-        counting = (
-            [each for each in found if not matches(each, accept)]
-            if found
-            else [Difference(*each) for each in dynamics(twins, options)]
-        )
+        found = found or [Difference(*each) for each in dynamics(twins, options)]
+        counting = [each for each in found if not matches(each, accept)]
+        accepted = tuple(each for each in found if matches(each, accept))
         bodies = {body: twins.body_indices[twin] for body, twin in twins.bodies.items() if body}
-        return Comparison(tuple(counting), tuple(_notes(twins)), bodies, tuple(twins.sliders))
+        return Comparison(tuple(counting), tuple(_notes(twins)), bodies, tuple(twins.sliders), accepted)
 
 
 def matches(difference: Difference, patterns: Sequence[str]) -> bool:
@@ -200,7 +200,8 @@ def _joints(twins: Twins) -> Iterator[Difference]:
             count = freedoms(file, joint)
             if name not in ("solref", "solimp") or file.dof_frictionloss[first]:
                 mine, theirs = getattr(built, f"dof_{name}"), getattr(file, f"dof_{name}") + shares.get(name, 0.0)
-                yield from _unequal(element, name, mine[second : second + count], theirs[first : first + count])
+                word = f"{name}friction" if name.startswith("sol") else name
+                yield from _unequal(element, word, mine[second : second + count], theirs[first : first + count])
 
 
 def _geoms(twins: Twins) -> Iterator[Difference]:

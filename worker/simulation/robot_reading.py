@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fnmatch
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,8 +83,8 @@ class Reading:
     Attributes:
         builder: Holds the robot alone, with the actuators of its file; the controls are their inputs.
         reference: MuJoCo's compiled model of the file; None for a USD file.
-        corrected: What Newton's importer had read otherwise, and is right now, or is accepted.
-        notes: What else a user should know of it, one sentence each.
+        corrected: What Newton's importer had read otherwise, and is right now.
+        notes: What else a user should know of it, one sentence each: accepted differences, for one.
         identity: By which a policy knows the robot again.
     """
 
@@ -149,9 +148,9 @@ def read(source: Source) -> Reading:
         builder = _imported(source, file, floating)
         found = _compared(source, builder, model)
         corrected = found.differences
-    except (ValueError, KeyError, RuntimeError, IndexError) as error:
+    except Exception as error:  # whatever an importer stumbles over, MuJoCo's model is there
         corrected = (Difference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
-        found, is_readable = Comparison(corrected, (), {}, ()), False
+        found, is_readable = Comparison(corrected, (), {}), False
     else:
         if file.format == "urdf" and corrected:
             _stiffen_limits(builder)
@@ -171,7 +170,9 @@ def read(source: Source) -> Reading:
         accepted = (*reference.notes, AS_IMPORTED.format(refusal))
         return Reading(builder, reference, corrected, accepted, identity(builder, None))
     mark_sliders(builder, found.sliders)
-    return Reading(builder, reference, corrected, tuple(notes), identity(builder, model))
+    notes += [f"accepted: {each}" for each in found.accepted]
+    own = identity(builder, model, options=source.options, accepted=found.accepted)
+    return Reading(builder, reference, corrected, tuple(notes), own)
 
 
 def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str) -> Reading:
@@ -184,7 +185,8 @@ def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str)
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
         notes = (AS_IMPORTED.format(refusal),)
-    return Reading(builder, None, corrected, notes, identity(builder, None))
+    notes += tuple(f"accepted: {each}" for each in found.accepted)
+    return Reading(builder, None, corrected, notes, identity(builder, None, accepted=found.accepted))
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
@@ -217,8 +219,7 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what the importer leaves out or changes is found by comparison
+        with robot_files.quiet():  # what the importer leaves out or changes is found by comparison
             if file.format == "mjcf":
                 builder.add_mjcf(
                     file.source,
@@ -240,7 +241,7 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
                     schema_resolvers=list(robot_usd.SCHEMAS),
                     parse_mujoco_options=source.options,
                 )
-    except (ValueError, KeyError, RuntimeError) as error:
+    except Exception as error:
         raise ValueError(f"{shown(source.file)} can't be read: {_line(error)}") from error
     if not builder.body_count:
         raise ValueError(f"{shown(source.file)} has no body that could be a robot's")
@@ -251,7 +252,7 @@ def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.
 
 def _line(error: Exception) -> str:
     """An error in one line, of OpenUSD's only what they say."""
-    text = " ".join(str(error).split())
+    text = " ".join(str(error).split()) or type(error).__name__
     return "; ".join(re.findall(r" : '(.+?)'(?= Error in '|$)", text)) or text
 
 

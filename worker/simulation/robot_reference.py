@@ -7,13 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 from shared_store.wording import nearest
-from worker.simulation import robot_files
+from worker.simulation import robot_files, robot_urdf
 from worker.simulation.robot_elements import kind_of, name_of, some, word_of
 from worker.simulation.robot_files import RobotFile
 
@@ -54,7 +53,7 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     """
     notes: list[str] = []
     if file.format == "urdf":
-        spec, looks = _urdf_spec(file, shown, notes)
+        spec, looks = robot_urdf.specification(file, shown, notes)
     else:
         spec, looks = file.spec, ""  # not a copy: MjSpec.copy drops actuators of unknown targets
     sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
@@ -182,7 +181,7 @@ _REMEDIES = (
         "give that body an <inertial> of a mass greater than 0, or a geom that has one; or fix it to its parent",
     ),
     ("negative", "give a value of 0 or more"),
-    ("only be used on top level", "leave that joint out, and let the root move freely: Robot(..., fixed=False)"),
+    ("only be used on top level", "move that body into <worldbody>, or fix it to its parent"),
 )
 """What to do, by a part of MuJoCo's message."""
 
@@ -210,121 +209,3 @@ def _check_numbers(model: Any, shown: str) -> None:
         element = "joint" if kind == "dof" else _KINDS[kind]
         name = name_of(model, kind_of(element), int(model.dof_jntid[index]) if kind == "dof" else index)
         raise ValueError(f"{shown}: {element} {name}: {value} is not a finite number; give it one")
-
-
-URDF_UNREAD = (("limit", "velocity"), ("mimic", "joint"))
-"""Attributes of URDF, by element, that are read as no number here."""
-URDF_LIMITS = ("lower", "upper", "effort")
-URDF_JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-
-
-def _urdf_spec(file: RobotFile, shown: str, notes: list[str]) -> tuple[Any, str]:
-    """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals.
-
-    Returns:
-        The specification, and what was taken of what is only seen.
-    """
-    root = robot_files.urdf_root(file.source, shown)
-    _check_tree(root, shown)
-    for element in (*root.findall("link"), *root.findall("joint")):
-        _check_urdf_numbers(element, shown)
-    for joint in root.iter("joint"):
-        _check_urdf_joint(joint, shown)
-    notes += _unlimited(root)
-    looks = "visuals" if root.find("link/visual") is not None else ""
-    for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-        for collision in link.findall("collision"):
-            mesh = collision.find("geometry/mesh")
-            if mesh is None:
-                continue
-            place = robot_files.urdf_mesh(file.source, mesh.get("filename", ""), shown)
-            if place.suffix.lower() in (".stl", ".obj", ".msh"):
-                mesh.set("filename", str(place))
-            else:
-                link.remove(collision)
-                notes.append(
-                    f"link {link.get('name')}: MuJoCo's compiler can't read {place.name}, so the shape of this collision geom "
-                    "is not compared"
-                )
-    extension = root.find("mujoco")
-    extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
-    compiler = extension.find("compiler")
-    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
-    compiler.attrib.update(strippath="false", fusestatic="false", discardvisual="true")
-    spec = robot_files.parse_mjcf(ElementTree.tostring(root, encoding="unicode"), shown)
-    _add_mimics(spec, root)
-    return spec, looks
-
-
-def _check_tree(root: ElementTree.Element, shown: str) -> None:
-    """Refuse closed loops: links are the bodies of a tree."""
-    above: dict[str, str] = {}
-    for joint in root.findall("joint"):
-        child = joint.find("child")
-        link = child.get("link", "") if child is not None else ""
-        if link in above:
-            raise ValueError(
-                f"{shown}: link {link} closes a loop: the joints {above[link]} and {joint.get('name')} both move it; leave out one "
-                "of them, or use MJCF: its <equality> can hold the two ends together"
-            )
-        above[link] = joint.get("name", "")
-
-
-def _check_urdf_numbers(element: ElementTree.Element, shown: str) -> None:
-    """Refuse numbers of a link or a joint that are not finite, and negative masses, by its name."""
-    where = f"{shown}: {element.tag} {element.get('name')}"
-    for tag in ("mass", "inertia", "origin", "axis", "dynamics", "limit", "mimic"):
-        for found in element.iter(tag):
-            for name, text in found.attrib.items():
-                numbers = [_number(word) for word in text.split() if (tag, name) not in URDF_UNREAD]
-                if not np.isfinite(numbers).all():
-                    raise ValueError(f"{where}: {name}={text!r} of its <{tag}> is not a finite number; give it one")
-                if tag == "mass" and min(numbers, default=0.0) < 0.0:
-                    raise ValueError(f"{where}: its mass is {text}; give it one greater than 0")
-
-
-def _number(word: str) -> float:
-    """A number, or 0 for another word, which MuJoCo's parser refuses or does not read."""
-    try:
-        return float(word)
-    except ValueError:
-        return 0.0
-
-
-def _check_urdf_joint(joint: ElementTree.Element, shown: str) -> None:
-    name, kind = joint.get("name"), joint.get("type")
-    if kind is not None and kind not in URDF_JOINTS:  # else a joint of a <transmission>
-        raise ValueError(f"{shown}: joint {name} is of type {kind!r}; URDF has {', '.join(URDF_JOINTS)}")
-
-
-def _unlimited(root: ElementTree.Element) -> Iterator[str]:
-    """Which joints of a URDF file have no limits, though URDF wants some, or a negative one."""
-    unlimited, negative = [], []
-    for joint in root.iter("joint"):
-        limit, name = joint.find("limit"), str(joint.get("name"))
-        lower, upper, effort = (0.0 if limit is None else _number(limit.get(word, "0")) for word in URDF_LIMITS)
-        if joint.get("type") in ("revolute", "prismatic") and lower == upper == 0.0:
-            unlimited.append(name)
-        if effort < 0.0:
-            negative.append(name)
-    if unlimited:
-        yield f"joints without <limit>, or whose lower and upper are both 0, move without end, as in MuJoCo: {some(unlimited)}"
-    if negative:
-        yield f"MuJoCo ignores a negative effort: joint {some(negative)}"
-
-
-def _add_mimics(spec: Any, root: ElementTree.Element) -> None:
-    """MuJoCo's reader of URDF knows no <mimic>: one joint follows another linearly."""
-    for joint in root.iter("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            data = [float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0)), *[0.0] * 10]
-            spec.add_equality(
-                type=mujoco.mjtEq.mjEQ_JOINT,
-                objtype=mujoco.mjtObj.mjOBJ_JOINT,
-                name1=joint.get("name"),
-                name2=mimic.get("joint"),
-                data=data,
-            )

@@ -77,4 +77,5 @@ def judge(
     robot_usd_bodies.compare(both)
     robot_usd_joints.compare(both)
     counting = [each for each in both.differences if not matches(each, accept)]
-    return Comparison(tuple(counting), tuple(both.notes), {}, ()), tuple(both.corrected)
+    accepted = tuple(each for each in both.differences if matches(each, accept))
+    return Comparison(tuple(counting), tuple(both.notes), {}, accepted=accepted), tuple(both.corrected)

@@ -9,12 +9,12 @@ from dataclasses import field, fields
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, WrapValidator
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, WrapValidator
 from pydantic.dataclasses import dataclass
 
 from shared_store.wording import nearest, shown
 from worker.learning.ppo.settings import PPOConfig
-from worker.tasks.overrides import Refused, configured, expecting, from_mapping, training_sections
+from worker.tasks.overrides import Refused, configured, expecting, from_mapping, refused, training_sections
 
 STRICT = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
 """Validation of configuration classes: no unknown field, and no value of another type."""
@@ -35,7 +35,7 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Substeps = Annotated[int, Field(ge=1, le=1000)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Rate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Range = Annotated[tuple[Finite, Finite], Field(strict=False), AfterValidator(_ordered), expecting("[least, greatest]")]
 Factors = Annotated[
     tuple[Amount, Amount],
@@ -44,7 +44,7 @@ Factors = Annotated[
     expecting("[least, greatest], two factors of 0 or more"),
 ]
 PositiveFactors = Annotated[
-    tuple[_Factor, _Factor],
+    tuple[Rate, Rate],
     Field(strict=False),
     AfterValidator(_ordered),
     expecting("[least, greatest], two factors above 0"),
@@ -156,11 +156,21 @@ def default_rewards(config_type: type[TaskConfig]) -> Mapping[str, float]:
     return weights
 
 
+class _InOneLine(type):
+    """Refuses a value in Python as it is refused in a job's YAML: in one line."""
+
+    def __call__(cls, *arguments: Any, **values: Any) -> Any:
+        try:
+            return super().__call__(*arguments, **values)
+        except ValidationError as error:
+            raise refused(error, (), values) from error
+
+
 @dataclass(frozen=True, config=STRICT)
-class _Common:
+class _Common(metaclass=_InOneLine):
     """The fields of :class:`TaskConfig`, each checked by itself."""
 
-    control_hz: Positive = 60.0
+    control_hz: Rate = 60.0
     """Control steps per simulated second [Hz]."""
     substeps: Substeps = 2
     """Physics steps of one control step."""
@@ -212,8 +222,8 @@ class TaskConfig(_Common):
         """The error in a job's ``train.config``: the keys to the value, and one line; None: it is valid."""
         try:
             cls.configured(overrides)
-        except Refused as refused:
-            return refused.path, refused.words
+        except Refused as error:
+            return error.path, error.words
         return None
 
     @classmethod

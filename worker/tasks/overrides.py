@@ -42,7 +42,7 @@ def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:
     try:
         default = kind()
     except ValidationError as error:
-        raise _refused(error, (), {}) from error
+        raise refused(error, (), {}) from error
     return _made(kind, default, {}, overrides, ())
 
 
@@ -58,7 +58,7 @@ def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mappin
         # as pydantic's own __init__ does; a plain dataclass that extends a pydantic one lacks it
         made: C = TypeAdapter(kind).validator.validate_python(ArgsKwargs((), values), self_instance=kind.__new__(kind))
     except ValidationError as error:
-        raise _refused(error, where, overrides) from error
+        raise refused(error, where, overrides) from error
     except (PydanticUserError, NameError) as error:
         first = str(error).partition("\n")[0]
         raise Refused(where, f"{kind.__name__} has a type that can't be checked: {first}") from error
@@ -75,7 +75,14 @@ def _as(default: Any, value: Any, where: Path) -> Any:
     return value
 
 
-def _refused(error: ValidationError, where: Path, overrides: Mapping[str, Any]) -> Refused:
+def refused(error: ValidationError, where: Path, overrides: Mapping[str, Any]) -> Refused:
+    """The first of pydantic's errors in one line.
+
+    Args:
+        error: Of a configuration.
+        where: Its keys in the document.
+        overrides: Its values, by which the keys of the error are found.
+    """
     problems = error.errors(include_url=False)
     first: Any = problems[0]
     found = first.get("input")

@@ -23,7 +23,10 @@ from worker import export, repeat_incident
 from worker.errors import TrainingError, UserError
 from worker.telemetry.view import Policy
 
-CHANGE = "robot: mass [kg] 1.1 became 1.3; body pole: mass 0.1 became 0.3"
+CHANGE = (
+    "robot: mass [kg] 1.1 became 1.3; body pole: mass 0.1 became 0.3; "
+    "body pole: inertia 0.0092944 0 0 0 0.0092944 0 0 0 7.919e-05 became 0.027883 0 0 0 0.027883 0 0 0 0.00023757"
+)
 OTHER = f"was trained on another robot than the file gives now: {CHANGE}"
 ACCEPT = "; to go on all the same, add --accept-changed-robot (accept_changed_robot: true in a job's section)"
 
@@ -82,7 +85,7 @@ def test_a_model_keeps_the_robot_of_its_training_and_says_that_it_changed(traine
         assert (done.returncode == 0) == accepted, done.stdout + done.stderr
         assert f"checkpoint {checkpoint.name} {OTHER}" in (done.stdout if accepted else done.stderr)
     bundle = trained.exports / checkpoint.name
-    assert read_contract(bundle).robots[0].elements["body pole"] == {"mass": 0.1}
+    assert read_contract(bundle).robots[0].elements["body pole"]["mass"] == 0.1
     assert (read_json(bundle / REPORT) or {})["changed_robot"] == f"checkpoint {checkpoint.name} {OTHER}"
     model = models.register(Store(tmp_path), "cart", trained, checkpoint, {})
     assert model.facts()["changed_robot"] == f"checkpoint {checkpoint.name} {OTHER}"

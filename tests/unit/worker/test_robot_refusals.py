@@ -278,3 +278,18 @@ def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[s
 def test_values_by_pattern_may_come_in_any_mapping() -> None:
     values = UserDict({"left_*": 1.0, "*": 2.0})
     assert resolve(["left_knee", "right_knee"], values, "joint") == [1.0, 2.0]
+
+
+def test_no_other_exception_than_a_value_error_escapes() -> None:
+    with pytest.raises(ValueError, match=r"robot: a+\.xml can't be read: OSError: .*File name too long"):
+        Robot(f"{'a' * 300}.xml").read()
+
+
+def test_a_load_prints_none_of_newton_s_warnings_of_what_is_judged_here(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Newton warns of solvers that are not used here."""
+    weld = '<equality><weld body1="thigh" body2="shank" torquescale="0.5"/></equality>'
+    Robot(leg(actuators=weld)).read()
+    assert [record for record in caplog.records if record.name.startswith("newton")] == []
+    assert "torquescale" not in capfd.readouterr().err

@@ -243,3 +243,21 @@ def test_transient_errors_and_musters_own_defects_are_not_mistakes_of_the_user(m
     monkeypatch.setattr(find_task("Cartpole"), "sketch", operator.neg)  # raises in C, called by our own code alone
     with pytest.raises(TypeError, match="bad operand type"):
         describe("Cartpole")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"substeps": 100000}, "substeps: expected a value less than or equal to 1000, found 100000"),
+        ({"control_hz": math.nan}, "control_hz: expected a finite number, found a number (nan)"),
+        ({"control_hz": math.inf}, "control_hz: expected a finite number, found a number (inf)"),
+        (
+            {"randomize": {"mass": (2.0, 1.0)}},
+            "randomize.mass: expected [least, greatest], two factors above 0, found [2.0, 1.0]",
+        ),
+    ],
+)
+def test_a_value_in_python_is_refused_in_one_line_as_in_yaml(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError) as refused:
+        TaskConfig(**values)
+    assert str(refused.value) == words

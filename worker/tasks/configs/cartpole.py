@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.sac.settings import SACConfig
-from worker.tasks.config import STRICT, Count, Positive, TaskConfig, reward_weights
+from worker.tasks.config import STRICT, Count, Positive, Rate, TaskConfig, reward_weights
 from worker.tasks.configs.camera import CameraConfig
 from worker.tasks.overrides import from_mapping
 
@@ -19,7 +19,7 @@ from worker.tasks.overrides import from_mapping
 class CartpoleConfig(TaskConfig):
     """The cart may not leave the rail and the pole may not fall past ``angle_limit``."""
 
-    control_hz: Positive = 60.0
+    control_hz: Rate = 60.0
     """Control steps per simulated second [Hz]."""
     substeps: Count = 1
     """Physics steps of one control step: without contacts one step of 1/60 s is accurate enough."""

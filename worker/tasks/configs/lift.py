@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
-from worker.tasks.config import STRICT, Count, Points, Positive, Range, TaskConfig, reward_weights
+from worker.tasks.config import STRICT, Count, Points, Positive, Range, Rate, TaskConfig, reward_weights
 
 CALM = ((0, -0.01), (499, -0.01), (500, -0.1), (999, -0.1), (1000, -1.0))
 """Weight of ``joint_vel_hinge`` by iteration: mjlab's stages at 12,000 and 24,000 control steps, of iterations of 24."""
@@ -25,7 +25,7 @@ class LiftCubeConfig(TaskConfig):
         ValueError: A range is malformed, or :class:`TaskConfig` refuses a value.
     """
 
-    control_hz: Positive = 50.0
+    control_hz: Rate = 50.0
     """Control steps per simulated second [Hz]."""
     substeps: Count = 4
     """Physics steps of one control step, each of 1/200 s."""

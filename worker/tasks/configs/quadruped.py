@@ -10,7 +10,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
-from worker.tasks.config import STRICT, Count, Positive, Range, TaskConfig, reward_weights
+from worker.tasks.config import STRICT, Count, Positive, Range, Rate, TaskConfig, reward_weights
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -21,7 +21,7 @@ class QuadrupedConfig(TaskConfig):
         ValueError: A range of commands is malformed, or :class:`TaskConfig` refuses a value.
     """
 
-    control_hz: Positive = 50.0
+    control_hz: Rate = 50.0
     """Control steps per simulated second [Hz]."""
     substeps: Count = 4
     """Physics steps of one control step, each of 1/200 s."""

@@ -26,6 +26,7 @@ from worker.tasks.config import (
     Positive,
     PositiveFactors,
     Range,
+    Rate,
     TaskConfig,
     reward_weights,
 )
@@ -110,7 +111,7 @@ class RacerConfig(TaskConfig):
     races: ClassVar[bool] = True
     hyperparameters: ClassVar[tuple[str, ...]] = tuple(KNOWN)
     other_rewards: ClassVar[Mapping[str, float]] = {"reward": 1.0}
-    control_hz: Positive = 15.0
+    control_hz: Rate = 15.0
     """Control steps per simulated second [Hz]."""
     substeps: Annotated[int, Field(ge=1, le=64)] = 4
     """Parts of a control step in which the car's motion is integrated."""

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.sac.settings import SACConfig
-from worker.tasks.config import STRICT, Count, Positive, TaskConfig, reward_weights
+from worker.tasks.config import STRICT, Count, Positive, Rate, TaskConfig, reward_weights
 
 SAC = SACConfig(
     batch_size=4096,
@@ -39,7 +39,7 @@ class RunningConfig(TaskConfig):
     The strength of a joint is the full torque of its motor over that of the strongest motor.
     """
 
-    control_hz: Positive = 60.0
+    control_hz: Rate = 60.0
     """Control steps per simulated second [Hz]."""
     substeps: Count = 2
     """Physics steps of one control step, each of 1/120 s."""

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from shared_store.wording import shown
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.sac.settings import SACConfig
-from worker.tasks.config import STRICT, Amount, Count, Finite, Positive, Range, TaskConfig, reward_weights
+from worker.tasks.config import STRICT, Amount, Count, Finite, Positive, Range, Rate, TaskConfig, reward_weights
 from worker.tasks.overrides import Refused, expecting
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -97,7 +97,7 @@ class VelocityConfig(TaskConfig):
       the trunk or the head the ground, with more than 10 N.
     """
 
-    control_hz: Positive = 50.0
+    control_hz: Rate = 50.0
     """Control steps per simulated second [Hz]."""
     substeps: Count = 4
     """Physics steps of one control step, each of 1/200 s."""
