@@ -16,6 +16,7 @@ from worker.simulation import robot_reading
 from worker.simulation.actuators import Actuator, Number
 from worker.simulation.collisions import Collision
 from worker.simulation.patterns import resolve
+from worker.simulation.robot_floor import FLOORS
 from worker.simulation.robot_view import RobotView
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -63,7 +64,7 @@ class Robot:
     armature: Number | None = field(default=None, kw_only=True)
     friction_loss: Number | None = field(default=None, kw_only=True)
     viscous_damping: Number | None = field(default=None, kw_only=True)
-    ignore: Sequence[str] = field(default=("floor", "ground"), kw_only=True)
+    ignore: Sequence[str] = field(default=FLOORS, kw_only=True)
     passive: bool = field(default=False, kw_only=True)
     visuals: bool = field(default=True, kw_only=True)
     file_options: bool = field(default=True, kw_only=True)
@@ -115,7 +116,16 @@ class Robot:
         Raises:
             ValueError: See :meth:`add_to`.
         """
-        source = robot_reading.Source(self.file, self.fixed, self.ignore, self.visuals, self.file_options, self.accept)
+        source = robot_reading.Source(
+            self.file,
+            self.fixed,
+            self.ignore,
+            self.visuals,
+            self.file_options,
+            self.accept,
+            is_placed=self.position is None and self.rotation is None,
+            has_contacts=not any(collision.only for collision in self.collisions),
+        )
         try:
             return robot_reading.read(source)
         except ValueError as error:

@@ -63,10 +63,12 @@ def tendon_numbers(model: Any, tendon: int) -> Any:
     return np.array([model.wrap_prm[wrap] for wrap in _wraps(model, tendon) if model.wrap_type[wrap] in numbered])
 
 
-def wrapped_geoms(model: Any) -> set[int]:
-    """The geoms that tendons wrap."""
+def effective_geoms(model: Any) -> list[int]:
+    """The geoms that do anything: they touch by their masks or in a contact pair, or a tendon wraps them."""
     kinds = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
-    return {int(geom) for geom in model.wrap_objid[np.isin(model.wrap_type, kinds)]}
+    named = (model.pair_geom1, model.pair_geom2, model.wrap_objid[np.isin(model.wrap_type, kinds)])
+    masked = (model.geom_contype | model.geom_conaffinity).nonzero()[0]
+    return sorted({int(geom) for group in (*named, masked) for geom in group})
 
 
 def held(model: Any, equality: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import os
 import re
 import warnings
 from collections.abc import Iterator
@@ -71,7 +72,6 @@ def read(file: str | Path) -> RobotFile:
     shown = "the robot's XML" if source == text and source.lstrip().startswith("<") else text
     if kind == "mjcf":
         spec = parse_mjcf(source, shown)
-        _check_mjcf_assets(spec, shown)
         return RobotFile(source, kind, _hinges(spec), spec)
     if kind == "urdf":
         for mesh in urdf_root(source, shown).iter("mesh"):  # Newton would only warn and continue without them
@@ -148,11 +148,18 @@ def _kind_of_xml(text: str, shown: str) -> str:
 
 def _root(text: str, shown: str) -> ElementTree.Element:
     try:
-        return ElementTree.fromstring(text)
+        return _element(text)
     except ElementTree.ParseError as error:
         if "unbound prefix" in str(error) and "<xacro:" in text:
             raise ValueError(f"{shown}: {XACRO}") from error
         raise ValueError(f"{shown}: is not XML: {error}") from error
+
+
+def _element(text: str) -> ElementTree.Element:
+    """The first element of XML, without its comments: MuJoCo reads those with dashes in them, too."""
+    return ElementTree.fromstring(
+        re.sub("<!--.*?-->", lambda found: "\n" * found[0].count("\n"), text, flags=re.DOTALL)
+    )
 
 
 def parse_mjcf(source: str, shown: str) -> Any:
@@ -168,9 +175,7 @@ def parse_mjcf(source: str, shown: str) -> Any:
     except ValueError as error:
         raise ValueError(f"{shown}: {' '.join(str(error).split())}") from error
     if any("NaN" in text for text in warned):
-        raise ValueError(
-            f"{shown}: {_not_a_number(source if is_text else _text_of(Path(source), shown))}; give it a number"
-        )
+        raise ValueError(f"{shown}: {_not_a_number(source)}; give it a number")
     return spec
 
 
@@ -185,26 +190,97 @@ def _spec_of_file(path: str) -> Any:
     return mujoco.MjSpec.from_file(path)
 
 
-def named_options(source: str) -> set[str]:
-    """Which of ``integrator`` and ``multiccd`` an MJCF file, or the text of one, sets; files that it includes are not looked at."""
-    text = source if source.lstrip().startswith("<") else _text_of(Path(source), source)
-    root = ElementTree.fromstring(text)
-    named = {"integrator" for option in root.iter("option") if option.get("integrator")}
-    return named | {"multiccd" for flag in root.iter("flag") if flag.get("multiccd") == "enable"}
+def _not_a_number(source: str) -> str:
+    for root, _ in mjcf_roots(source):
+        parents = {child: parent for parent in root.iter() for child in parent}
+        for element in root.iter():
+            for name, value in element.attrib.items():
+                if "nan" in value.lower().split():
+                    owner = element
+                    while not owner.get("name") and owner in parents:
+                        owner = parents[owner]
+                    is_within = owner is not element and owner.get("name")
+                    within = f" in {owner.tag} {owner.get('name')}" if is_within else ""
+                    return (
+                        f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}>{within} is not a number"
+                    )
+    return "a value of a model that it attaches is not a number"
 
 
-def _not_a_number(text: str) -> str:
-    root = ElementTree.fromstring(text)
-    parents = {child: parent for parent in root.iter() for child in parent}
-    for element in root.iter():
-        for name, value in element.attrib.items():
-            if "nan" in value.lower().split():
-                owner = element
-                while not owner.get("name") and owner in parents:
-                    owner = parents[owner]
-                within = f" in {owner.tag} {owner.get('name')}" if owner is not element and owner.get("name") else ""
-                return f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}>{within} is not a number"
-    return "a value of a file that it includes is not a number"
+def mjcf_roots(source: str) -> Iterator[tuple[ElementTree.Element, Path]]:
+    """The first element of an MJCF file, or of the text of one, and of each file that it includes, with the folder of that file.
+
+    MuJoCo looks for an included file in the folder of the first one, then in that of the file which includes it.
+    """
+    is_text = source.lstrip().startswith("<")
+    first = Path() if is_text else Path(source).parent
+    yield from _with_included(source if is_text else Path(source), first, first)
+
+
+def _with_included(file: str | Path, first: Path, folder: Path) -> Iterator[tuple[ElementTree.Element, Path]]:
+    text = file if isinstance(file, str) else _text_of(file, str(file))
+    try:
+        root = _element(text)
+    except ElementTree.ParseError:  # of an included file, of which MuJoCo's parser accepts a little more
+        return
+    yield root, folder
+    for name in (include.get("file", "") for include in root.iter("include")):
+        place = next((base / name for base in (first, folder) if (base / name).is_file()), None)
+        if place is not None:
+            yield from _with_included(place, first, place.parent)
+
+
+def named_options(file: RobotFile) -> set[str]:
+    """Which of ``integrator`` and ``multiccd`` a file sets, or one that it includes.
+
+    The parsed file does not show whether it names Euler's integrator, the default.
+    """
+    is_another = file.spec is not None and file.spec.option.integrator != mujoco.mjtIntegrator.mjINT_EULER
+    named = {"integrator"} if is_another else set()
+    for root, _ in mjcf_roots(file.source):
+        named |= {"integrator" for option in root.iter("option") if option.get("integrator")}
+        named |= {"multiccd" for flag in root.iter("flag") if flag.get("multiccd") == "enable"}
+    return named
+
+
+def asset_folders(source: str, kind: str) -> list[tuple[Path, str]]:
+    """Where an MJCF file, or the text of one, and the models that it attaches look for their assets.
+
+    Args:
+        source: Path or text of the file.
+        kind: ``"meshdir"`` or ``"texturedir"``.
+
+    Returns:
+        Of each file: its folder, and the assets' folder inside of that as the file says it, the main file's first.
+    """
+    words: dict[str, str] = {}
+    attached = []
+    main = Path() if source.lstrip().startswith("<") else Path(source).parent
+    for root, _ in mjcf_roots(source):
+        for compiler in root.iter("compiler"):
+            words |= compiler.attrib
+        models = [main / model.get("file", "") for model in root.iter("model")]
+        attached += [place for model in models if model.is_file() for place in asset_folders(str(model), kind)]
+    return [(main, words.get(kind, words.get("assetdir", ""))), *attached]
+
+
+def missing_asset(spec: Any, source: str, name: str, shown: str) -> ValueError:
+    """The error of a mesh or height field that MuJoCo can't open.
+
+    Args:
+        spec: The parsed file, ``mujoco.MjSpec``.
+        source: Path or text of the file.
+        name: The asset as MuJoCo says it, with the folder of the assets.
+        shown: The file's name, for errors.
+    """
+    places = [(folder, os.path.normpath(inside)) for folder, inside in asset_folders(source, "meshdir")]
+    without = [(folder, inside) for folder, inside in places if not (folder / name).is_file()]
+    within = [each for each in without if Path(name).is_relative_to(each[1])]
+    folder, inside = max(within, key=lambda each: len(Path(each[1]).parts), default=(places[0][0], ""))
+    fields = [Path(field.file).name for field in spec.hfields]
+    place = Path(name).relative_to(inside) if within else Path(name)
+    kind = "height field" if place.name in fields else "mesh"
+    return _missing(shown, kind, str(place), (folder / inside / place).parent)
 
 
 @contextlib.contextmanager
@@ -222,15 +298,6 @@ def quiet() -> Iterator[list[str]]:
     finally:
         logger.setLevel(level)
         mujoco.set_mju_user_warning(before)
-
-
-def _check_mjcf_assets(spec: Any, shown: str) -> None:
-    """Refuse missing meshes and height fields: Newton would leave them out and build a different robot."""
-    folder = Path(spec.modelfiledir) / spec.meshdir
-    for kind, elements in (("mesh", spec.meshes), ("height field", spec.hfields)):
-        for name in (element.file for element in elements):
-            if name and not (folder / name).is_file():
-                _refuse_missing(shown, kind, name, folder)
 
 
 def urdf_root(source: str, shown: str) -> ElementTree.Element:
@@ -268,14 +335,14 @@ def urdf_mesh(source: str, name: str, shown: str) -> Path:
             )
         place = above.parent / inside
     if not place.is_file():
-        _refuse_missing(shown, "mesh", name, place.parent)
+        raise _missing(shown, "mesh", name, place.parent)
     return place
 
 
-def _refuse_missing(shown: str, kind: str, name: str, folder: Path) -> None:
+def _missing(shown: str, kind: str, name: str, folder: Path) -> ValueError:
     there = sorted(item.name for item in folder.iterdir() if item.is_file()) if folder.is_dir() else []
     near = nearest(Path(name).name, there, "put it there") if there else "that folder does not exist or is empty"
-    raise ValueError(f"{shown}: its {kind} {name} is missing in {folder}; {near}")
+    return ValueError(f"{shown}: its {kind} {name} is missing in {folder}; {near}")
 
 
 def _hinges(spec: Any) -> dict[str, list[str]]:

@@ -20,8 +20,9 @@ from worker.simulation.robot_connections import (
     tendon_ends,
     tendon_numbers,
 )
+from worker.simulation.robot_contacts import differing, lost_margin, notes, stay_apart
 from worker.simulation.robot_dynamics import RELATIVE, dynamics
-from worker.simulation.robot_elements import count_of, some, word_of
+from worker.simulation.robot_elements import count_of, word_of
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import (
@@ -35,17 +36,17 @@ from worker.simulation.robot_values import (
     length,
     matrix,
     shown_value,
-    touching,
 )
 
 ROUNDING = 1e-4
 """Up to this share of the greater one, a difference is of no consequence to a policy."""
 FAR = 10.0
 """Ends of an equality are compared this much less sharply: their places add up along chains of bodies."""
-ELSEWHERE = ("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV")
-"""Flags that a task's solver options set, that nothing here reads, that only report, or that are compared in another way."""
-FLAT = ("mesh", "cylinder")
-"""Geoms of which MuJoCo-Warp finds several contacts with others than planes only if ``multiccd`` is enabled."""
+ELSEWHERE = (
+    *("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV"),
+    *("mjDSBL_MIDPHASE", "mjDSBL_AUTORESET"),
+)
+"""Flags that a task's solver options set, that nothing here reads, that only report or speed up, or that are compared in another way."""
 COUNTS = {
     "coordinates": "nq",
     "degrees of freedom": "nv",
@@ -54,8 +55,6 @@ COUNTS = {
     "tendons": "ntendon",
     "equalities": "neq",
     "contact pairs": "npair",
-    "flexible bodies": "nflex",
-    "plugins": "nplugin",
 }
 """What is counted, and its field of ``mujoco.MjModel``."""
 TENDON = (
@@ -140,7 +139,7 @@ def compare(
         counting = [each for each in found if not matches(each, accept)]
         accepted = tuple(each for each in found if matches(each, accept))
         bodies = {body: twins.body_indices[twin] for body, twin in twins.bodies.items() if body}
-        return Comparison(tuple(counting), tuple(_notes(twins)), bodies, tuple(twins.sliders), accepted)
+        return Comparison(tuple(counting), tuple(notes(twins)), bodies, tuple(twins.sliders), accepted)
 
 
 def matches(difference: Difference, patterns: Sequence[str]) -> bool:
@@ -156,6 +155,11 @@ def _counts(twins: Twins) -> Iterator[Difference]:
     for what, field in COUNTS.items():
         if getattr(twins.built, field) != getattr(twins.file, field):
             yield Difference("model", f"the number of {what}", getattr(twins.built, field), getattr(twins.file, field))
+    for flex in range(twins.file.nflex):
+        yield Difference(twins.name("flex", flex), "flexible body", "missing", "there")
+    for kind in ("body", "geom", "actuator"):  # what else has plugins is not read
+        for index in (getattr(twins.file, f"{kind}_plugin") >= 0).nonzero()[0]:
+            yield Difference(twins.name(kind, index), "plugin", "missing", "there")
 
 
 def _bodies(twins: Twins) -> Iterator[Difference]:
@@ -206,12 +210,12 @@ def _joints(twins: Twins) -> Iterator[Difference]:
 
 def _geoms(twins: Twins) -> Iterator[Difference]:
     file, built = twins.file, twins.stepped
+    has_medium = bool(file.opt.density or file.opt.viscosity)
     for geom in set(range(file.ngeom)) - set(twins.geoms):
         if has_mask(file, geom):
             yield Difference(twins.name("geom", geom), "existence", "missing", "there")
-        yield from _unequal(
-            twins.name("geom", geom), "fluid", np.zeros_like(file.geom_fluid[geom]), file.geom_fluid[geom]
-        )
+        if has_medium:
+            yield from _unequal(twins.name("geom", geom), "fluid", 0.0 * file.geom_fluid[geom], file.geom_fluid[geom])
     for geom, twin in twins.geoms.items():
         element = twins.name("geom", geom)
         kind, other = (word_of(mujoco.mjtGeom, model.geom_type[each]) for model, each in ((file, geom), (built, twin)))
@@ -220,9 +224,10 @@ def _geoms(twins: Twins) -> Iterator[Difference]:
             continue
         if has_mask(file, geom):
             yield from _fields(twins, "geom", geom, twin, "condim friction solref solimp solmix priority gap")
-            if not (file.geom_margin[geom] and not built.geom_margin[twin]):  # else a note says so
+            if not lost_margin(twins, "geom", geom, twin):
                 yield from _fields(twins, "geom", geom, twin, "margin")
-        yield from _fields(twins, "geom", geom, twin, "fluid")
+        if has_medium:
+            yield from _fields(twins, "geom", geom, twin, "fluid")
         yield from _unequal(element, "shape and place", extent(built, twin), extent(file, geom), length(file))
 
 
@@ -244,10 +249,12 @@ def _pairs(twins: Twins) -> Iterator[Difference]:
         if pair not in twins.contact_pairs:
             yield Difference(element, "existence", "missing", "there")
             continue
-        models = (twins.stepped, twins.contact_pairs[pair]), (twins.file, pair)
+        twin = twins.contact_pairs[pair]
+        models = (twins.stepped, twin), (twins.file, pair)
         for name in ("dim", "friction", "solref", "solimp", "margin", "gap"):
             mine, theirs = (getattr(model, f"pair_{name}")[index] for model, index in models)
-            yield from _unequal(element, name, mine, theirs)
+            if name != "margin" or not lost_margin(twins, "pair", pair, twin):
+                yield from _unequal(element, name, mine, theirs)
         mine, theirs = (_of_friction(model, index) for model, index in models)
         yield from _unequal(element, "solreffriction", mine, theirs)
 
@@ -260,27 +267,10 @@ def _of_friction(model: Any, pair: int) -> Any:
 
 def _contacts(twins: Twins) -> Iterator[Difference]:
     words = {True: "can touch", False: "can't touch"}
-    for pair, mine in _pairs_of_geoms(twins):
-        if mine or not _stay_apart(twins, pair):
+    for pair, mine in differing(twins):
+        if mine or not stay_apart(twins, pair):
             names = " and ".join(twins.name("geom", geom).removeprefix("geom ") for geom in pair)
             yield Difference(f"geoms {names}", "contact", words[mine], words[not mine])
-
-
-def _pairs_of_geoms(twins: Twins) -> Iterator[tuple[tuple[int, int], bool]]:
-    """Geoms of the file of which two can touch in one model alone, and whether it is the built one."""
-    geoms, others = list(twins.geoms), list(twins.geoms.values())
-    theirs, mine = touching(twins.file)[np.ix_(geoms, geoms)], touching(twins.built)[np.ix_(others, others)]
-    welded = twins.file.body_weldid[twins.file.geom_bodyid]
-    for first, second in np.argwhere(np.triu(theirs != mine)):
-        pair = geoms[first], geoms[second]
-        if welded[pair[0]] or welded[pair[1]]:  # else neither can move
-            yield pair, bool(mine[first, second])
-
-
-def _stay_apart(twins: Twins, pair: tuple[int, int]) -> bool:
-    """Whether it is Newton's rule that two geoms never touch: a joint or an equality connects their bodies."""
-    ends = frozenset(int(twins.file.body_weldid[twins.file.geom_bodyid[geom]]) for geom in pair)
-    return 0 in ends or ends in twins.joined()
 
 
 def _tendons(twins: Twins) -> Iterator[Difference]:
@@ -348,31 +338,6 @@ def _options(twins: Twins) -> Iterator[Difference]:
                 yield Difference("option", f"{name} {word}", bool(mine & int(bit)), bool(theirs & int(bit)))
 
 
-def _notes(twins: Twins) -> Iterator[str]:
-    file, built = twins.file, twins.built
-    single = [joint for joint in range(file.njnt) if freedoms(file, joint) == 1]
-    if shifted := [joint for joint in single if file.qpos0[file.jnt_qposadr[joint]]]:
-        names = some([f"{twins.name('joint', each)}: {file.qpos0[file.jnt_qposadr[each]]:.6g}" for each in shifted])
-        yield f"positions and limits of joints count from their ref in the file, which is 0 here ({names})"
-    pairs = [(geom, twin) for geom, twin in twins.geoms.items() if has_mask(file, geom)]
-    bare = [geom for geom, twin in pairs if file.geom_margin[geom] and not built.geom_margin[twin]]
-    if bare:
-        names = some([twins.name("geom", geom) for geom in bare])
-        yield f"contacts begin where geoms touch, not at the margin of the file ({names}): MuJoCo-Warp has none between boxes"
-    flat = [geom for geom, _ in pairs if word_of(mujoco.mjtGeom, file.geom_type[geom]) in FLAT]
-    multiccd = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
-    if flat and built.opt.disableflags & multiccd and not file.opt.disableflags & multiccd:
-        names = some([twins.name("geom", geom) for geom in flat])
-        yield (
-            f"where meshes and cylinders touch each other, boxes or capsules, they have one contact, in MuJoCo several ({names}); "
-            'solver_options={"enable_multiccd": True} finds them all'
-        )
-    apart = [pair for pair, mine in _pairs_of_geoms(twins) if not mine and _stay_apart(twins, pair)]
-    if apart:
-        names = some([" and ".join(twins.name("geom", geom) for geom in pair) for pair in apart])
-        yield f"bodies that a joint or an equality connects do not touch, even if one is fixed to the world ({names})"
-
-
 def _fields(twins: Twins, kind: str, index: int, twin: int, names: str) -> Iterator[Difference]:
     element = twins.name({"jnt": "joint", "eq": "equality"}.get(kind, kind), index)
     for name in names.split():
@@ -381,10 +346,12 @@ def _fields(twins: Twins, kind: str, index: int, twin: int, names: str) -> Itera
 
 
 def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0) -> Iterator[Difference]:
-    mine, theirs = np.asarray(built, np.float64), np.asarray(file, np.float64)
+    mine, theirs = (np.clip(np.asarray(value, np.float64), -newton.MAXVAL, newton.MAXVAL) for value in (built, file))
     if mine.shape != theirs.shape:
         yield Difference(element, field, built, file)
         return
+    bounded = (mine != theirs) | (np.abs(mine) < newton.MAXVAL)  # of the open end of a range, nothing is to be compared
+    mine, theirs = mine[bounded], theirs[bounded]
     greatest = max(scale, float(np.abs(theirs).max(initial=0.0)), float(np.abs(mine).max(initial=0.0)))
     if not (np.abs(mine - theirs) <= RELATIVE * greatest).all():
         yield Difference(element, field, built, file)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from worker.simulation import carriers
-from worker.simulation.robot_connections import TARGETS, actuator_ends, equality_ends, held
+from worker.simulation.robot_connections import TARGETS, actuator_ends, effective_geoms, equality_ends, held
 from worker.simulation.robot_elements import Words, unique_names
 from worker.simulation.robot_values import quaternion
 
@@ -33,7 +33,7 @@ _GAINS = Words(mujoco.mjtGain, "fixed affine muscle user")
 _BIASES = Words(mujoco.mjtBias, "none affine muscle user")
 
 
-def write(model: Any, *, named: Collection[str] = ()) -> str:
+def write(model: Any, *, named: Collection[str] = (), visuals: bool = True) -> str:
     """Write a compiled model as MJCF.
 
     Of several joints of a body all but the last move carriers (:mod:`worker.simulation.carriers`), so that each keeps its own place,
@@ -43,6 +43,7 @@ def write(model: Any, *, named: Collection[str] = ()) -> str:
         model: The compiled model, ``mujoco.MjModel``.
         named: Which of ``integrator`` and ``multiccd`` the file sets. Of others the compiled model has MuJoCo's defaults, and the
             worlds' defaults hold.
+        visuals: Whether geoms that are only seen are written.
 
     Returns:
         The XML. Angles are in radians, and each number is written with all its digits.
@@ -50,13 +51,14 @@ def write(model: Any, *, named: Collection[str] = ()) -> str:
     Raises:
         ValueError: An element is of a kind that Newton's models don't have.
     """
-    return _Writer(model, named).write()
+    return _Writer(model, named, visuals).write()
 
 
 class _Writer:
-    def __init__(self, model: Any, named: Collection[str]) -> None:
+    def __init__(self, model: Any, named: Collection[str], visuals: bool) -> None:
         self.model = model
         self.named = named
+        self.geoms = range(model.ngeom) if visuals else effective_geoms(model)
         self.bodies: dict[int, Element] = {}
         self.names: dict[str, list[str]] = {}
 
@@ -74,14 +76,15 @@ class _Writer:
         _add(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false", balanceinertia="true")
         self._write_options(root)
         asset = _add(root, "asset")
-        for mesh in np.unique(self.model.geom_dataid[self.model.geom_type == int(mujoco.mjtGeom.mjGEOM_MESH)]):
+        meshes = [geom for geom in self.geoms if self.model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_MESH)]
+        for mesh in np.unique(self.model.geom_dataid[meshes]):
             self._write_mesh(asset, mesh)
         for hfield in range(self.model.nhfield):
             self._write_hfield(asset, hfield)
         self.bodies[0] = _add(root, "worldbody")
         for body in range(1, self.model.nbody):
             self._write_body(body)
-        for geom in range(self.model.ngeom):
+        for geom in self.geoms:
             self._write_geom(geom)
         for site in range(self.model.nsite):
             self._write_site(site)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import fnmatch
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,9 @@ REMEDIES = {
     "dampingpoly": "Give damping one number",
     "stiffnesspoly": "Give stiffness one number",
     "fluid": "Leave out fluidshape",
+    "actuatorfrcrange": "Make it symmetric, or give the actuator a forcerange instead",
+    "plugin": "Leave the plugin out, or replace it by elements of MJCF that need none",
+    "flexible body": "Leave out the flexible body",
     "anchor2": "Let both sites of the equality be at one place in the first pose of the file",
     "axes of inertia": "Give the body an <inertial> of three different moments, on whose axes the medium's drag acts",
     "greatest force of actuators": "Newton limits the force on a joint: choose smaller gears or gains",
@@ -66,6 +69,8 @@ class Source:
         visuals: Whether geoms that are only seen are read.
         options: Whether the file's solver options are read.
         accept: Patterns of differences from the file that are accepted.
+        is_placed: Whether the robot begins where its file puts it.
+        has_contacts: Whether its geoms touch as its file says.
     """
 
     file: str | Path
@@ -74,6 +79,8 @@ class Source:
     visuals: bool = True
     options: bool = True
     accept: Sequence[str] = ()
+    is_placed: bool = True
+    has_contacts: bool = True
 
 
 @dataclass(frozen=True)
@@ -142,7 +149,14 @@ def read(source: Source) -> Reading:
     floating = None if source.fixed is None else not source.fixed
     if file.format == "usd":
         return _read_usd(source, file, floating, name)
-    reference = robot_reference.compile_file(file, fixed=source.fixed, ignored=_ignored(source), shown=name)
+    reference = robot_reference.compile_file(
+        file,
+        fixed=source.fixed,
+        ignored=_ignored(source),
+        shown=name,
+        is_placed=source.is_placed,
+        has_contacts=source.has_contacts,
+    )
     model, is_readable = reference.model, True
     try:
         builder = _imported(source, file, floating)
@@ -157,7 +171,8 @@ def read(source: Source) -> Reading:
         found = _amended(source, builder, model, found)
     notes = list(reference.notes)
     if found.differences:
-        builder = _imported(source, RobotFile(_rewritten(file, model, name), "mjcf"), None)
+        rewritten = RobotFile(_rewritten(file, model, source.visuals, name), "mjcf")
+        builder = _imported(replace(source, visuals=True), rewritten, None)
         found = _amended(source, builder, model, _compared(source, builder, model))
         if reference.looks:
             notes.append(f"pictures lack the {reference.looks} of the file, since MuJoCo's compiled model has none")
@@ -256,9 +271,9 @@ def _line(error: Exception) -> str:
     return "; ".join(re.findall(r" : '(.+?)'(?= Error in '|$)", text)) or text
 
 
-def _rewritten(file: RobotFile, model: Any, shown: str) -> str:
+def _rewritten(file: RobotFile, model: Any, visuals: bool, shown: str) -> str:
     try:
-        return robot_mjcf.write(model, named=robot_files.named_options(file.source))
+        return robot_mjcf.write(model, named=robot_files.named_options(file), visuals=visuals)
     except ValueError as error:
         raise ValueError(f"{shown}: {error}") from error
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import newton
 import numpy as np
 
 from shared_store.wording import nearest
-from worker.simulation import robot_files, robot_urdf
+from worker.simulation import robot_files, robot_floor, robot_urdf
 from worker.simulation.robot_elements import kind_of, name_of, some, word_of
-from worker.simulation.robot_files import RobotFile
+from worker.simulation.robot_files import RobotFile, asset_folders, missing_asset
 
 _KINDS = {"jnt": "joint", "dof": "dof", "eq": "equality"} | {
     kind: kind for kind in ("body", "geom", "site", "tendon", "actuator")
@@ -39,7 +41,15 @@ class Reference:
     sensors: tuple[tuple[str, str], ...] = ()
 
 
-def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str], shown: str) -> Reference:
+def compile_file(
+    file: RobotFile,
+    *,
+    fixed: bool | None,
+    ignored: Sequence[str],
+    shown: str,
+    is_placed: bool = True,
+    has_contacts: bool = True,
+) -> Reference:
     """Compile an MJCF or URDF file.
 
     Args:
@@ -47,6 +57,8 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
         fixed: Whether its root is fixed to the world; None: as in the file.
         ignored: Regular expressions of the names of geoms and sites to leave out.
         shown: The file's name, for errors.
+        is_placed: Whether the robot begins where its file puts it.
+        has_contacts: Whether its geoms touch as the file says.
 
     Raises:
         ValueError: MuJoCo refuses the file; the message names the element.
@@ -59,37 +71,57 @@ def compile_file(file: RobotFile, *, fixed: bool | None, ignored: Sequence[str],
     sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
     for element in (*spec.sensors, *spec.keys):
         spec.delete(element)  # sensors may name places that do not exist, and poses do not fit another root
-    for element in (*spec.geoms, *spec.sites):
-        if any(re.match(pattern, element.name) for pattern in ignored):
-            spec.delete(element)
-    looks = _without_looks(spec, notes) or looks
+    floors = robot_floor.compiled(spec, lambda name: _is_ignored(name, ignored))
+    left_out = _leave_out(spec, ignored, notes)
+    looks = _without_looks(spec, file.source, notes) or looks
     if fixed is not None:
         _set_root(spec, fixed, shown)
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         notes.append("the file asks for the solver PGS, which MuJoCo-Warp lacks: worlds use Newton's method")
     if spec.option.noslip_iterations:
         notes.append("noslip_iterations of the file are not used: a task's solver_options have none")
-    model = _compiled(spec, shown, notes)
+    model = _compiled(spec, partial(_refusal, spec, file.source, left_out, shown), notes)
+    _open_ranges(model)
     _check_numbers(model, shown)
     notes += _empty_ranges(model)
+    notes += robot_floor.notes(model, floors, is_placed=is_placed, has_contacts=has_contacts)
     return Reference(model, tuple(notes), looks, sensors)
 
 
-def _without_looks(spec: Any, notes: list[str]) -> str:
+def _is_ignored(name: str, ignored: Sequence[str]) -> bool:
+    return any(re.match(pattern, name) for pattern in ignored)
+
+
+def _leave_out(spec: Any, ignored: Sequence[str], notes: list[str]) -> list[str]:
+    """Leave out ignored geoms and sites, and the contact pairs of such geoms, which are noted.
+
+    Returns:
+        The names of the geoms and sites.
+    """
+    elements = [element for element in (*spec.geoms, *spec.sites) if _is_ignored(element.name, ignored)]
+    left_out = [element.name for element in elements]
+    for element in elements:
+        spec.delete(element)
+    for pair in spec.pairs:
+        names = pair.geomname1, pair.geomname2
+        missing = [name for name in names if name in left_out]
+        if missing:
+            notes.append(
+                f"the contact pair of {names[0]} and {names[1]} is left out, since {missing[0]} is; ignore=() keeps both"
+            )
+            spec.delete(pair)
+    return left_out
+
+
+def _without_looks(spec: Any, source: str, notes: list[str]) -> str:
     """Take textures and skins, which move nothing, from a file, and note those that are missing.
 
     Returns:
         What of them a picture would have shown: textures of meshes.
     """
     names = {texture.name or Path(texture.file).stem for texture in spec.textures}
-    folder = Path(spec.modelfiledir) / spec.texturedir
     files = [file for texture in spec.textures for file in (texture.file, *texture.cubefiles)]
-    missing = [file for file in files if file and not (folder / file).is_file()]
-    missing += [
-        skin.file
-        for skin in spec.skins
-        if skin.file and not (Path(spec.modelfiledir) / spec.meshdir / skin.file).is_file()
-    ]
+    missing = _missing(files, source, "texturedir") + _missing([skin.file for skin in spec.skins], source, "meshdir")
     textured = {material.name for material in spec.materials if any(material.textures)}
     meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
     for material in spec.materials:
@@ -102,6 +134,13 @@ def _without_looks(spec: Any, notes: list[str]) -> str:
     for element in (*spec.textures, *spec.skins):
         spec.delete(element)
     return "textures" if any(geom.material in textured for geom in meshes) else ""
+
+
+def _missing(files: Sequence[str], source: str, kind: str) -> list[str]:
+    """The files that are in none of the folders of assets, with their paths or, as ``strippath`` wants it, without."""
+    folders = [folder / inside for folder, inside in asset_folders(source, kind)] if any(files) else []
+    names = [(file, (file, file.replace("\\", "/").rpartition("/")[2])) for file in files if file]
+    return [file for file, forms in names if not any((folder / form).is_file() for folder in folders for form in forms)]
 
 
 def _set_root(spec: Any, fixed: bool, shown: str) -> None:
@@ -128,10 +167,26 @@ def _set_root(spec: Any, fixed: bool, shown: str) -> None:
             body.add_freejoint(name=name)
 
 
+_LIMITS = [
+    *((kind, limit) for kind in ("jnt", "tendon") for limit in ("", "actfrc")),
+    *(("actuator", limit) for limit in ("ctrl", "force", "act")),
+]
+"""What ``mujoco.MjModel`` limits: prefixes of its fields."""
+
+
+def _open_ranges(model: Any) -> None:
+    """Ranges that are infinite on one side get Newton's number for that, and on both sides no limit, which is the same."""
+    for kind, limit in _LIMITS:
+        ranges, limited = getattr(model, f"{kind}_{limit}range"), getattr(model, f"{kind}_{limit}limited")
+        is_open = np.isneginf(ranges[:, 0]) & np.isposinf(ranges[:, 1])
+        limited[is_open], ranges[is_open] = 0, 0.0
+        ranges[np.isneginf(ranges[:, 0]), 0] = -newton.MAXVAL
+        ranges[np.isposinf(ranges[:, 1]), 1] = newton.MAXVAL
+
+
 def _empty_ranges(model: Any) -> Iterator[str]:
     """What has a range without any values, and so no limit in MuJoCo."""
-    limits = [(kind, limit) for kind in ("jnt", "tendon") for limit in ("", "actfrc")]
-    for kind, limit in (*limits, *(("actuator", word) for word in ("ctrl", "force", "act"))):
+    for kind, limit in _LIMITS:
         ranges, limited = getattr(model, f"{kind}_{limit}range"), getattr(model, f"{kind}_{limit}limited")
         empty = np.flatnonzero((ranges[:, 0] >= ranges[:, 1]) & ranges.any(1) & (limited == 0))
         element = _KINDS[kind]
@@ -143,19 +198,19 @@ def _empty_ranges(model: Any) -> Iterator[str]:
             yield f"MuJoCo ignores an empty {limit}range: {some(names)}"
 
 
-def _compiled(spec: Any, shown: str, notes: list[str]) -> Any:
+def _compiled(spec: Any, refusal: Callable[[Exception], ValueError], notes: list[str]) -> Any:
     """Compile, and where only inertias are impossible, once more with MuJoCo's own correction, which is noted."""
     with robot_files.quiet():
         try:
             return spec.compile()
         except ValueError as error:
             if "balanceinertia" not in str(error):
-                raise ValueError(_refusal(spec, error, shown)) from error
+                raise refusal(error) from error
         spec.compiler.balanceinertia = True
         try:
             model = spec.compile()
         except ValueError as error:
-            raise ValueError(_refusal(spec, error, shown)) from error
+            raise refusal(error) from error
     for body in spec.bodies:
         moments = _moments(body)
         if body.explicitinertial and 2.0 * max(moments) > sum(moments) * (1.0 + 1e-9):
@@ -186,14 +241,19 @@ _REMEDIES = (
 """What to do, by a part of MuJoCo's message."""
 
 
-def _refusal(spec: Any, error: Exception, shown: str) -> str:
+def _refusal(spec: Any, source: str, left_out: Sequence[str], shown: str, error: Exception) -> ValueError:
     text = re.sub(r"\s+", " ", str(error)).strip().removeprefix("Error: ")
+    asset = re.search(r"^Error opening file '([^']*)'", text)
+    if asset:
+        return missing_asset(spec, source, asset.group(1), shown)
     unknown = re.search(r"unknown transmission target '([^']*)'", text)
     if unknown:
         names = [element.name for element in (*spec.joints, *spec.tendons, *spec.sites, *spec.bodies) if element.name]
-        return f"{shown}: {text}; {nearest(unknown.group(1), names)}"
+        return ValueError(f"{shown}: {text}; {nearest(unknown.group(1), names)}")
     remedy = next((f"; {words}" for part, words in _REMEDIES if part in text), "")
-    return f"{shown}: MuJoCo refuses it: {text}{remedy}"
+    if any(f"'{name}' not found" in text for name in left_out):
+        remedy = "; the robot's ignore leaves it out: give ignore=() to keep it"
+    return ValueError(f"{shown}: MuJoCo refuses it: {text}{remedy}")
 
 
 def _check_numbers(model: Any, shown: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from worker.simulation import carriers
-from worker.simulation.robot_connections import Ends, equality_ends, pair_ends, tendon_ends, wrapped_geoms
+from worker.simulation.robot_connections import Ends, effective_geoms, equality_ends, pair_ends, tendon_ends
 from worker.simulation.robot_elements import Pairs, count_of, kind_of, name_of, names_of, paired, plain, short
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
@@ -120,7 +120,7 @@ class Twins:
     def geoms(self) -> Pairs:
         """The geoms that can touch or that tendons wrap: Newton leaves out those that are only seen."""
         model, built = self.file, self.built
-        file_names, there = names_of(model, "geom", _effective(model)), _effective(built)
+        file_names, there = names_of(model, "geom", effective_geoms(model)), effective_geoms(built)
         pairs: Pairs = {}
         for body, twin in self.bodies.items():
             names = {
@@ -247,12 +247,6 @@ class Twins:
 
 ENDS: dict[str, Callable[[Any, int], Ends]] = {"tendon": tendon_ends, "equality": equality_ends, "pair": pair_ends}
 """What says the ends of an element, by its kind."""
-
-
-def _effective(model: Any) -> list[int]:
-    """The geoms that do anything: they touch by their masks or in a contact pair, or a tendon wraps them."""
-    named = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist(), *wrapped_geoms(model)}
-    return sorted(named | {int(geom) for geom in (model.geom_contype | model.geom_conaffinity).nonzero()[0]})
 
 
 def _matched(*keys: tuple[Iterable[Hashable], Iterable[Hashable]]) -> Pairs:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, mjcf, read, twins
+from worker.simulation import robot_judge
+from worker.simulation.robot_view import RobotView
 
 URDF = """<robot name="r"><link name="base"/><link name="a"><inertial><origin xyz=".5 0 0"/><mass value="1"/>
 <inertia ixx="{xx}" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -110,13 +112,71 @@ def test_a_light_with_a_texture_is_no_part_of_a_robot() -> None:
     assert not read(mjcf(f'{HINGE}{BOX}<light texture="t"/>', before=texture)).notes
 
 
-def test_flags_that_only_report_do_not_make_another_robot() -> None:
-    assert not read(mjcf(HINGE + BOX, before='<option><flag energy="enable" fwdinv="enable"/></option>')).corrected
+def test_flags_that_do_not_move_it_do_not_make_another_robot() -> None:
+    flags = '<flag energy="enable" fwdinv="enable" midphase="disable" autoreset="disable"/>'
+    assert not read(mjcf(HINGE + BOX, before=f"<option>{flags}</option>")).corrected
 
 
 def test_a_missing_height_field_is_refused() -> None:
     with pytest.raises(ValueError, match=r"its height field nope\.png is missing"):
         read(mjcf(HINGE + BOX, before='<asset><hfield name="h" file="nope.png" size="1 1 1 1"/></asset>'))
+
+
+@pytest.mark.parametrize(("density", "is_refused"), [("0", False), ("1", True)])
+def test_the_shape_of_a_geom_in_a_medium_counts_where_there_is_one(density: str, is_refused: bool) -> None:
+    """The medium acts on the axes of inertia, so that they are all different."""
+    moments = '<inertial pos="0 0 0" mass="1" diaginertia=".1 .15 .2"/>'
+    shape = BOX.replace("/>", ' fluidshape="ellipsoid"/>')
+    file = mjcf(HINGE + moments + shape, before=f'<option density="{density}"/>')
+    if not is_refused:
+        assert not read(file).corrected
+        return
+    with pytest.raises(ValueError, match=r"geom geom_0: fluid is .*Leave out fluidshape"):
+        read(file)
+
+
+@pytest.mark.parametrize(
+    ("joint", "motor", "limits"),
+    [
+        ("", 'forcerange="-inf inf"', (-np.inf, np.inf)),
+        ("", 'ctrlrange="-inf inf"', (-np.inf, np.inf)),
+        ("", 'forcerange="-inf 3"', (-np.inf, np.inf)),
+        ('range="-inf inf"', "", (-np.inf, np.inf)),
+        ('range="-inf 1"', "", (-np.inf, 1.0)),
+        ('range="-1 inf" springdamper=".1 1"', "", (-1.0, np.inf)),
+        ('actuatorfrcrange="-inf inf"', "", (-np.inf, np.inf)),
+    ],
+)
+def test_ranges_may_be_open(joint: str, motor: str, limits: tuple[float, float]) -> None:
+    reading = read(
+        mjcf(
+            f'<joint name="j" axis="0 1 0" {joint}/>{BOX}',
+            f'<actuator><motor joint="j" {motor}/></actuator>',
+            '<compiler angle="radian"/>',
+        )
+    )
+    assert RobotView(reading.builder, "").ranges == [limits] and not reading.notes
+
+
+def test_another_end_of_an_open_range_is_found() -> None:
+    files = [mjcf(f'<joint name="j" axis="0 1 0" range="-inf {end}"/>{BOX}') for end in ("1", "2")]
+    first, second = (read(file) for file in files)
+    assert second.reference is not None
+    (found,) = robot_judge.compare(second.reference.model, first.builder).differences
+    assert (found.element, found.field) == ("joint j", "range")
+
+
+@pytest.mark.parametrize(("kind", "is_lost"), [("box", True), ("sphere", False)])
+def test_margins_that_newton_leaves_out_are_noted(kind: str, is_lost: bool) -> None:
+    """Of all geoms and contact pairs where one geom is a box."""
+    geom = '<geom name="{}" type="{}" size=".1 .1 .1" pos="0 {} 0" margin="{}"/>'
+    bodies = HINGE + geom.format("g", "sphere", 1, 0.02) + f'<body name="c">{geom.format("h", kind, 2, 0)}</body>'
+    reading = read(mjcf(bodies, '<contact><pair geom1="g" geom2="h" margin=".01"/></contact>'))
+    lost = (
+        "contacts begin where geoms touch, not at the margin of the file (geom g, contact pair 0): "
+        "Newton leaves out the margins of all geoms where one is a box or, with multiccd, a mesh"
+    )
+    assert reading.notes == ((lost,) if is_lost else ())
 
 
 @pytest.mark.parametrize("fixed", [True, False])
@@ -208,6 +268,24 @@ def test_a_mimic_joint_follows() -> None:
         (
             mjcf(HINGE + BOX, before='<option density="1000"/>'),
             r"body b: axes of inertia is .*Give the body an <inertial> of three different moments",
+        ),
+        (
+            mjcf(f'<joint name="j" axis="0 1 0" actuatorfrcrange="-2 3"/>{BOX}'),
+            r"actuatorfrcrange is \(-3 3\), in the file \(-2 3\)\. Make it symmetric, or give the actuator a forcerange",
+        ),
+        (
+            mjcf(
+                HINGE + BOX,
+                '<actuator><motor joint="j"/><plugin name="act" joint="j" plugin="mujoco.pid" instance="p"/></actuator>',
+                '<extension><plugin plugin="mujoco.pid"><instance name="p"/></plugin></extension>',
+            ),
+            r"actuator act: plugin is missing, in the file there\. Leave the plugin out",
+        ),
+        (
+            mjcf(
+                f'{HINGE}{BOX}<flexcomp name="f" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2" radius=".01" mass="1"/>'
+            ),
+            r"flex f: flexible body is missing, in the file there\. Leave out the flexible body",
         ),
         ("", r"a robot needs a file"),
     ],
