@@ -9,6 +9,8 @@ from typing import TypeVar
 from shared_store.wording import nearest
 
 Value = TypeVar("Value")
+FLOORS = ("floor", "ground")
+"""Names of floors in robot files."""
 
 
 def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list[int]:
@@ -35,6 +37,16 @@ def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list
             raise ValueError(f"no {what} matches {pattern!r}; {_what_there_is(pattern, names)}")
         found |= matching
     return sorted(found)
+
+
+def check_ignored(names: Sequence[str], patterns: Iterable[str], what: str) -> None:
+    """Check the patterns of what a robot leaves out; those of floors, which it leaves out by default, need match nothing.
+
+    Raises:
+        ValueError: Another pattern matches nothing.
+    """
+    if others := [pattern for pattern in patterns if pattern not in FLOORS]:
+        find(names, others, what)
 
 
 def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str) -> list[Value | None]:

@@ -15,8 +15,7 @@ from worker.simulation import collisions as contacts
 from worker.simulation import robot_reading
 from worker.simulation.actuators import Actuator, Number
 from worker.simulation.collisions import Collision
-from worker.simulation.patterns import resolve
-from worker.simulation.robot_floor import FLOORS
+from worker.simulation.patterns import FLOORS, resolve
 from worker.simulation.robot_view import RobotView
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)

@@ -59,11 +59,14 @@ def notes(twins: Twins) -> Iterator[str]:
             f"contacts begin where geoms touch, not at the margin of the file ({some(bare)}): "
             "Newton leaves out the margins of all geoms where one is a box or, with multiccd, a mesh"
         )
-    flat = [
-        twins.name("geom", geom)
-        for geom in twins.geoms
-        if has_mask(file, geom) and word_of(mujoco.mjtGeom, file.geom_type[geom]) in FLAT
-    ]
+    kinds = [word_of(mujoco.mjtGeom, kind) for kind in file.geom_type]
+    flat = sorted(
+        {
+            twins.name("geom", geom)
+            for geom, other in np.argwhere(touching(file))
+            if kinds[geom] in FLAT and kinds[other] in (*FLAT, "box", "capsule")
+        }
+    )
     if flat and twins.built.opt.disableflags & MULTICCD and not file.opt.disableflags & MULTICCD:
         yield (
             f"where meshes and cylinders touch each other, boxes or capsules, they have one contact, in MuJoCo several ({some(flat)}); "

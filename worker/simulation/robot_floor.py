@@ -9,11 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from worker.simulation.patterns import FLOORS
 from worker.simulation.robot_elements import name_of, some, word_of
 from worker.simulation.robot_files import quiet
 
-FLOORS = ("floor", "ground")
-"""Names of floors in robot files, which a robot leaves out by default."""
 _GROUND = mujoco.MjSpec()
 _GROUND.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 1.0))
 GROUND: Any = _GROUND.compile()

@@ -23,7 +23,7 @@ from worker.simulation.robot_connections import (
     tendon_numbers,
 )
 from worker.simulation.robot_elements import count_of, kind_of, name_of, short, word_of
-from worker.simulation.robot_judge import ACTUATOR, ELSEWHERE, TENDON, Difference
+from worker.simulation.robot_judge import ACTUATOR, ELSEWHERE, SHARED, TENDON, Difference
 from worker.simulation.robot_values import effort, extent, freedoms, gravity, has_mask, inertia, matrix
 
 Values = dict[str, Any]
@@ -160,13 +160,14 @@ def _pair(model: Any, pair: int) -> Values:
 
 def _tendon(model: Any, tendon: int) -> Values:
     path = {"path": _names(model, tendon_ends(model, tendon)), "coefficients": tendon_numbers(model, tendon)}
-    return path | _fields(model, "tendon", tendon, TENDON)
+    return path | _fields(model, "tendon", tendon, " ".join((TENDON, *SHARED)))
 
 
 def _actuator(model: Any, actuator: int) -> Values:
     limits = " ".join(f"{word}range" for word in ("ctrl", "force", "act") if _is_limited(model, word, actuator))
     values = {"drives": _names(model, actuator_ends(model, actuator))}
-    values |= _fields(model, "actuator", actuator, f"{ACTUATOR} {limits}")
+    values |= _fields(model, "actuator", actuator, " ".join((ACTUATOR, *SHARED, limits)))
+    values |= {name: np.trim_zeros(values[name], "b") for name in ("gear", "gainprm", "biasprm")}
     return values | (_fields(model, "actuator", actuator, "dynprm lengthrange") if values["dyntype"] else {})
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -124,9 +124,10 @@ class AnotherRobot(ValueError):
     Args:
         file: The file's name.
         differences: What would differ.
+        accept: Patterns of differences that were accepted, and matched others, or none.
     """
 
-    def __init__(self, file: str, differences: Sequence[Difference]) -> None:
+    def __init__(self, file: str, differences: Sequence[Difference], accept: Sequence[str] = ()) -> None:
         self.differences = tuple(differences)
         first = differences[0]
         more = f", and {len(differences) - 1} more" if len(differences) > 1 else ""
@@ -135,6 +136,7 @@ class AnotherRobot(ValueError):
             f"{file} would be another robot here: {first}{more}. {REMEDIES.get(first.field, 'Change the file')}, or accept the "
             f"difference: Robot(..., accept=({pattern!r},)). For a run that was trained on it: --accept-changed-robot"
             + (f". All of them: muster robot {file} --compare" if more else "")
+            + (f". It does not match what is accepted: {', '.join(map(repr, accept))}" if accept else "")
         )
 
 
@@ -152,7 +154,7 @@ def read(source: Source) -> Reading:
     reference = robot_reference.compile_file(
         file,
         fixed=source.fixed,
-        ignored=_ignored(source),
+        ignored=source.ignore,
         shown=name,
         is_placed=source.is_placed,
         has_contacts=source.has_contacts,
@@ -178,30 +180,37 @@ def read(source: Source) -> Reading:
             notes.append(f"pictures lack the {reference.looks} of the file, since MuJoCo's compiled model has none")
     notes += found.notes
     if found.differences:
-        refusal = AnotherRobot(name, found.differences)
+        refusal = AnotherRobot(name, found.differences, source.accept)
         if not CHANGED_ROBOTS.get() or not is_readable:
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
         accepted = (*reference.notes, AS_IMPORTED.format(refusal))
         return Reading(builder, reference, corrected, accepted, identity(builder, None))
     mark_sliders(builder, found.sliders)
-    notes += [f"accepted: {each}" for each in found.accepted]
+    notes += _accepted(source, found)
     own = identity(builder, model, options=source.options, accepted=found.accepted)
     return Reading(builder, reference, corrected, tuple(notes), own)
 
 
 def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str) -> Reading:
     builder = _imported(source, file, floating)
-    found, corrected = robot_usd.judge(file.source, builder, _ignored(source), name, source.accept)
+    found, corrected = robot_usd.judge(file.source, builder, source.ignore, name, source.accept)
     notes = found.notes
     if found.differences:
-        refusal = AnotherRobot(name, found.differences)
+        refusal = AnotherRobot(name, found.differences, source.accept)
         if not CHANGED_ROBOTS.get():
             raise refusal
         builder = _imported(source, file, floating)  # as the training had it
         notes = (AS_IMPORTED.format(refusal),)
-    notes += tuple(f"accepted: {each}" for each in found.accepted)
+    notes += tuple(_accepted(source, found))
     return Reading(builder, None, corrected, notes, identity(builder, None, accepted=found.accepted))
+
+
+def _accepted(source: Source, found: Comparison) -> Iterator[str]:
+    yield from (f"accepted: {each}" for each in found.accepted)
+    for pattern in source.accept:
+        if not any(robot_judge.matches(each, (pattern,)) for each in found.accepted):
+            yield f"accept={pattern!r} matches no difference from the file"
 
 
 def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:

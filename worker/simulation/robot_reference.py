@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from shared_store.wording import nearest
 from worker.simulation import robot_files, robot_floor, robot_urdf
+from worker.simulation.patterns import check_ignored
 from worker.simulation.robot_elements import kind_of, name_of, some, word_of
 from worker.simulation.robot_files import RobotFile, asset_folders, missing_asset
 
@@ -55,13 +57,13 @@ def compile_file(
     Args:
         file: The file, whose ``spec`` is changed and compiled.
         fixed: Whether its root is fixed to the world; None: as in the file.
-        ignored: Regular expressions of the names of geoms and sites to leave out.
+        ignored: Patterns of the names of geoms and sites to leave out.
         shown: The file's name, for errors.
         is_placed: Whether the robot begins where its file puts it.
         has_contacts: Whether its geoms touch as the file says.
 
     Raises:
-        ValueError: MuJoCo refuses the file; the message names the element.
+        ValueError: MuJoCo refuses the file; the message names the element. Or a pattern matches nothing.
     """
     notes: list[str] = []
     if file.format == "urdf":
@@ -71,6 +73,9 @@ def compile_file(
     sensors = tuple((sensor.name, word_of(mujoco.mjtSensor, sensor.type)) for sensor in spec.sensors)
     for element in (*spec.sensors, *spec.keys):
         spec.delete(element)  # sensors may name places that do not exist, and poses do not fit another root
+    check_ignored(
+        [element.name for element in (*spec.geoms, *spec.sites) if element.name], ignored, f"geom or site of {shown}"
+    )
     floors = robot_floor.compiled(spec, lambda name: _is_ignored(name, ignored))
     left_out = _leave_out(spec, ignored, notes)
     looks = _without_looks(spec, file.source, notes) or looks
@@ -89,7 +94,7 @@ def compile_file(
 
 
 def _is_ignored(name: str, ignored: Sequence[str]) -> bool:
-    return any(re.match(pattern, name) for pattern in ignored)
+    return any(fnmatchcase(name, pattern) for pattern in ignored)
 
 
 def _leave_out(spec: Any, ignored: Sequence[str], notes: list[str]) -> list[str]:

@@ -6,14 +6,15 @@ Only values that the file gives are compared. Those that the builder can hold ar
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 
 import newton
 from newton.usd import PrimType, SchemaResolverMjc, SchemaResolverNewton, SchemaResolverPhysx
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from worker.simulation import robot_usd_bodies, robot_usd_joints
+from worker.simulation.patterns import check_ignored
 from worker.simulation.robot_elements import some
 from worker.simulation.robot_judge import Comparison, Difference, matches
 from worker.simulation.robot_usd_stage import RELATIVE, Stage
@@ -44,7 +45,7 @@ def judge(
     Args:
         path: The file.
         builder: Holds the robot alone, as imported, with its drives as actuators.
-        ignored: Regular expressions of the names of prims that were left out.
+        ignored: Patterns of the names of prims that were left out.
         shown: The file's name, for errors.
         accept: Patterns of differences that do not count, ``"ELEMENT: FIELD"``.
 
@@ -62,8 +63,9 @@ def judge(
     ):
         if not math.isclose(unit, 1.0, rel_tol=RELATIVE):
             raise ValueError(f"{shown}: {name} is {unit:g}; export the file in metres and kilograms ({name} = 1)")
-    every = Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
-    prims = [prim for prim in every if not any(re.match(each, prim.GetName()) for each in ignored)]
+    every = [*Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())]
+    check_ignored([prim.GetName() for prim in every], ignored, f"prim of {shown}")
+    prims = [prim for prim in every if not any(fnmatchcase(prim.GetName(), each) for each in ignored)]
     joints = [prim for prim in prims if prim.IsA(UsdPhysics.Joint)]
     if joints and not any(prim.HasAPI(UsdPhysics.ArticulationRootAPI) for prim in prims):
         raise ValueError(

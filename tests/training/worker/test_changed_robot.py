@@ -73,7 +73,7 @@ def test_what_follows_from_an_accepted_robot_does_not_refuse_the_policy(
     file.write_text(file.read_text().replace('gear="10"', 'gear="8"'))
     Policy(Store(tmp_path).run("run"), {"checkpoint": None, "accept_changed_robot": True}, 1, 1, [])
     printed = capsys.readouterr().out
-    assert "actuator slider: gear 0 10 became 8" in printed and "action 0: slider scale 10.0 became 8.0" in printed
+    assert "actuator slider: gear 10 became 8" in printed and "action 0: slider scale 10.0 became 8.0" in printed
 
 
 def test_a_model_keeps_the_robot_of_its_training_and_says_that_it_changed(trained: Run, tmp_path: Path) -> None:

@@ -263,7 +263,9 @@ def test_a_robots_file_that_is_not_text_is_named(tmp_path: Path, name: str) -> N
         def robot(self, config: SlidersConfig) -> Robot:
             return Robot(tmp_path / name)
 
-    with pytest.raises(ValueError, match=rf"{name}: the file is not text in UTF-8 \(invalid start byte at byte 128\)$"):
+    with pytest.raises(
+        ValueError, match=rf"{name}: the file is not text in UTF-8 \(invalid start byte at byte 128\); declare its enc"
+    ):
         Unreadable.sketch(SlidersConfig())
 
 

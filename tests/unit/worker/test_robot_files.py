@@ -130,3 +130,10 @@ def test_without_visuals_geoms_that_tendons_wrap_are_kept() -> None:
     )
     assert [label.rpartition("/")[2] for label in reading.builder.shape_label] == ["w", "g", "s", "t"]
     assert twins(reading).built.tendon_num.tolist() == [3]
+
+
+def test_a_pattern_to_leave_out_that_matches_nothing_is_refused_except_for_floors() -> None:
+    text = mjcf(HINGE + BOX.replace("<geom", '<geom name="trunk"') + BOX)
+    assert read(text, ignore=("floor", "ground", "tr*")).builder.shape_count == 1
+    with pytest.raises(ValueError, match=r"no geom or site of its XML matches 'trunkk'; did you mean trunk\?"):
+        read(text, ignore=("floor", "trunkk"))

@@ -116,14 +116,15 @@ def test_options_that_do_not_apply_do_not_count() -> None:
 
 
 def test_an_accepted_difference_is_shown_and_is_in_the_identity() -> None:
-    text = """<mujoco><worldbody><body name="b"><joint name="j" axis="0 1 0"/><geom size=".1" fluidshape="ellipsoid"/></body>
-</worldbody></mujoco>"""
+    text = """<mujoco><option density="1"/><worldbody><body name="b"><joint name="j" axis="0 1 0"/><inertial pos="0 0 .1" mass="1"
+diaginertia="1 2 2.5"/><geom size=".1" fluidshape="ellipsoid"/></body></worldbody></mujoco>"""
     with pytest.raises(ValueError, match="accept=") as refused:
         read(Source(text))
     pattern = str(refused.value).split("accept=('")[1].split("'")[0]
-    accepted = read(Source(text, accept=(pattern, "model: *", "geom *", "joint *")))
+    accepted = read(Source(text, accept=(pattern, "model: *", "geom *", "joint *", "arm: mass")))
     element, _, field = pattern.rpartition(": ")
     assert any(note.startswith(f"accepted: {element}: {field} is ") for note in accepted.notes)
+    assert "accept='arm: mass' matches no difference from the file" in accepted.notes
     assert field not in accepted.identity.elements[element]  # zeros of the robot that is built
     plain = read(Source(text.replace(' fluidshape="ellipsoid"', "")))
     assert accepted.identity.elements[element] == plain.identity.elements[element]
