@@ -214,7 +214,7 @@ class RobotModel(_Part):
     name: str
     """Its name in the task."""
     digest: str
-    """SHA-256 of :attr:`elements`; of a USD file, of further values of its model, too."""
+    """SHA-256 of ``elements``; of a USD file, of further values of its model, too."""
     mass: float
     """Total mass [kg]."""
     joints: int

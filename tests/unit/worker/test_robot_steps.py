@@ -136,14 +136,16 @@ SPRING = HINGE.replace("/>", ' springdamper=".1 1"/>')
 @pytest.mark.parametrize("joint", [HINGE, SPRING], ids=["as it is", "rewritten"])
 @pytest.mark.parametrize(("flag", "is_on"), [("", False), ('<option><flag multiccd="enable"/></option>', True)])
 def test_a_file_that_enables_multiccd_keeps_it_and_another_gets_a_note(joint: str, flag: str, is_on: bool) -> None:
-    reading = read(mjcf(f'{joint}<geom type="mesh" mesh="m"/>', before=flag + MESH))
+    table = '<worldbody><geom name="table" type="box" size="1 1 .1"/></worldbody>'
+    reading = read(mjcf(f'{joint}<geom name="stone" type="mesh" mesh="m"/>', table, before=flag + MESH))
     assert bool(reading.corrected) == (joint == SPRING)
     assert bool(twins(reading).built.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)) != is_on
-    assert any("enable_multiccd" in note and "geom_0" in note for note in reading.notes) != is_on
+    assert any("enable_multiccd" in note and "geom stone" in note for note in reading.notes) != is_on
 
 
-def test_a_robot_of_boxes_and_spheres_has_no_note_of_multiccd() -> None:
+def test_a_robot_without_such_contacts_has_no_note_of_multiccd() -> None:
     assert not read(mjcf(f'{HINGE}<geom type="box" size=".1 .1 .1"/><geom size=".1"/>')).notes
+    assert not read(mjcf(f'{HINGE}<geom type="mesh" mesh="m"/>', before=MESH)).notes, "it touches the ground alone"
 
 
 def test_a_force_beyond_newtons_limit_is_named() -> None:
