@@ -188,5 +188,5 @@ def test_what_cannot_be_is_refused_in_one_line(randomize: object, message: str) 
 def test_a_robot_that_is_fixed_is_not_pushed() -> None:
     with pytest.raises(ValueError, match=r"randomize.push_velocity: the robot is fixed to the world"):
         Cartpole(CartpoleConfig(randomize={"push_interval": 1.0, "push_velocity": 1.0}), 2)
-    with pytest.raises(ValueError, match=r"randomize.mas\n *Unexpected keyword argument"):
+    with pytest.raises(ValueError, match=r"^randomize.mas: Unexpected keyword argument"):
         CartpoleConfig(randomize={"mas": [1, 2]})
