@@ -185,7 +185,7 @@ def rates(home: Path) -> list[tuple[str, str]]:
 
 
 def measure(home: Path, gpus: bool) -> tuple[list[tuple[str, str]], list[Restart]]:
-    """All rows about saving, of which there are none with ``gpus``, and the restarts."""
+    """The rows about saving, and the restarts. With ``gpus`` there are no such rows."""
     (home / "muster").mkdir()
     bench = Restarts(home / "muster")
     changes = ON_GPUS if gpus else ()

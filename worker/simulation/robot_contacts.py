@@ -12,7 +12,7 @@ from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import freedoms, has_mask, touching
 
 FLAT = ("mesh", "cylinder")
-"""Geoms of which MuJoCo-Warp finds several contacts with others than planes only if ``multiccd`` is enabled."""
+"""Without ``multiccd``, MuJoCo-Warp finds one contact of such a geom with a geom that is not a plane."""
 MULTICCD = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
 
 
@@ -23,7 +23,7 @@ def lost_margin(twins: Twins, kind: str, index: int, twin: int) -> bool:
 
 
 def differing(twins: Twins) -> Iterator[tuple[tuple[int, int], bool]]:
-    """Geoms of the file of which two can touch in one model alone, and whether it is the built one."""
+    """Pairs of the file's geoms that can touch in only one of the models, and whether that is the built one."""
     geoms, others = list(twins.geoms), list(twins.geoms.values())
     theirs, mine = touching(twins.file)[np.ix_(geoms, geoms)], touching(twins.built)[np.ix_(others, others)]
     welded = twins.file.body_weldid[twins.file.geom_bodyid]

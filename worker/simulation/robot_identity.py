@@ -131,7 +131,7 @@ def _joint(model: Any, joint: int) -> Values:
         values |= _fields(model, "jnt", joint, "range margin solref solimp")
     values["actuatorfrcrange"] = effort(model, joint)
     first, count = model.jnt_dofadr[joint], freedoms(model, joint)
-    for name in ("damping", "dampingpoly", "armature", "frictionloss", "solref", "solimp"):
+    for name in (*SHARED, "frictionloss", "solref", "solimp"):
         word = {"solref": "solreffriction", "solimp": "solimpfriction"}.get(name, name)
         if word == name or model.dof_frictionloss[first]:
             values[word] = getattr(model, f"dof_{name}")[first : first + count]

@@ -141,7 +141,7 @@ def _ends(joint: ElementTree.Element, shown: str, links: list[str]) -> tuple[str
         end = joint.find(word)
         link = "" if end is None else end.get("link", "")
         if link not in links:
-            what = f"the {word} {link!r} is no link of the file" if link else f"it has no <{word} link=…>"
+            what = f"the {word} {link!r} is not a link of the file" if link else f"it has no <{word} link=…>"
             raise ValueError(f"{shown}: joint {joint.get('name')}: {what}; {nearest(link, links)}")
         found.append(link)
     return found[0], found[1]
@@ -197,7 +197,7 @@ def _check_mimics(joints: list[ElementTree.Element], shown: str, notes: list[str
             continue
         leader = mimic.get("joint", "")
         if leader not in kinds or leader == name:
-            what = "itself" if leader == name else f"{leader!r}, which is no joint of the file"
+            what = "itself" if leader == name else f"{leader!r}, which is not a joint of the file"
             others = [other for other in kinds if other != name]
             raise ValueError(f"{shown}: joint {name} mimics {what}; {nearest(leader, others)}")
         if still := [each for each in (name, leader) if kinds[each] not in FOLLOWING]:

@@ -48,7 +48,7 @@ NOTES = {
     "a height": (scene(' pos="0 0 -.5"'), (other("another height (-0.5 m)"),)),
     "a tilt": (scene(' euler="10 0 0"'), (other("another tilt (10 degrees)"),)),
     "a box": (scene(kind="box"), (other("another shape (box)"),)),
-    "less friction, of which the greater counts": (scene(' friction=".1"'), ()),
+    "less friction: the greater one counts": (scene(' friction=".1"'), ()),
     "more friction": (scene(' friction="2"'), (other("another friction (with geom g 2, here 1)"),)),
     "friction about more axes": (
         scene(' friction="2 .1" condim="4"'),
