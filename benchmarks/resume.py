@@ -27,6 +27,7 @@ from benchmarks.spine import MUSTER, REPOSITORY, Bench, seconds
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
+from shared_store.processes import find_process
 from worker.learning.saving import Saver
 from worker.learning.shards import read_file
 
@@ -90,8 +91,8 @@ class Restarts(Bench):
             assert self.detail(job)["status"] not in ("SUCCEEDED", "FAILED"), self.detail(job)["statusReason"]
             time.sleep(0.1)
 
-    def kill_and_wait(self, job: str, run: str, attempt: int) -> tuple[float, float, float, Restart]:
-        """SIGKILL rank 1 of ``attempt`` after a checkpoint; returns the times of the restart, whose start is filled in later."""
+    def kill_and_wait(self, job: str, run: str, attempt: int) -> Restart:
+        """SIGKILL rank 1 of ``attempt`` after a checkpoint, and wait for the first iteration of the next attempt."""
         self.await_line(job, attempt, r"checkpoint \d+")
         victim = rank_of(run, 1)
         killed = time.time()
@@ -100,27 +101,23 @@ class Restarts(Bench):
             time.sleep(0.01)
         decided = time.time()
         resumed = self.await_line(job, attempt + 1, "resumed from checkpoint")
+        started = start_of(rank_of(run, 0))
         first = seconds(self.await_line(job, attempt + 1, r"iteration +\d+/")["time"])
         stopped = self.detail(job)["attempts"][attempt - 1]["stoppedAt"] / 1000
         took = re.search(r" in ([\d.]+) s", resumed["text"])
         assert took is not None
-        load = float(took[1])
-        loaded = seconds(resumed["time"])
-        return stopped, loaded, load, Restart(decided - killed, stopped - decided, 0.0, 0.0, load, first - loaded)
+        load, loaded = float(took[1]), seconds(resumed["time"])
+        return Restart(
+            decided - killed, stopped - decided, started - stopped, loaded - load - started, load, first - loaded
+        )
 
     def restarts(self, *changes: str) -> list[Restart]:
         """Kill a rank of a gang of two Ants :data:`KILLS` times; ``changes`` of its spec."""
         job = self.submit(
             "train.iterations=100000", "checkpoint.every=5", f"retry.attempts={KILLS + 1}", "train.worlds=64", *changes
         )
-        run = self.home / "store" / "runs" / job["run"]
-        seen = [self.kill_and_wait(job["id"], job["run"], attempt) for attempt in range(1, KILLS + 1)]
+        found = [self.kill_and_wait(job["id"], job["run"], attempt) for attempt in range(1, KILLS + 1)]
         subprocess.run([MUSTER, "stop", job["id"]], env=self.env, check=True, capture_output=True)
-        found = []
-        for attempt, (stopped, loaded, load, restart) in enumerate(seen, 2):
-            outcome = json.loads((run / "outcomes" / job["id"] / str(attempt) / "node-0.json").read_text())
-            restart.start, restart.imports = outcome["started"] - stopped, loaded - load - outcome["started"]
-            found.append(restart)
         return found
 
     def saving(self) -> list[tuple[str, str]]:
@@ -154,6 +151,14 @@ def rank_of(run: str, rank: int) -> int:
         if f"MUSTER_RUN={run}".encode() in environment and f"RANK={rank}".encode() in environment:
             return int(entry.name)
     raise LookupError(f"no rank {rank} of run {run} runs")
+
+
+def start_of(pid: int) -> float:
+    """When a process was started (Unix time [s])."""
+    process = find_process(pid)
+    assert process is not None, f"process {pid} has ended"
+    age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(process.start) / os.sysconf("SC_CLK_TCK")
+    return time.time() - age
 
 
 def rates(home: Path) -> list[tuple[str, str]]:
