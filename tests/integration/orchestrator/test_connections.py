@@ -94,7 +94,7 @@ def test_a_burst_of_connections_leaves_descriptors_for_the_rest(tmp_path: Path) 
         assert server.process is not None
         address = httpx.URL(server.url)
         for _ in range(3):
-            server.process.send_signal(signal.SIGSTOP)  # the kernel keeps all connections until the server goes on
+            server.process.send_signal(signal.SIGSTOP)  # while it is stopped, the kernel queues the connections
             for _ in range(300):
                 connection = stack.enter_context(socket.socket())
                 connection.setblocking(False)
