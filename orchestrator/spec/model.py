@@ -324,6 +324,8 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
+    if spec.train and merged:
+        notes = [*notes, *_notes_of(spec.train)]
     spec._notes = tuple(notes)
     return spec
 
@@ -393,6 +395,18 @@ def _problem_of(train: _Train) -> _Problem | None:
     except Exception:  # a defect of somebody's class: its rank shows the traceback
         return None
     return None
+
+
+def _notes_of(train: _Train) -> list[str]:
+    """Notes on values of the task's configuration, which is valid as far as it is known here."""
+    kind = task_config(train.task)
+    if kind is None or not train.config:
+        return []
+    try:
+        found: list[str] = kind.configured(train.config).notes(train.algorithm)
+    except Exception:  # a defect of somebody's class: its rank shows the traceback
+        return []
+    return found
 
 
 def _explain(problem: Any, path: tuple[str | int, ...]) -> str:

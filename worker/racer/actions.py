@@ -15,17 +15,19 @@ STEERING = (-30.0, 30.0)
 """Least and greatest steering angle [degrees], to the left greater than 0."""
 CHOICES = (2, 30)
 """Fewest and most actions of a discrete space."""
-SPEED = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
-"""Least and greatest speed of each type of space [m/s]."""
+SPEED = (0.1, 4.0)
+"""Least and greatest speed [m/s]."""
+TYPES = ("discrete", "continuous")
+"""Of action spaces."""
 CAMERA = "FRONT_FACING_CAMERA"
+CAMERAS = (CAMERA, "STEREO_CAMERAS", "LEFT_CAMERA", "observation")
+"""DeepRacer's cameras, of which a car has one; the simulated car has the first, and the last is its name in the oldest files."""
 LIDARS = {
     "LIDAR": {"sectors": 64, "rays": 1, "levels": 0},
     "SECTOR_LIDAR": {"sectors": 8, "rays": 8, "levels": 1},
     "DISCRETIZED_SECTOR_LIDAR": {"sectors": 8, "rays": 8, "levels": 8},
 }
 """DeepRacer's lidars, and what each is of the settings of a task's ``lidar``."""
-SENSORS = {CAMERA: True, **dict.fromkeys(LIDARS, True), "STEREO_CAMERAS": False, "LEFT_CAMERA": False}
-"""DeepRacer's sensors, and whether the simulated car has them."""
 ALGORITHMS = {"ppo": "clipped_ppo", "sac": "sac"}
 """DeepRacer's names of algorithms."""
 LARGEST = 1 << 20
@@ -41,12 +43,16 @@ class ActionSpace:
         speed: Least and greatest speed [m/s].
         choices: Steering angle [degrees] and speed [m/s] of each action, in order; empty where the space is continuous.
         lidar: Name of the lidar among the sensors; None: there is none.
+        algorithm: Name of the algorithm for which the file was made, such as ``ppo``; None: it names none.
+        notes: A line for each kind of value that the simulated car does not have exactly so.
     """
 
     steering: tuple[float, float]
     speed: tuple[float, float]
     choices: tuple[tuple[float, float], ...] = ()
     lidar: str | None = None
+    algorithm: str | None = None
+    notes: tuple[str, ...] = ()
 
     def metadata(self, sensors: Sequence[str], algorithm: str) -> dict[str, Any]:
         """The content of ``model_metadata.json`` for a policy with these actions.
@@ -103,72 +109,112 @@ def read_metadata(file: Path) -> ActionSpace:
 
 
 def action_space(content: Any) -> ActionSpace:
-    """The action space of what a ``model_metadata.json`` holds. Network, algorithm and version are the job's matter and are not looked at.
+    """The action space of what a ``model_metadata.json`` holds, or of a list of actions alone, as older files have it.
+
+    Angles and speeds out of range are clipped, as DeepRacer's simulator does. Network and version are the job's matter and are not
+    looked at.
 
     Raises:
-        Refused: It has none, an action is out of range, or the car does not have a sensor.
+        Refused: It has none, a value is no number, or there is no such sensor.
     """
+    if isinstance(content, Sequence) and not isinstance(content, str):
+        content = {"action_space": content}
     if not isinstance(content, Mapping):
         raise Refused((), f"expected a mapping with action_space and action_space_type, found {shown(content)}")
-    lidar = _lidar_of(content.get("sensor", [CAMERA]))
+    lidar, cameras = _sensors(content.get("sensor", [CAMERA]))
     if "action_space" not in content:
         raise Refused((), f"action_space is missing; {nearest('action_space', list(map(str, content)))}")
     space = content["action_space"]
     usual = "continuous" if isinstance(space, Mapping) else "discrete"
-    kind = content.get("action_space_type", usual)
-    if kind not in SPEED:
-        raise Refused(("action_space_type",), f"there is no type {shown(kind)}; {nearest(str(kind), list(SPEED))}")
+    kind = _lower(content.get("action_space_type", usual))
+    if kind not in TYPES:
+        raise Refused(("action_space_type",), f"there is no type {shown(kind)}; {nearest(str(kind), list(TYPES))}")
     if kind != usual:
         found = "a list of actions" if usual == "discrete" else "a mapping of ranges"
         raise Refused(
             ("action_space_type",), f"it is {kind}, and action_space is {found if space else 'empty'}; they must fit"
         )
-    return replace(_continuous(space) if kind == "continuous" else _discrete(space), lidar=lidar)
+    found = _continuous(space) if kind == "continuous" else _discrete(space)
+    meant = _lower(content.get("training_algorithm"))
+    algorithm = next((name for name, theirs in ALGORITHMS.items() if theirs == meant), None)
+    return replace(found, lidar=lidar, algorithm=algorithm, notes=(*found.notes, *cameras))
 
 
-def _lidar_of(sensors: Any) -> str | None:
-    """The lidar among the sensors, all of which are checked."""
+def _lower(text: Any) -> Any:
+    return text.lower().strip() if isinstance(text, str) else text
+
+
+def _sensors(sensors: Any) -> tuple[str | None, list[str]]:
+    """The lidar among the sensors, all of which are checked, and a note for a camera that the simulated car does not have."""
     if isinstance(sensors, str) or not isinstance(sensors, Sequence):
-        raise Refused(("sensor",), f"expected a list such as [FRONT_FACING_CAMERA], found {shown(sensors)}")
+        raise Refused(("sensor",), f"expected a list such as [{CAMERA}], found {shown(sensors)}")
     for number, sensor in enumerate(sensors):
-        if not SENSORS.get(sensor if isinstance(sensor, str) else ""):
-            there = [name for name, has in SENSORS.items() if has]
-            what = "the simulated car does not have" if sensor in SENSORS else "DeepRacer knows no sensor"
-            raise Refused(("sensor", number), f"{what} {shown(sensor)}; use {', '.join(there)}")
-    lidars = [sensor for sensor in sensors if sensor in LIDARS]
-    if len(lidars) > 1:
-        raise Refused(("sensor",), f"a car has one lidar, and there are {' and '.join(lidars)}")
-    return lidars[0] if lidars else None
+        if not isinstance(sensor, str) or sensor not in (*CAMERAS, *LIDARS):
+            there = ", ".join((CAMERA, *LIDARS))
+            raise Refused(("sensor", number), f"DeepRacer knows no sensor {shown(sensor)}; use {there}")
+    for kind, known in (("camera", CAMERAS), ("lidar", LIDARS)):
+        several = [sensor for sensor in sensors if sensor in known]
+        if len(several) > 1:
+            raise Refused(("sensor",), f"a car has one {kind}, and there are {' and '.join(several)}")
+    cameras = [
+        f"the simulated car has one front camera in the place of {sensor}; its policy sees no depth from two images"
+        for sensor in sensors
+        if sensor in CAMERAS[1:3]
+    ]
+    return next((sensor for sensor in sensors if sensor in LIDARS), None), cameras
 
 
 def _discrete(space: Any) -> ActionSpace:
-    if isinstance(space, str) or not isinstance(space, Sequence) or not CHOICES[0] <= len(space) <= CHOICES[1]:
-        found = (
-            f"found {len(space)}"
-            if isinstance(space, Sequence) and not isinstance(space, str)
-            else f"found {shown(space)}"
-        )
+    is_list = isinstance(space, Sequence) and not isinstance(space, str)
+    if not is_list or not CHOICES[0] <= len(space) <= CHOICES[1]:
+        found = f"found {len(space)}, which AWS refuses, too" if is_list else f"found {shown(space)}"
         raise Refused(("action_space",), f"expected a list of {CHOICES[0]} to {CHOICES[1]} actions, {found}")
-    choices = []
+    asked = []
     for number, action in enumerate(space):
         where = ("action_space", number)
         _check_keys(where, action, ("steering_angle", "speed", "index"))
-        steering = _number((*where, "steering_angle"), action["steering_angle"], STEERING, "degrees")
-        choices.append((steering, _number((*where, "speed"), action["speed"], SPEED["discrete"], "m/s")))
+        asked.append(
+            (
+                _number((*where, "steering_angle"), action["steering_angle"], "degrees"),
+                _number((*where, "speed"), action["speed"], "m/s"),
+            )
+        )
+    steerings, speeds = zip(*asked, strict=True)
+    clipped = (
+        ([abs(angle) > STEERING[1] for angle in steerings], "a steering angle beyond", STEERING[1], "degrees", "steer"),
+        ([speed > SPEED[1] for speed in speeds], "a speed above", SPEED[1], "m/s", "drive"),
+        ([speed < SPEED[0] for speed in speeds], "a speed below", SPEED[0], "m/s", "drive"),
+    )
+    notes = tuple(
+        f"1 action has {what} {limit:g} {unit} and {does}s {limit:g}"
+        if sum(which) == 1
+        else f"{sum(which)} actions have {what} {limit:g} {unit} and {does} {limit:g}"
+        for which, what, limit, unit, does in clipped
+        if any(which)
+    )
+    choices = tuple((_clipped(angle, STEERING), _clipped(speed, SPEED)) for angle, speed in asked)
     steerings, speeds = zip(*choices, strict=True)
-    return ActionSpace((min(steerings), max(steerings)), (min(speeds), max(speeds)), tuple(choices))
+    return ActionSpace((min(steerings), max(steerings)), (min(speeds), max(speeds)), choices, notes=notes)
 
 
 def _continuous(space: Any) -> ActionSpace:
     _check_keys(("action_space",), space, ("steering_angle", "speed"))
-    steering = _range("steering_angle", space["steering_angle"], STEERING, "degrees")
-    return ActionSpace(steering, _range("speed", space["speed"], SPEED["continuous"], "m/s"))
+    notes: list[str] = []
+    steering = _range("steering_angle", space["steering_angle"], STEERING, "degrees", notes)
+    return ActionSpace(steering, _range("speed", space["speed"], SPEED, "m/s", notes), notes=tuple(notes))
 
 
-def _range(name: str, ends: Any, limits: tuple[float, float], unit: str) -> tuple[float, float]:
+def _range(name: str, ends: Any, limits: tuple[float, float], unit: str, notes: list[str]) -> tuple[float, float]:
+    """The ends within the limits, with a note for one that is clipped."""
     where = ("action_space", name)
     _check_keys(where, ends, ("low", "high"))
-    low, high = (_number((*where, end), ends[end], limits, unit) for end in ("low", "high"))
+    clipped = []
+    for end in ("low", "high"):
+        asked = _number((*where, end), ends[end], unit)
+        clipped.append(_clipped(asked, limits))
+        if clipped[-1] != asked:
+            notes.append(f"{name}.{end} is {asked:g} {unit}, out of the car's range, and becomes {clipped[-1]:g}")
+    low, high = clipped
     if low >= high:
         raise Refused(where, f"low is {low:g} and high is {high:g}; low must be less")
     return low, high
@@ -186,11 +232,15 @@ def _check_keys(where: tuple[str | int, ...], value: Any, keys: Sequence[str]) -
             raise Refused(where, f"{key} is missing")
 
 
-def _number(where: tuple[str | int, ...], value: Any, limits: tuple[float, float], unit: str) -> float:
+def _number(where: tuple[str | int, ...], value: Any, unit: str) -> float:
     try:  # exported files have numbers as texts, too
         number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not limits[0] <= number <= limits[1]:
-        raise Refused(where, f"expected a number from {limits[0]:g} to {limits[1]:g} [{unit}], found {shown(value)}")
+    if not math.isfinite(number):
+        raise Refused(where, f"expected a number [{unit}], found {shown(value)}")
     return number
+
+
+def _clipped(number: float, limits: tuple[float, float]) -> float:
+    return min(max(number, limits[0]), limits[1])

@@ -67,7 +67,7 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
         The section, and a note for each hyperparameter that is not meant, or not done, exactly so.
 
     Raises:
-        Refused: One of them is unknown, out of range, or given as a setting, too.
+        Refused: One of them is misspelt, out of range, or given as a setting, too.
     """
     where, given = "hyperparameters", train["hyperparameters"]
     if not isinstance(given, Mapping):
@@ -107,7 +107,9 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
 def _checked(where: str, name: str, value: Any) -> Any:
     if name not in KNOWN:
         near = difflib.get_close_matches(name, _ALSO, n=1, cutoff=0.8)
-        meant = f"did you mean {_ALSO[near[0]]}?" if near else nearest(name, list(KNOWN))
+        meant = f"did you mean {_ALSO[near[0]]}?" if near else nearest(name, list(KNOWN), _UNKNOWN)
+        if meant == _UNKNOWN:
+            return value
         raise Refused((where, name), f"DeepRacer has no such hyperparameter; {meant}")
     try:
         return KNOWN[name].check(value)
@@ -116,7 +118,7 @@ def _checked(where: str, name: str, value: Any) -> Any:
 
 
 def _meaning(name: str, value: Any, job: Job) -> Meaning:
-    meaning = KNOWN[name].meaning
+    meaning = KNOWN[name].meaning if name in KNOWN else _UNKNOWN
     return ({}, meaning) if isinstance(meaning, str) else meaning(value, job)
 
 
@@ -226,6 +228,11 @@ def _num_episodes(value: int, job: Job) -> Meaning:
 def _exploration_type(value: str, job: Job) -> Meaning:
     if value == "e-greedy":
         raise ValueError("ppo and sac draw actions from the policy itself; use categorical")
+    if value == "additive noise" and job.algorithm == "ppo":
+        return (
+            {},
+            "it is that of SAC, and ppo draws actions from the policy itself; a file of SAC wants train.algorithm: sac",
+        )
     return {}, ""
 
 
@@ -246,6 +253,7 @@ def _sac_alpha(value: float, job: Job) -> Meaning:
 
 
 _ENDS = "it ends no training; train.iterations says how long it is"
+_UNKNOWN = "it changes nothing, as on AWS, which does not know it"
 _GREEDY = "it is not used without e-greedy exploration"
 
 _ALSO = {
@@ -265,7 +273,7 @@ KNOWN: Mapping[str, Hyperparameter] = {
     "beta_entropy": Hyperparameter(_number(0, 1), _beta_entropy),
     "loss_type": Hyperparameter(_one_of("huber", "mean squared error"), _loss_type),
     "num_episodes_between_training": Hyperparameter(_whole(1, 100), _num_episodes),
-    "exploration_type": Hyperparameter(_one_of("categorical", "e-greedy"), _exploration_type),
+    "exploration_type": Hyperparameter(_one_of("categorical", "e-greedy", "additive noise"), _exploration_type),
     "e_greedy_value": Hyperparameter(_number(0, 1), _GREEDY),
     "epsilon_steps": Hyperparameter(_whole(0, math.inf), _GREEDY),
     "stack_size": Hyperparameter(_whole(1, 16), _stack_size),

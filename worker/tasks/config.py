@@ -246,6 +246,14 @@ class TaskConfig(_Common):
         """
         raise Refused(("hyperparameters",), f"{cls.__name__} has none; settings of PPO stand under train.ppo")
 
+    def notes(self, algorithm: str) -> list[str]:
+        """A line for each value that is taken but not meant, or not done, exactly so; told at the submission.
+
+        Args:
+            algorithm: Name of the algorithm that trains.
+        """
+        return []
+
     @property
     def has_other_rewards(self) -> bool:
         """Whether :attr:`other_rewards` are the task's reward terms; no, by default."""

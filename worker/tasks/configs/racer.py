@@ -119,14 +119,16 @@ class RacerConfig(TaskConfig):
     """Simulated time after which the clock ends an episode [s]."""
     track: TrackName | Annotated[tuple[TrackName, ...], Field(strict=False, min_length=1, max_length=64)] = "oval"
     """A preset, ``random:SEED``, or a track of the store; of several, world w drives number w modulo their count."""
-    action_space: str | Mapping[str, Any] = field(
+    action_space: Annotated[
+        str | Mapping[str, Any] | list[Any], expecting("the path or the content of a model_metadata.json")
+    ] = field(
         default_factory=lambda: {
             "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}},
             "action_space_type": "continuous",
         },
         metadata=kept_file("json"),
     )
-    """Contents or path of a ``model_metadata.json``; steering in degrees, speed in m/s."""
+    """Contents or path of a ``model_metadata.json``, or the list of actions alone; steering in degrees, speed in m/s."""
     reward_function: Annotated[
         Annotated[RewardFile | str | None, expecting("the path of a reward function")], from_mapping(RewardFile)
     ] = field(default=None, metadata=kept_file("text", check="worker.racer.rewards", needs=("numpy", "scipy")))
@@ -240,6 +242,15 @@ class RacerConfig(TaskConfig):
     def plain_settings(cls, train: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         """As :meth:`TaskConfig.plain_settings`, of DeepRacer's hyperparameters."""
         return plain_settings(train, cls())
+
+    def notes(self, algorithm: str) -> list[str]:
+        """As :meth:`TaskConfig.notes`, of an action space that the simulated car does not have exactly so."""
+        if isinstance(self.action_space, str):
+            return []
+        space = self.actions()
+        other = space.algorithm not in (None, algorithm)
+        meant = [f"its training_algorithm is {space.algorithm}, and train.algorithm is {algorithm}"] if other else []
+        return [f"action_space: {note}" for note in (*space.notes, *meant)]
 
     @property
     def chooses(self) -> bool:

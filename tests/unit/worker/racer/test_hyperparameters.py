@@ -60,6 +60,25 @@ def test_a_usual_file_becomes_settings_of_sac() -> None:
     assert spec.train.given() == {"batch_size": 64, "gamma": 0.99, "init_temperature": 0.2, **rates}
 
 
+OF_SAC = {
+    **{"lr": 0.0003, "discount_factor": 0.999, "batch_size": 64, "loss_type": "mean squared error"},
+    **{"exploration_type": "additive_noise", "sac_alpha": 0.2},
+}
+"""A file of a SAC model, as AWS's console exported it."""
+
+
+def test_a_file_of_sac_is_taken_and_noted_where_ppo_trains() -> None:
+    spec = job({**OF_SAC, "e_greedy_value": 0.05, "stack_size": 1, "pretrained": "false"}, algorithm="sac")
+    rates = dict.fromkeys(("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate"), 0.0003)
+    assert spec.train is not None
+    assert spec.train.given() == {"batch_size": 64, "gamma": 0.999, "init_temperature": 0.2, **rates}
+    assert [note for note in spec.notes if "exploration_type" in note] == []
+    assert "hyperparameters.pretrained false: it changes nothing, as on AWS, which does not know it" in spec.notes
+    notes = job(OF_SAC).notes
+    assert any(note.startswith("hyperparameters.sac_alpha 0.2: it is not used by ppo") for note in notes)
+    assert any(note.endswith("a file of SAC wants train.algorithm: sac") for note in notes)
+
+
 @pytest.mark.parametrize(
     ("worlds", "episodes", "batch", "steps", "minibatches"),
     [

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from orchestrator.spec.model import validate
 from shared_store.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, counted, known, racer, straight
@@ -177,18 +178,26 @@ def space(actions: Any, **more: Any) -> dict[str, Any]:
 STILL, SPEEDS, LOW = {"steering_angle": 0, "speed": 1}, {"low": 1, "high": 2}, "config.action_space.action_space"
 LEFT, TURNING = {"distance": 1.0, "lane": "left"}, {"steering_angle": {"low": 9, "high": 9}}
 REFUSED: dict[str, dict[str, Any]] = {
-    f"{LOW}.1.speed: expected a number from 0.1 to 4 [m/s], found 5": space([STILL, {**STILL, "speed": 5}]),
-    f"{LOW}: expected a list of 2 to 30 actions, found 1": space([STILL]),
-    f"{LOW}.steering_angle.low: expected a number from -30 to 30 [degrees], found -45": space(
-        {"steering_angle": {"low": -45, "high": 30}, "speed": SPEEDS}
+    f"{LOW}.1.speed: expected a number [m/s], found 'fast'": space([STILL, {**STILL, "speed": "fast"}]),
+    f"{LOW}.0.steering_angle: expected a number [degrees], found inf": space(
+        [{**STILL, "steering_angle": math.inf}] * 2
     ),
+    f"{LOW}: expected a list of 2 to 30 actions, found 1, which AWS refuses, too": space([STILL]),
+    f"{LOW}: expected a list of 2 to 30 actions, found 31, which AWS refuses, too": {"action_space": [STILL] * 31},
+    f"{LOW}.speed: low is 4 and high is 4; low must be less": space(
+        {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 5, "high": 6}}
+    ),
+    "config.action_space: expected the path or the content of a model_metadata.json, found 5": {"action_space": 5},
     f"{LOW}.steering_angle: low is 9 and high is 9; low must be less": space({**TURNING, "speed": SPEEDS}),
     f"{LOW}_type: there is no type 'discreet'; did you mean discrete?": space(FIVE, action_space_type="discreet"),
     f"{LOW}_type: it is continuous, and action_space is a list of actions; they must fit": space(
         FIVE, action_space_type="continuous"
     ),
-    "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA, LIDAR, "
-    "SECTOR_LIDAR, DISCRETIZED_SECTOR_LIDAR": space(FIVE, sensor=["STEREO_CAMERAS"]),
+    "config.action_space.sensor.0: DeepRacer knows no sensor 'RADAR'; use FRONT_FACING_CAMERA, LIDAR, SECTOR_LIDAR, "
+    "DISCRETIZED_SECTOR_LIDAR": space(FIVE, sensor=["RADAR"]),
+    "config.action_space.sensor: a car has one camera, and there are STEREO_CAMERAS and LEFT_CAMERA": space(
+        FIVE, sensor=["STEREO_CAMERAS", "LEFT_CAMERA"]
+    ),
     f"{LOW}.0: there is no key 'steering'; did you mean steering_angle?": space([{"steering": 0, "speed": 1}] * 2),
     "config.obstacles.0.lane: expected 'inner', 'center' or 'outer', found 'left'": {"obstacles": [LEFT]},
     "config.randomize.mass: the car moves as a kinematic bicycle, without an engine's contacts; use "
@@ -202,6 +211,47 @@ REFUSED: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("message", REFUSED)
 def test_an_impossible_car_is_refused_in_one_line_before_anything_is_built(message: str) -> None:
     assert refusal(configure, Racer, {"config": REFUSED[message]}, error=UserError).removeprefix("train.") == message
+
+
+def noted(space: Any, algorithm: str = "ppo") -> list[str]:
+    train = {"task": "Racer", "worlds": 8, "iterations": 1, "algorithm": algorithm, "config": {"action_space": space}}
+    return list(validate({"name": "racer", "train": train}, "racer.yaml").notes)
+
+
+def test_actions_out_of_the_car_s_range_are_clipped_as_aws_s_simulator_does_with_a_note_for_each_kind() -> None:
+    wild = [(45, 5), (-30, "8"), (0, 0.05), ("-31.5", 4), (30, 0.1)]
+    asked = [{"steering_angle": angle, "speed": speed, "index": number} for number, (angle, speed) in enumerate(wild)]
+    clipped = ((30.0, 4.0), (-30.0, 4.0), (0.0, 0.1), (-30.0, 4.0), (30.0, 0.1))
+    for content in (asked, {"action_space": asked}):  # older files hold the list alone
+        config = RacerConfig(action_space=content)
+        assert config.actions().choices == clipped
+        assert noted(content) == [
+            "action_space: 2 actions have a steering angle beyond 30 degrees and steer 30",
+            "action_space: 2 actions have a speed above 4 m/s and drive 4",
+            "action_space: 1 action has a speed below 0.1 m/s and drives 0.1",
+        ]
+    kept = Racer.sketch(config).bundle_documents("ppo")["model_metadata.json"]["action_space"]
+    assert tuple((action["steering_angle"], action["speed"]) for action in kept) == clipped
+    ranges = {"steering_angle": {"low": "-45", "high": 30}, "speed": {"low": 0.1, "high": 9}}
+    space = RacerConfig(action_space={"action_space": ranges}).actions()
+    assert (space.steering, space.speed) == ((-30.0, 30.0), (0.1, 4.0))
+    assert noted({"action_space": ranges}) == [
+        "action_space: steering_angle.low is -45 degrees, out of the car's range, and becomes -30",
+        "action_space: speed.high is 9 m/s, out of the car's range, and becomes 4",
+    ]
+    assert noted(DISCRETE) == []
+
+
+def test_a_camera_or_an_algorithm_of_a_metadata_file_that_the_job_does_not_have_is_noted() -> None:
+    for sensor in ("STEREO_CAMERAS", "LEFT_CAMERA"):
+        assert noted({**DISCRETE, "sensor": ["LIDAR", sensor]}) == [
+            f"action_space: the simulated car has one front camera in the place of {sensor}; its policy sees no depth from two images"
+        ]
+        config = RacerConfig(action_space={**DISCRETE, "sensor": ["LIDAR", sensor]})
+        assert Racer.sketch(config).bundle_documents("ppo")["model_metadata.json"]["sensor"] == ["LIDAR"]
+    sac = {"action_space": {"steering_angle": {"low": -9, "high": 9}, "speed": SPEEDS}, "training_algorithm": " SAC "}
+    assert noted(sac, "sac") == noted({**sac, "training_algorithm": "clipped_ppo"}) == []
+    assert noted(sac) == ["action_space: its training_algorithm is sac, and train.algorithm is ppo"]
 
 
 def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) -> None:
