@@ -96,7 +96,7 @@ def main(kind: str = "evaluate") -> int:
         if not laps:
             print(result, flush=True)
         known = {"keep": job.section.get("keep", True), **_circumstances(facts)}
-        driven = laps.race(played, rules_of(job.section), seed) if laps else None
+        driven = laps.race(played, rules_of(job.section), seed, facts) if laps else None
         summary = result.write(run, job.id, driven, iteration=checkpoint.iteration, config=changes, **known)
         print("\n".join(lines(summary)), flush=True)
         print(f"written: {run.evaluations / summary['table']} and .json", flush=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import warp as wp
 
 from shared_store.files import write_atomic
 from shared_store.races import SIM_TRACE
-from worker.racer.resets import MISHAPS
+from worker.racer.sim_trace import CONTINUOUS, SIM_TRACE_COLUMNS, model_documents, sim_trace, write_documents
 from worker.racer.trace import COLUMNS
 from worker.simulation.capture import on_torch_stream
 
@@ -22,17 +22,9 @@ if TYPE_CHECKING:
     from worker.evaluation.episodes import Episodes
     from worker.tasks.racer import Racer
 
-SIM_TRACE_COLUMNS = (
-    *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done", "all_wheels_on_track"),
-    *("progress", "closest_waypoint", "track_len", "tstamp", "episode_status", "pause_duration"),
-    *("obstacle_crash_counter", "wall_clock"),
-)
-"""Of a SimTrace file, as DeepRacer's community reads it."""
 COMPLETE = "lap_complete"
 _CALLED = {"off_tracks": "off_track", "crashes": "crashed", "immobilized": "immobilized", "reversed": "reversed"}
 """A trial's names for the counts of mishaps."""
-_STATUS = {"time_out": "time_up"}
-"""SimTrace's names of ends where they differ from ours."""
 
 
 @dataclass(frozen=True)
@@ -77,30 +69,16 @@ class Trial:
         }
 
     def sim_trace(self, episode: int) -> Iterator[str]:
-        """The lines of its SimTrace file; where the car is is said of its front, angles are in degrees.
-
-        The first row, ``prepare``, is the car at the start: tools count steps and time from there.
-        """
+        """The lines of its SimTrace file, see :func:`worker.racer.sim_trace.sim_trace`."""
         yield ",".join(SIM_TRACE_COLUMNS)
-        before = [0.0] * len(MISHAPS)
-        for number, row in enumerate([self.start.tolist(), *self.steps.tolist()]):
-            told = dict(zip((*COLUMNS, "reward", "action"), row, strict=True))
-            counts = [told[name] for name in MISHAPS]
-            status = next((name for name, now, then in zip(MISHAPS, counts, before, strict=True) if now > then), "")
-            before = counts
-            status = status or ("in_progress" if number else "prepare")
-            if done := number == len(self.steps):
-                status = _STATUS.get(self.status, self.status)
-            yield ",".join(
-                (
-                    *(f"{episode}", f"{number}", f"{told['x']:.4f}", f"{told['y']:.4f}"),
-                    *(f"{math.degrees(told['heading']):.4f}", f"{math.degrees(told['steering']):.2f}"),
-                    *(f"{told['speed']:.2f}", f"{told['action']:.0f}", f"{told['reward']:.4f}", f"{done}"),
-                    *(f"{told['wheels'] == 4}", f"{told['progress']:.4f}", f"{told['waypoint']:.0f}"),
-                    *(f"{self.length:.2f}", f"{number / self.control_hz:.3f}", status, "0.00"),
-                    *(f"{told['crashed']:.0f}", f"{self.clocks[max(0, number - 1)]:.3f}"),
-                )
-            )
+        yield from sim_trace(
+            [self.start.tolist(), *self.steps.tolist()],
+            self.clocks,
+            self.status,
+            episode=episode,
+            length=self.length,
+            control_hz=self.control_hz,
+        )
 
 
 @dataclass(frozen=True)
@@ -112,12 +90,14 @@ class Race:
         rules: See :func:`shared_store.races.rules_of`.
         directions: In which each track is driven, by its name.
         seed: Of the worlds.
+        documents: Files about the model, see :func:`worker.racer.sim_trace.model_documents`.
     """
 
     trials: Sequence[Trial]
     rules: Mapping[str, Any]
     directions: Mapping[str, str]
     seed: int
+    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """As JSON values. Best, average and total are of complete laps with their penalties; there is a total where all are complete."""
@@ -142,7 +122,8 @@ class Race:
         return {name: [trial[name] for trial in trials] for name in trials[0] if name != "seed"}
 
     def write_sim_traces(self, evaluation: Path) -> None:
-        """Write a SimTrace file for each trial below the directory of an evaluation, in the layout that log tools look for.
+        """Write a SimTrace file for each trial below the directory of an evaluation, in the layout that log tools look for, and what
+        they look for beside them.
 
         Raises OSError.
         """
@@ -151,6 +132,7 @@ class Race:
         for episode, trial in enumerate(self.trials):
             text = "\n".join(trial.sim_trace(episode)) + "\n"
             write_atomic(folder / f"{episode}-iteration.csv", text.encode())
+        write_documents(evaluation, self.documents)
 
 
 class Laps:
@@ -174,18 +156,21 @@ class Laps:
     def note(self, running: torch.Tensor) -> None:
         """Keep the last control step of the worlds whose trial had not ended before it, shape ``(worlds,)``, bool."""
         task = self._task
-        action = task.actions if task.discrete else torch.full_like(task.rewards, -1.0)[:, None]
+        action = task.actions if task.discrete else torch.full_like(task.rewards, CONTINUOUS)[:, None]
         rows = torch.cat([self._trace, task.rewards[:, None], action], 1)
         worlds = running.nonzero()[:, 0]
         self._noted.append((time.time(), worlds.cpu(), rows[worlds].cpu()))
 
-    def race(self, played: Episodes, rules: Mapping[str, Any], seed: int) -> Race:
+    def race(
+        self, played: Episodes, rules: Mapping[str, Any], seed: int, facts: Mapping[str, Any] | None = None
+    ) -> Race:
         """The race that these trials were.
 
         Args:
             played: How each ended.
             rules: Of the race.
             seed: Of the worlds.
+            facts: The checkpoint's manifest, for the files about the model; None: there are none.
         """
         steps: list[list[torch.Tensor]] = [[] for _ in self._tracks]
         clocks: list[list[float]] = [[] for _ in self._tracks]
@@ -200,4 +185,9 @@ class Laps:
                 self._starts, steps, clocks, played.ends, self._tracks, strict=True
             )
         ]
-        return Race(trials, rules, {track.name: track.direction for track in self._tracks}, seed)
+        directions = {track.name: track.direction for track in self._tracks}
+        documents = {}
+        if facts is not None:
+            trained = facts["algorithm"], facts["settings"], facts["train"].get("worlds", 1)
+            documents = model_documents(self._task, *trained)
+        return Race(trials, rules, directions, seed, documents)

@@ -10,7 +10,7 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.outcomes import EX_TEMPFAIL
 from shared_store.wording import counted
 from worker.distributed import Gang
-from worker.errors import TrainingError
+from worker.errors import TrainingError, UserError
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
@@ -45,6 +45,7 @@ from worker.tasks.config import value_at
 from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
+    from worker.tasks.step_log import StepLog
     from worker.tasks.task import Task
 
 
@@ -86,6 +87,7 @@ class Loop:
         """Checkpoint with a clone's initial weights; None for a run that began with new ones, or has a checkpoint of its own."""
         if gang.is_main:
             write_contract(job, facts["contract"])
+        self.step_log = self._step_log(facts) if gang.is_main else None
         self.task.clear_statistics()
         self.iterated = 0
         """Iterations that this process has done."""
@@ -110,6 +112,13 @@ class Loop:
         made = build_algorithm(training.algorithm_type, training.settings, task, self.share, gang, training.seed)
         check_state(made, training.algorithm)
         return task, made
+
+    def _step_log(self, facts: dict[str, Any]) -> StepLog | None:
+        """The task's log of control steps. Raises UserError if the store does not take it."""
+        try:
+            return self.task.step_log(self.job.run, self.algorithm.steps, self.state.progress.iteration, facts)
+        except OSError as error:
+            raise UserError(f"{error.filename or self.job.run.path}: {error.strerror or error}") from None
 
     def _begin_run(self, facts: dict[str, Any]) -> Checkpoint | None:
         """Start a run for the first time; returns a clone's checkpoint with the initial weights."""
@@ -199,6 +208,8 @@ class Loop:
     def _order(self, *, wait: bool = False) -> None:
         """Order a checkpoint of the state after the last whole iteration."""
         scheduled, self._order_is_due, self._is_scheduled = self._is_scheduled, False, False
+        if self.step_log:  # before the checkpoint that needs it
+            self.reporter.do(self.fence.guard, self.step_log.keep, self.state.progress.iteration)
         self.state.save(self.reporter if self.gang.is_main else None, wait=wait, scheduled=scheduled)
         self._stall_seconds = self.state.saver.stall
 
@@ -227,7 +238,11 @@ class Loop:
         self._stopwatch.start()
         algorithm.begin(progress.iteration)
         self._begin_iteration(progress.iteration)
+        if self.step_log:
+            self.step_log.begin()
         self._collecting()
+        if self.step_log:
+            self.step_log.copy()
         self._stopwatch.mark()
         self._exchange.gather(self._stopwatch.collect, self._signals())
         metrics = algorithm.learn(self._observations)
@@ -241,6 +256,8 @@ class Loop:
             self.state.copy(progress.iteration + 1)
         # the one transfer of the iteration: from here on the host knows
         learnt, totals = self._exchange.read(metrics)
+        if self.step_log:
+            self.reporter.do(self.fence.guard, self.step_log.write, progress.iteration, self.step_log.taken())
         if self._collecting.can_be_captured:
             self.gate.shut()
         signals = {name: totals[name][0] for name in SIGNALS}

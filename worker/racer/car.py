@@ -101,7 +101,7 @@ class Cars:
         put_back: How far behind where it was [m].
         max_resets: How often in an episode; the next time it ends.
         stuck_steps: Control steps in a row of standing, or of coming back, after which a car does not go on.
-        traced: Whether :mod:`worker.racer.trace` notes each control step.
+        traced: How many cars, from the first, :mod:`worker.racer.trace` notes in each control step; all at most.
     """
 
     circuit: Circuit
@@ -113,7 +113,7 @@ class Cars:
     put_back: float = 1.0
     max_resets: int = 100
     stuck_steps: int = 15
-    traced: bool = False
+    traced: int = 0
     arrays_type: ClassVar[Any] = CarArrays
     meaning: ClassVar[str] = "Cars"
     """The car's part of a policy's contract: its measurements are the same on every track."""
@@ -154,8 +154,8 @@ class Driving:
         for name, kind in kinds.items():
             setattr(arrays, name, wp.zeros(self._count, dtype=kind, device=device))
         arrays.counts = wp.zeros((self._count, len(COUNTS)), dtype=wp.int32, device=device)
-        self._traced = declared.traced
-        arrays.trace = wp.zeros((self._count if self._traced else 0, len(COLUMNS)), dtype=wp.float32, device=device)
+        self._traced = min(declared.traced, self._count)
+        arrays.trace = wp.zeros((self._traced, len(COLUMNS)), dtype=wp.float32, device=device)
         self._lasting = (*LASTING, "counts") if declared.continuous else LASTING
         rules = ResetRules()
         rules.continuous, rules.put_back = declared.continuous, declared.put_back
@@ -176,7 +176,7 @@ class Driving:
 
     def note(self) -> None:
         """Write what is known of the cars now into ``arrays.trace``."""
-        wp.launch(_trace, dim=self._count, inputs=[self.arrays], device=self._device)
+        wp.launch(_trace, dim=self._traced, inputs=[self.arrays], device=self._device)
 
     def settle(self) -> None:
         """Updates the places of the cars that were put down or back."""

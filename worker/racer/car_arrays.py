@@ -88,8 +88,8 @@ class CarArrays:
         put_poses: Where to, where ``put``: as ``poses``, shape ``(worlds,)``.
         set_back: How much of its way along the centre line it loses by that [m], shape ``(worlds,)``.
         counts: How often what happened in the episode, see :data:`worker.racer.resets.COUNTS`; shape ``(worlds, 5)``.
-        trace: The last control step as race results have it, see :data:`worker.racer.trace.COLUMNS`; shape ``(worlds, 13)``, without
-            rows where nobody asked for it.
+        trace: The last control step as race results have it, see :data:`worker.racer.trace.COLUMNS`; shape ``(traced, 13)``: of the
+            first cars, as many as were asked for.
     """
 
     road: RoadArrays

@@ -104,6 +104,39 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
     return plain, notes
 
 
+def deepracer_names(algorithm: str, settings: Mapping[str, Any], worlds: int, frames: int) -> dict[str, Any]:
+    """The settings of a training that DeepRacer has, under its names; of another algorithm than ``ppo`` and ``sac`` none.
+
+    Args:
+        algorithm: Its name.
+        settings: All of its settings.
+        worlds: Of each rank.
+        frames: Images of one observation.
+    """
+    if algorithm not in ("ppo", "sac"):
+        return {}
+    alike = {
+        "discount_factor": settings["gamma"],
+        "loss_type": "mean squared error",
+        "num_episodes_between_training": max(1, round(settings["steps"] * worlds / EPISODE)),
+        "stack_size": frames,
+    }
+    if algorithm == "sac":
+        return alike | {
+            "batch_size": settings["batch_size"],
+            "exploration_type": "additive_noise",
+            "lr": settings["actor_learning_rate"],
+            "sac_alpha": settings["init_temperature"],
+        }
+    return alike | {
+        "batch_size": settings["steps"] * worlds // settings["minibatches"],
+        "beta_entropy": settings["entropy_coef"],
+        "exploration_type": "categorical",
+        "lr": settings["learning_rate"],
+        "num_epochs": settings["epochs"],
+    }
+
+
 def _checked(where: str, name: str, value: Any) -> Any:
     if name not in KNOWN:
         near = difflib.get_close_matches(name, _ALSO, n=1, cutoff=0.8)

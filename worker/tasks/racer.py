@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import newton
 import torch
 import warp as wp
 
-from shared_store.layout import Store
+from shared_store.layout import Run, Store
 from shared_store.policy_contract import Target
 from worker.racer import resets
 from worker.racer import terms as racing
@@ -24,7 +25,9 @@ from worker.racer.naming import resolve
 from worker.racer.reward_inputs import RewardInputs
 from worker.racer.rewards.kept import reward_file
 from worker.racer.scenery import CAR, add_scenery
+from worker.racer.sim_trace import model_documents
 from worker.racer.track import Track
+from worker.racer.training_trace import TrainingTrace
 from worker.simulation.capture import on_torch_stream
 from worker.simulation.robot import Robot
 from worker.simulation.sensors.camera import CameraSensor
@@ -43,6 +46,7 @@ from worker.tasks.declaration import (
 )
 from worker.tasks.declared import DeclaredTask
 from worker.tasks.overrides import Refused
+from worker.tasks.step_log import StepLog
 
 
 class Racer(DeclaredTask):
@@ -173,6 +177,18 @@ class Racer(DeclaredTask):
             sensors.append(("LIDAR", "SECTOR_LIDAR", "DISCRETIZED_SECTOR_LIDAR")[min(self.lidar.levels, 2)])
         return {"model_metadata.json": self.actions_of_car.metadata(sensors, algorithm)}
 
+    @staticmethod
+    def traced_of(config: RacerConfig) -> int:
+        """How many cars are noted in each control step: in a race all of them."""
+        return sys.maxsize if config.trace else config.sim_trace
+
+    def step_log(self, run: Run, steps: int, iteration: int, facts: Mapping[str, Any]) -> StepLog | None:
+        """As :meth:`Task.step_log`: SimTrace files of the first cars, if the configuration asks for them."""
+        if not self.config.sim_trace:
+            return None
+        documents = model_documents(self, facts["algorithm"], facts["settings"], facts["train"].get("worlds", 1))
+        return TrainingTrace(run, self, steps, iteration, documents)
+
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """The policy's observations."""
         return {**self.road_terms(config), **self.lidar_term()}
@@ -202,7 +218,7 @@ class Racer(DeclaredTask):
             config.put_back,
             config.max_resets,
             config.stuck_steps,
-            config.trace,
+            self.traced_of(config),
         )
         return {"car": cars, **({"race": self.race} if self.race else {})}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import newton
 import torch
@@ -34,6 +34,10 @@ from worker.tasks.ended import Ended
 from worker.tasks.interface import Interface
 from worker.tasks.saved import check_state, completed
 from worker.tasks.telling import Telling
+
+if TYPE_CHECKING:
+    from shared_store.layout import Run
+    from worker.tasks.step_log import StepLog
 
 
 class Task(Telling):
@@ -170,6 +174,7 @@ class Task(Telling):
             self._begin()
             for _, part in self._parts():  # Load every kernel; not every platform can load one during a capture.
                 part()
+        self._looks: dict[str, Callable[[], None]] = {}
         self._steps = [CapturedStep(part, self.device).launch if whole else part for whole, part in self._parts()]
         self.captured = assert_replays(self, self._steps)
         self.restart(seed, first_world)
@@ -235,13 +240,31 @@ class Task(Telling):
         for launch in self._steps:
             launch()
 
-    def watch(self, look: Callable[[], None] | None) -> None:
-        """Call ``look`` after every control step, instead of an earlier one; None: call nothing. Run ``look`` once beforehand.
+    def watch(self, look: Callable[[], None] | None, by: str = "tap") -> None:
+        """Call ``look`` after every control step, instead of an earlier one of the same name; None: call nothing. Run ``look`` once
+        beforehand.
 
         It may only launch kernels, and these may write nothing that the task reads. A caller with a graph of :meth:`step` must
         capture it again.
         """
-        self._steps[len(self._parts()) :] = [] if look is None else [CapturedStep(look, self.device).launch]
+        self._looks.pop(by, None)
+        if look is not None:
+            self._looks[by] = CapturedStep(look, self.device).launch
+        self._steps[len(self._parts()) :] = self._looks.values()
+
+    def step_log(self, run: Run, steps: int, iteration: int, facts: Mapping[str, Any]) -> StepLog | None:
+        """A log of the control steps of a training that begins or goes on, on the main rank; None: the task keeps none.
+
+        Args:
+            run: The run.
+            steps: Control steps of an iteration.
+            iteration: Iterations done.
+            facts: The entries of a checkpoint's manifest about the policy.
+
+        Raises:
+            OSError: The store can't be written.
+        """
+        return None
 
     def reset(self) -> None:
         """Begin a new episode with new random numbers in every world."""

@@ -174,6 +174,8 @@ class RacerConfig(TaskConfig):
     """Time penalty for each touched obstacle [s]."""
     max_resets: Annotated[int, Field(ge=0, le=1_000_000)] = 100
     """Number of times that a car is put back in an episode; the next time, the episode ends."""
+    sim_trace: Annotated[int, Field(ge=0, le=16)] = 0
+    """Number of cars of the main rank, from the first, of which a training writes each control step into SimTrace files."""
     trace: bool = False
     """Whether to record each control step on the device for the files of a race; a race sets it."""
     waypoints: Annotated[int, Field(ge=1, le=64)] = 8
