@@ -10,7 +10,9 @@ from shared_store.wording import counted
 TRIALS = 3
 """Laps of a race, by default."""
 SIM_TRACE = "sim-trace"
-"""Directory of a race's step logs, in that of its evaluation."""
+"""Directory of step logs: of a race in that of its evaluation, of a training in that of the run."""
+BESIDE = ("model", "ip")
+"""Directories beside it, with the action space and the hyperparameters."""
 DEFAULTS: Mapping[str, Any] = {
     "continuous": False,
     "off_track_penalty": 1.0,

@@ -20,7 +20,7 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.kept_files import with_files
 from orchestrator.spec.model import Spec, validate
-from shared_store.races import SIM_TRACE
+from shared_store.races import BESIDE, SIM_TRACE
 
 _EXAMPLES = """Examples:  muster evaluate ant-1f2e3d4c@best --episodes 500
 muster evaluate ant-1f2e3d4c@300 --set 'config.randomize.friction=[0.4, 0.6]' --name ant-on-ice
@@ -91,7 +91,7 @@ def evaluate(
         typer.Option(
             "--output",
             "-o",
-            help="Copy the SimTrace files into this directory, in the layout that log tools expect.",
+            help="Copy the SimTrace files of the race, and those of the training, into this directory, as log tools expect them.",
             rich_help_panel=_RACE,
             show_default=False,
         ),
@@ -113,8 +113,9 @@ def evaluate(
     run, checkpoint = split_reference(source)
     rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None}
     _refuse_mixed(race, {"episodes": episodes, "worlds": worlds}, {**rules, "output": output})
-    if output is not None and (output / SIM_TRACE).exists():
-        raise UsageError(f"-o {output}: {output / SIM_TRACE} exists; name another directory")
+    for there in () if output is None else (output / each for each in (SIM_TRACE, *BESIDE)):
+        if there.exists():
+            raise UsageError(f"-o {output}: {there} exists; name another directory")
     asked = {"checkpoint": checkpoint, "episodes": episodes, "worlds": worlds, "seed": seed, **rules}
     asked |= {"accept_changed_robot": accept_changed_robot or None}
     if (seconds := asked.pop("penalty")) is not None:
@@ -170,21 +171,25 @@ def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -
 
 
 def _copy(run: Path, evaluation: str, output: Path, quiet: bool) -> None:
-    """Copy the SimTrace files of a race to ``output``. Raises ServerError."""
-    made = run / "evaluations" / evaluation / SIM_TRACE
-    if not made.is_dir():
+    """Copy the SimTrace files of a race, those of its training, if there are any, and what is beside them. Raises ServerError."""
+    made, trained = run / "evaluations" / evaluation, Path(SIM_TRACE) / "training"
+    if not (made / SIM_TRACE).is_dir():
         raise ServerError(
-            f"-o {output}: the run's directory {run} is not visible from this machine; the files are in {made}"
+            f"-o {output}: the run's directory {run} is not visible from this machine; the files are in {made / SIM_TRACE}"
         )
     hidden = output / f".{SIM_TRACE}.{evaluation}.tmp"
     try:
         output.mkdir(parents=True, exist_ok=True)
         shutil.copytree(made, hidden)
-        hidden.rename(output / SIM_TRACE)
+        if (run / trained).is_dir():
+            shutil.copytree(run / trained, hidden / trained)
+        for each in list(hidden.iterdir()):
+            each.rename(output / each.name)
+        hidden.rmdir()
     except OSError as error:
         shutil.rmtree(hidden, ignore_errors=True)
         raise ServerError(
-            f"-o {output}: it can't be written ({error.strerror or error}); the files are in {made}"
+            f"-o {output}: it can't be written ({error.strerror or error}); the files are in {made / SIM_TRACE}"
         ) from None
     if not quiet:
         echo(f"copied: {output / SIM_TRACE}")

@@ -187,7 +187,7 @@ class Laps:
         ]
         directions = {track.name: track.direction for track in self._tracks}
         documents = {}
-        if facts is not None:
+        if facts and "settings" in facts:
             trained = facts["algorithm"], facts["settings"], facts["train"].get("worlds", 1)
             documents = model_documents(self._task, *trained)
         return Race(trials, rules, directions, seed, documents)

@@ -304,7 +304,7 @@ class TrainingState:
 
     def _changed(self, checkpoint: Checkpoint) -> set[str]:
         """The algorithm's settings that differ from those of ``checkpoint``, or that this job sets and that one did not."""
-        there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
+        there, here = (json.loads(json.dumps(facts)) for facts in (checkpoint.manifest, self.facts))
         given = (f"train.{section_of(here['algorithm'])}", "settings")
         pairs = [(setting_at(there, key) or {}, setting_at(here, key) or {}) for key in given]
         return {name for old, new in pairs for name in new if old.get(name) != new[name]}
@@ -316,6 +316,9 @@ class TrainingState:
             raise UserError(
                 f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
             )
+        for facts in (there, here):
+            for key in getattr(self.task.config, "may_change", ()):
+                (facts["train"].get("config") or {}).pop(key, None)
         settings = [f"settings.{key}" for key in fixed_settings(self.algorithm.config_type, there["settings"])]
         difference = first_difference(there, here, ["task", "algorithm", "train.seed", "train.config", *settings])
         if difference:

@@ -134,10 +134,10 @@ def action_space(content: Any) -> ActionSpace:
         raise Refused(
             ("action_space_type",), f"it is {kind}, and action_space is {found if space else 'empty'}; they must fit"
         )
-    found = _continuous(space) if kind == "continuous" else _discrete(space)
+    actions = _continuous(space) if kind == "continuous" else _discrete(space)
     meant = _lower(content.get("training_algorithm"))
     algorithm = next((name for name, theirs in ALGORITHMS.items() if theirs == meant), None)
-    return replace(found, lidar=lidar, algorithm=algorithm, notes=(*found.notes, *cameras))
+    return replace(actions, lidar=lidar, algorithm=algorithm, notes=(*actions.notes, *cameras))
 
 
 def _lower(text: Any) -> Any:

@@ -53,7 +53,7 @@ def sim_trace(
         length: Of the track's centre line [m].
         control_hz: Control steps a second [Hz].
     """
-    before = [0.0] * len(MISHAPS)
+    before, chooses = [0.0] * len(MISHAPS), rows[-1][-1] != CONTINUOUS
     for number, row in enumerate(rows):
         car = dict(zip((*COLUMNS, "reward", "action"), row, strict=True))
         counts = [car[name] for name in MISHAPS]
@@ -63,7 +63,7 @@ def sim_trace(
         if done := number == len(rows) - 1:
             state = _STATUS.get(status, status)
         steering, speed = math.degrees(car["steering"]), car["speed"]
-        action = f"[{steering:.4f} {speed:.4f}]" if car["action"] == CONTINUOUS else f"{car['action']:.0f}"
+        action = f"{car['action']:.0f}" if chooses else f"[{steering:.4f} {speed:.4f}]"
         yield ",".join(
             (
                 *(f"{episode}", f"{number}", f"{car['x']:.4f}", f"{car['y']:.4f}"),

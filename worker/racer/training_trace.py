@@ -148,8 +148,8 @@ class TrainingTrace:
             since = 0
             for step in np.flatnonzero(rows[:, car, END] >= 0).tolist():
                 self._append(car, rows[since : step + 1, car], clock)
-                if (episode := self._open[car]) is not None:
-                    ended.append((step, car, np.concatenate(episode), self._clocks[car], int(rows[step, car, END])))
+                if (driven := self._open[car]) is not None:
+                    ended.append((step, car, np.concatenate(driven), self._clocks[car], int(rows[step, car, END])))
                 self._open[car], self._clocks[car] = [_started(afterwards[step, car])], []
                 since = step + 1
             self._append(car, rows[since:, car], clock)

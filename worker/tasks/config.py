@@ -212,6 +212,8 @@ class TaskConfig(_Common):
     if a declaration makes it an image. Submission checks jobs against these names."""
     races: ClassVar[bool] = False
     """Whether an episode is a lap of a race, as a job with ``race`` runs it."""
+    may_change: ClassVar[tuple[str, ...]] = ()
+    """Fields that change nothing of a training, so that a run may go on with other values."""
     hyperparameters: ClassVar[tuple[str, ...]] = ()
     """Further names for settings that ``train.hyperparameters`` accepts (:meth:`plain_settings`)."""
     other_rewards: ClassVar[Mapping[str, float]] = MappingProxyType({})

@@ -184,7 +184,7 @@ class Racer(DeclaredTask):
 
     def step_log(self, run: Run, steps: int, iteration: int, facts: Mapping[str, Any]) -> StepLog | None:
         """As :meth:`Task.step_log`: SimTrace files of the first cars, if the configuration asks for them."""
-        if not self.config.sim_trace:
+        if not getattr(self.config, "sim_trace", 0):
             return None
         documents = model_documents(self, facts["algorithm"], facts["settings"], facts["train"].get("worlds", 1))
         return TrainingTrace(run, self, steps, iteration, documents)

@@ -29,6 +29,7 @@ from orchestrator.persistence.models import AutomaticEvaluation, Job, RunRecord
 from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
+from orchestrator.spec.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
 from shared_store.evaluations import by_checkpoint
 from shared_store.files import DamagedFile
@@ -260,7 +261,11 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         if before.kind != after.kind:
             raise ClientError(f"run {run.name} is a {before.kind} job; it can't continue as {after.kind}")
         return
-    was, wanted = dict(before.train), dict(after.train)
+    may_change = getattr(task_config(after.train.task), "may_change", ())
+    was, wanted = (
+        {**dict(train), "config": {key: value for key, value in (train.config or {}).items() if key not in may_change}}
+        for train in (before.train, after.train)
+    )
     if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
         key, old, new = innermost(*difference)
         raise ClientError(

@@ -109,6 +109,7 @@ class RacerConfig(TaskConfig):
     """
 
     races: ClassVar[bool] = True
+    may_change: ClassVar[tuple[str, ...]] = ("sim_trace",)
     hyperparameters: ClassVar[tuple[str, ...]] = tuple(KNOWN)
     other_rewards: ClassVar[Mapping[str, float]] = {"reward": 1.0}
     control_hz: Rate = 15.0

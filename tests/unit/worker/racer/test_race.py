@@ -134,7 +134,7 @@ def test_a_step_log_has_a_row_a_step_as_deepracer_s_tools_read_it(tmp_path: Path
     x, y = OVAL.center[0] + [0.14, 0.0]  # the front of a car on the line, on a straight along x
     assert (float(start["X"]), float(start["Y"])) == pytest.approx((x, y), abs=1e-4)
     expected = {"steps": "1", "tstamp": "0.067", "done": "False", "all_wheels_on_track": "True"}
-    expected |= {"steer": "0.00", "throttle": "1.25", "action": "-1", "pause_duration": "0.00"}
+    expected |= {"steer": "0.00", "throttle": "1.25", "action": "[0.0000 1.2500]", "pause_duration": "0.00"}
     assert first.items() >= expected.items()
     assert float(first["track_len"]) == pytest.approx(OVAL.length, abs=0.005)
     statuses = [row["episode_status"] for row in rows[1:]]
