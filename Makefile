@@ -58,7 +58,7 @@ robots: $(READY) robots-kernels
 	$(PYTEST) tests/robots
 
 services: $(READY) kernels tracking
-	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py
+	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py tests/training/worker/test_sim_trace.py
 
 # pictures of the pages are left in build/console
 console: $(READY) kernels
@@ -81,9 +81,9 @@ kernels: $(READY)
 robots-kernels: $(READY)
 	$(BIN)/python -m tests.support.suite.kernels Go1Flat G1Flat Go1Rough LiftCube LiftCubes
 
-# W&B, MLflow and LEAPP (130 MB); pandas for MLflow's own server, which the extra has without it
+# W&B, MLflow and LEAPP (130 MB); pandas for MLflow's own server, which the extra has without it; deepracer-utils, which reads SimTrace files
 tracking: $(READY)
-	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --no-warn-conflicts --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
+	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas, deepracer' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --no-warn-conflicts --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas deepracer-utils
 
 lint: $(READY)
 	$(BIN)/ruff check .
