@@ -15,6 +15,7 @@ import pytest
 from tests.conftest import REPOSITORY
 from worker.racer.rewards import confined, guard, parameters, sandbox
 from worker.racer.rewards.guard import check_source, try_out
+from worker.racer.rewards.problems import RewardFailed
 from worker.racer.rewards.samples import oval
 from worker.racer.rewards.workers import Workers
 
@@ -326,6 +327,8 @@ def test_a_package_that_is_not_one_of_the_five_is_not_there_and_of_those_the_way
 def test_a_process_that_answers_what_it_likes_is_bounded_and_says_no_more_than_a_fault() -> None:
     flood = "while True:\n    for each in range(3, 12):\n        try:\n            os.write(each, b'{' * 4096)\n        except OSError:\n            pass"
     assert "ended the process" in tried(flood)
+    with pytest.raises(RewardFailed, match="the function's process answers without end"):
+        called(flood)
     forged = json.dumps({"kind": "<script>", "message": "a\nb", "line": []})
     end = "for each in range(3, 12):\n    try:\n        os.write(each, ANSWER)\n    except OSError:\n        pass\nos._exit(3)"
     assert "ended the process (exit code 3)" in tried(f"ANSWER = {forged!r}.encode()\n{end}")
