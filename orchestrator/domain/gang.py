@@ -56,6 +56,10 @@ class Shape:
         return sum(self.nodes[: self.minimum], Resources())
 
 
+LOG_GROUP = "/aws/batch/job"
+"""The log group of containers that name none."""
+
+
 @dataclass(frozen=True)
 class NodeSpec:
     """The command and the resources of one node."""
@@ -69,6 +73,21 @@ class NodeSpec:
     """``containerProperties`` unchanged, from which engines read volumes, limits and the like."""
     ecs: str | None = None
     """Name of the container where the definition gave ``ecsProperties``; None where it gave ``container``."""
+
+    @property
+    def log_group(self) -> str | None:
+        """Its log group; None: :data:`LOG_GROUP`."""
+        named = self._log_options.get("awslogs-group")
+        return None if named == LOG_GROUP else named
+
+    @property
+    def log_prefix(self) -> str | None:
+        """The beginning of its stream's name; None: the name of the job."""
+        return self._log_options.get("awslogs-stream-prefix") or None
+
+    @property
+    def _log_options(self) -> Mapping[str, str]:
+        return (self.container.get("logConfiguration") or {}).get("options") or {}
 
     @cached_property
     def spec(self) -> Mapping[str, Any] | None:

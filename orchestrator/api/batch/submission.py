@@ -24,6 +24,7 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
+from orchestrator.persistence import log_groups
 from orchestrator.persistence.gangs import gangs
 from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.persistence.ownership import owner_of
@@ -131,6 +132,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     properties = rules.substitute(_properties(document, request), parameters)
     gang = rules.check_nodes(properties, document["type"], complete=True)
     _check_secrets(context, queue, gang)
+    _make_log_groups(context, gang)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     copy = context.making or context.teacher
@@ -170,6 +172,13 @@ def _check_secrets(context: Context, queue: JobQueue, gang: GangSpec) -> None:
             context.reconciler.engine.check_secrets(engines, containers, queue.name)
         except SecretsError as error:
             raise ClientError(str(error)) from None
+
+
+def _make_log_groups(context: Context, gang: GangSpec) -> None:
+    """The groups that its nodes log to exist from now on. Raises RequestError where there are too many."""
+    if names := {node.log_group for node in gang.nodes if node.log_group}:
+        log_groups.add_missing(context.session, names, permissions.current_identity.get().name)
+        log_groups.check_room(context.session, 0)
 
 
 def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict[str, Any]:

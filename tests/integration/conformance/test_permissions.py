@@ -10,14 +10,15 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from orchestrator.api.batch import members
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.app import create_app
 from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
 from orchestrator.api.permissions import HIDDEN, Operation
 from orchestrator.domain.errors import ApiError
+from tests.support.conformance.fuzz_requests import GROUP_ARN
 from tests.support.conformance.permissions_world import KEYS, MARK, SECRET, TOKEN, World, definition
+from tests.support.conformance.streams import GROUP
 
 OWN_WRITE = "+ + + - - - -"
 """What belongs to the queue robots is changed: ``+`` is carried out, ``-`` is refused."""
@@ -31,8 +32,8 @@ SHARED_WRITE = "+ + - - - - -"
 SHARED_READ = "+ + + + + + +"
 ALL_READ = "+ + - - + - -"
 """It tells of all queues at once."""
-OWN_LEAGUE = "+ + + + - - -"
-"""A league of one's own is created."""
+OWN_MADE = "+ + + + - - -"
+"""A league or a log group is created, which then is the caller's."""
 DEFINITION_READ = "+ + + h h h h"
 """Names and commands of definitions are everybody's to see, values only of one's own."""
 
@@ -43,7 +44,16 @@ TABLE = {
         OWN_WRITE: (
             *(OF.REGISTER_JOB_DEFINITION, OF.DEREGISTER_JOB_DEFINITION, OF.SUBMIT_JOB, OF.TERMINATE_JOB),
             *(OF.CANCEL_JOB, OF.TAG_RESOURCE, OF.UNTAG_RESOURCE, OF.PLAN, OF.FIT, OF.CHECKPOINT_JOB, OF.RESUME_RUN),
-            *(OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.RERUN_ENTRY, OF.ENTER_LEAGUE, OF.DISQUALIFY),
+            *(OF.DELETE_LOG_GROUP, OF.PUT_RETENTION_POLICY, OF.DELETE_RETENTION_POLICY, OF.CREATE_LOG_STREAM),
+            *(
+                OF.DELETE_LOG_STREAM,
+                OF.CLONE_RUN,
+                OF.REGISTER_MODEL,
+                OF.RACE,
+                OF.RERUN_ENTRY,
+                OF.ENTER_LEAGUE,
+                OF.DISQUALIFY,
+            ),
         ),
         DEFINITION_READ: (OF.DESCRIBE_JOB_DEFINITIONS,),
         OWN_LIST: (
@@ -68,7 +78,7 @@ TABLE = {
             *(OF.READ_CAPACITY, OF.LIST_LEAGUES, OF.READ_LEAGUE, OF.READ_LEAGUE_TABLE, OF.READ_ENTRY, OF.LIST_TRACKS),
         ),
         ALL_READ: (OF.READ_MONITORING, OF.READ_KEYS, OF.READ_WEBHOOKS),
-        OWN_LEAGUE: (OF.CREATE_LEAGUE,),
+        OWN_MADE: (OF.CREATE_LEAGUE, OF.CREATE_LOG_GROUP),
     }.items()
     for operation in operations
 }
@@ -100,7 +110,13 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
     def policy() -> str:
         return world.made("CreateSchedulingPolicy", "name", fairsharePolicy={})
 
-    group = {"logGroupName": members.LOG_GROUP}
+    def own_group() -> str:
+        """A new log group of the key ``robots``."""
+        name = f"/{world.fresh()}"
+        assert world.send("robots", "CreateLogGroup", logGroupName=name).status_code == 200
+        return name
+
+    group = {"logGroupName": GROUP}
     queue = {"priority": 1, "computeEnvironmentOrder": [{"order": 1, "computeEnvironment": "local"}]}
     job = {"jobName": "x", "jobQueue": "robots", "jobDefinition": world.definition}
     disabled = {"type": "UNMANAGED", "state": "DISABLED"}
@@ -141,6 +157,12 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of.FILTER_LOG_EVENTS: dict(**group, filterPattern='"robots line"'),
         of.DESCRIBE_LOG_STREAMS: dict(**group),
         of.DESCRIBE_LOG_GROUPS: {},
+        of.CREATE_LOG_GROUP: dict(logGroupName=world.fresh),
+        of.DELETE_LOG_GROUP: dict(logGroupName=own_group),
+        of.PUT_RETENTION_POLICY: dict(logGroupName=own_group, retentionInDays=7),
+        of.DELETE_RETENTION_POLICY: dict(logGroupName=own_group),
+        of.CREATE_LOG_STREAM: dict(logGroupName=own_group, logStreamName="made"),
+        of.DELETE_LOG_STREAM: dict(logGroupName=own_group, logStreamName="made"),
     }
     others: dict[Operation, Callable[[str], httpx.Response]] = {
         of.START_LIVE_TAIL: lambda key: live_tail(world, key),
@@ -173,9 +195,7 @@ def live_tail(world: World, key: str) -> httpx.Response:
     own = key.removesuffix("-reader")
     wanted = [f"{queue} line".encode() for queue in ("robots", "lab") if own not in ("robots", "lab") or own == queue]
     body = b""
-    with world.http.stream(
-        "POST", world.url, json={"logGroupIdentifiers": [logs.GROUP_ARN]}, headers=headers
-    ) as answer:
+    with world.http.stream("POST", world.url, json={"logGroupIdentifiers": [GROUP_ARN]}, headers=headers) as answer:
         for chunk in answer.iter_bytes():
             body += chunk
             if all(body.count(line) >= 3 for line in wanted):
@@ -234,7 +254,7 @@ def test_every_operation_of_the_product_stands_in_the_table() -> None:
     for route in [*app.routes, *native.router.routes]:
         if isinstance(route, APIRoute) and not route.path.startswith("/v1/") and route.name != "cloudwatch_logs":
             routes |= {f"{method} {route.path}" for method in route.methods}
-    offered = {*batch.OPERATIONS, *logs.OPERATIONS, "StartLiveTail", *routes}
+    offered = {*batch.OPERATIONS, *logs.NAMES, *routes}
     assert {operation.value for operation in Operation} == offered
     assert set(TABLE) == set(Operation)
 

@@ -1,0 +1,35 @@
+"""Log groups of users: which nodes log there, and the rows of those that exist."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from orchestrator.domain.errors import RequestError
+from orchestrator.domain.gang import LOG_GROUP
+from orchestrator.persistence.models import Job, LogGroup, Node
+
+MOST = 1000
+"""Log groups of a controller."""
+
+
+def check_room(session: Session, more: int = 1) -> None:
+    """Raise RequestError where so many ``more`` groups would be too many."""
+    there = session.scalar(select(func.count()).select_from(LogGroup)) or 0
+    if there + more > MOST:
+        raise RequestError(f"there are {there} log groups, and {MOST} at most; delete some, or log to {LOG_GROUP}")
+
+
+def add_missing(session: Session, names: Collection[str], owner: str | None) -> None:
+    """Create those of the groups that do not exist yet."""
+    there = set(session.scalars(select(LogGroup.name).where(LogGroup.name.in_(names)))) if names else set()
+    session.add_all(LogGroup(name=name, owner=owner) for name in sorted(set(names) - there))
+
+
+def record_logs(session: Session, job: Job, nodes: Sequence[Node]) -> None:
+    """Record with the nodes of a new attempt where they log; a group that was deleted since the submission is created again."""
+    for node, spec in zip(nodes, job.gang.nodes, strict=False):  # an elastic gang may start with fewer
+        node.log_group, node.log_prefix = spec.log_group, spec.log_prefix
+    add_missing(session, {node.log_group for node in nodes if node.log_group}, job.owner)
