@@ -211,6 +211,8 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
         raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
+    if holder and not permissions.is_visible(holder):
+        raise ClientError(f"run {run} is being written by another job; choose another name")
     if holder:
         raise ClientError(
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"

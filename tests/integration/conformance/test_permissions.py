@@ -26,6 +26,10 @@ OWN_WRITES = "+ + + e - - -"
 """Several at once: ``e`` is an answer with an error for each that is not its own."""
 OWN_READ = "+ + + - h h -"
 """It is read: ``h`` without the values of environment variables."""
+NAMED_READ = "+ + + n h h n"
+"""It is found by its name: ``n`` answers as if it did not exist."""
+NAMED_WRITE = "+ + + n - - n"
+"""The same where it is changed; a read-only key is refused before or after it is found."""
 OWN_LIST = "+ + + o h h o"
 """It is listed: ``o`` is an answer without it."""
 SHARED_WRITE = "+ + - - - - -"
@@ -43,26 +47,19 @@ TABLE = {
     for row, operations in {
         OWN_WRITE: (
             *(OF.REGISTER_JOB_DEFINITION, OF.DEREGISTER_JOB_DEFINITION, OF.SUBMIT_JOB, OF.TERMINATE_JOB),
-            *(OF.CANCEL_JOB, OF.TAG_RESOURCE, OF.UNTAG_RESOURCE, OF.PLAN, OF.FIT, OF.CHECKPOINT_JOB, OF.RESUME_RUN),
+            *(OF.CANCEL_JOB, OF.TAG_RESOURCE, OF.UNTAG_RESOURCE, OF.PLAN, OF.FIT, OF.RERUN_ENTRY, OF.DISQUALIFY),
             *(OF.DELETE_LOG_GROUP, OF.PUT_RETENTION_POLICY, OF.DELETE_RETENTION_POLICY, OF.CREATE_LOG_STREAM),
-            *(
-                OF.DELETE_LOG_STREAM,
-                OF.CLONE_RUN,
-                OF.REGISTER_MODEL,
-                OF.RACE,
-                OF.RERUN_ENTRY,
-                OF.ENTER_LEAGUE,
-                OF.DISQUALIFY,
-            ),
+            OF.DELETE_LOG_STREAM,
         ),
+        NAMED_WRITE: (OF.CHECKPOINT_JOB, OF.RESUME_RUN, OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.ENTER_LEAGUE),
         DEFINITION_READ: (OF.DESCRIBE_JOB_DEFINITIONS,),
         OWN_LIST: (
             *(OF.DESCRIBE_JOBS, OF.FILTER_LOG_EVENTS, OF.DESCRIBE_LOG_STREAMS, OF.START_LIVE_TAIL, OF.READ_QUEUES),
             *(OF.FIND_JOBS, OF.LIST_RUNS, OF.LIST_MODELS),
         ),
-        OWN_READ: (
-            *(OF.LIST_JOBS, OF.GET_JOB_QUEUE_SNAPSHOT, OF.LIST_TAGS_FOR_RESOURCE, OF.GET_LOG_EVENTS, OF.READ_JOB),
-            *(OF.READ_JOB_LOGS, OF.READ_JOB_STACKS, OF.READ_RUN, OF.READ_CHECKPOINTS, OF.READ_METRICS),
+        OWN_READ: (OF.LIST_JOBS, OF.GET_JOB_QUEUE_SNAPSHOT, OF.LIST_TAGS_FOR_RESOURCE, OF.GET_LOG_EVENTS),
+        NAMED_READ: (
+            *(OF.READ_JOB, OF.READ_JOB_LOGS, OF.READ_JOB_STACKS, OF.READ_RUN, OF.READ_CHECKPOINTS, OF.READ_METRICS),
             *(OF.READ_EVALUATIONS, OF.READ_MODEL),
         ),
         OWN_WRITES: (OF.TERMINATE_JOBS, OF.CANCEL_JOBS),
@@ -234,6 +231,10 @@ def test_every_operation_is_allowed_or_refused_as_the_table_says(world: World, p
             if expected == "-":
                 refusal_of(answer, key)
                 continue
+            if expected == "n":
+                assert answer.status_code == 404 and "does not exist" in answer.text, (operation, key, answer.text)
+                assert "robots" not in answer.text, (operation, key, answer.text)
+                continue
             assert answer.status_code in (200, 307, 400, 409), (operation, key, answer.text)  # 400, 409: of its state
             assert ('"AccessDenied"' in answer.text) is (expected == "e"), (operation, key, answer.text)
             if not operation.reads or operation.value.endswith("/stacks"):
@@ -259,10 +260,10 @@ def test_every_operation_of_the_product_stands_in_the_table() -> None:
     assert set(TABLE) == set(Operation)
 
 
-def refused(text: str, call: Callable[..., Any], *arguments: Any, **request: Any) -> None:
+def refused(text: str, call: Callable[..., Any], *arguments: Any, status: int = 403, **request: Any) -> None:
     with pytest.raises(ApiError, match=text) as caught:
         call(*arguments, **request)
-    assert caught.value.status == 403, caught.value
+    assert caught.value.status == status, caught.value
 
 
 def submission(name: str, queue: str, **environment: str) -> dict[str, Any]:
@@ -278,7 +279,7 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
         world.server.wait(each["id"])
     before = epoch.read_bytes()
     own = world.register("lab", "labs")
-    foreign = f"run {world.run} belongs to job queue robots"
+    foreign, absent = f"run {world.run} belongs to job queue robots", f"run {world.run} does not exist"
     refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_RUN=world.run))
     named = definition("named")
     container = named["nodeProperties"]["nodeRangeProperties"][0]["container"]
@@ -288,15 +289,16 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
     lab.batch("RegisterJobDefinition", jobDefinitionName="single", type="container", containerProperties=container)
     refused(foreign, lab.batch, "SubmitJob", jobName="x", jobQueue="lab", jobDefinition="single")
     for change in ("name=labs2", "queue=lab"):
-        refused(foreign, lab.post, f"/api/runs/{world.run}/resume", {"set": [change, "queue=lab"]})
+        refused(absent, lab.post, f"/api/runs/{world.run}/resume", {"set": [change, "queue=lab"]}, status=404)
     waits = lab.batch("SubmitJob", jobName="x", jobQueue="lab", jobDefinition=own)["jobId"]
-    refused(foreign, lab.post, f"/api/runs/{world.run}/clone", {"name": "labs-own", "set": ["queue=lab"]})
+    clone = {"name": "labs-own", "set": ["queue=lab"]}
+    refused(absent, lab.post, f"/api/runs/{world.run}/clone", clone, status=404)
     teacher = {"train": {"task": "Cartpole", "rsl_rl": {"teacher_checkpoint": f"{world.run}@3"}}}
     for section in ({"evaluate": {"run": world.run}}, {"export": {"run": world.run}}, teacher):
         spec = json.dumps({"name": "x", **section})
-        refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_SPEC=spec))
+        refused(absent, lab.batch, "SubmitJob", status=404, **submission(own, "lab", MUSTER_SPEC=spec))
         later = {**submission(own, "lab", MUSTER_SPEC=spec), "dependsOn": [{"jobId": waits}]}
-        refused(foreign, lab.batch, "SubmitJob", **later)
+        refused(f"run {world.run} belongs to no known job queue", lab.batch, "SubmitJob", **later)
     train = {"train": {"task": "Cartpole", "worlds": 4, "iterations": 9}, "evaluation": {"every": 1, "queue": "robots"}}
     elsewhere = submission(own, "lab", MUSTER_SPEC=json.dumps({"name": "x", **train}))
     refused("it concerns job queue robots", lab.batch, "SubmitJob", **elsewhere)
@@ -334,11 +336,33 @@ def test_names_of_others_are_not_told_by_errors_and_not_found_by_name(world: Wor
         lab.get("/api/jobs/theirs")
     with pytest.raises(ApiError, match="does not exist"):
         lab.get(f"/api/jobs/{world.job[:8]}")
+    own = world.register("lab", "labs-waiting")
+    with pytest.raises(ApiError, match="another job; choose another name") as caught:
+        waiting = world.native("robots", "robots", name="waiting", resources={"cpus": 1000})
+        lab.batch("SubmitJob", **submission(own, "lab", MUSTER_RUN=waiting[1]))
+    world.clients["robots"].batch("TerminateJob", jobId=waiting[0], reason="x")
     assert lab.get("/api/capacity")["queues"] == ["lab"]
     assert world.server.muster("queues").returncode == 1  # without a key
     for key, names in (("lab", {"lab"}), ("admin", {"default", "lab", "robots"})):
         shown = json.loads(world.server.muster("queues", "--json", MUSTER_TOKEN=world.tokens[key]).stdout)
         assert {queue["jobQueueName"] for queue in shown} >= names and ("robots" in str(shown)) is (key == "admin")
+
+
+@pytest.mark.parametrize("kind", ["models", "runs", "jobs"])
+def test_what_a_key_may_not_see_answers_as_what_does_not_exist(world: World, kind: str) -> None:
+    """No answer tells which names exist, nor do hints name what is another queue's (T7)."""
+    taken = world.job if kind == "jobs" else world.run
+    for key in ("lab", "lab-reader"):
+        answers = []
+        for name in (taken, "z" + taken[1:]):
+            with pytest.raises(ApiError) as caught:
+                world.clients[key].get(f"/api/{kind}/{name}")
+            assert "robots" not in str(caught.value)
+            answers.append((caught.value.status, str(caught.value).replace(name, "NAME")))
+        assert answers[0] == answers[1]
+    near = f"{world.run}x"
+    with pytest.raises(ApiError, match="did you mean" if kind != "jobs" else "does not exist"):
+        world.clients["robots"].get(f"/api/{kind}/{near}")
 
 
 def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> None:
@@ -351,7 +375,7 @@ def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> N
         facts = {**described, "run": name, "queue": queue, "owner": None}
         (path / "run.json").write_text(json.dumps({key: value for key, value in facts.items() if value}))
     assert world.clients["robots"].get("/api/runs/moved")["queue"] == "robots"
-    refused("run moved belongs to job queue robots", world.clients["lab"].get, "/api/runs/moved")
+    refused("run moved does not exist", world.clients["lab"].get, "/api/runs/moved", status=404)
     own = world.register("robots", "continuing")
     older = submission(own, "robots", MUSTER_RUN="older")
     refused("no known job queue", world.clients["robots"].batch, "SubmitJob", **older)
