@@ -41,7 +41,7 @@ def recognise(session: Session, account: str | None, region: str | None) -> Acco
     if known is None:
         session.add(KnownAccount(id=1, account=wanted[0], region=wanted[1]))
     elif wanted != (known.account, known.region):
-        option = f"--account-id {account}" if wanted[0] != known.account else f"--region {region}"
+        option = f"--account-id {wanted[0][:40]}" if wanted[0] != known.account else f"--region {wanted[1][:60]}"
         raise UsageError(
             f"{option}: this controller has the ARNs of account {known.account} in {known.region} since its first start, and its "
             "clients know them; leave the option out, or begin anew: another MUSTER_HOME, and another --database where one is used"
