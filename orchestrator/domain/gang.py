@@ -116,6 +116,11 @@ class GangSpec:
         return Shape(tuple(node.resources for node in self.nodes), self.minimum, self.main)
 
     @property
+    def log_groups(self) -> set[str]:
+        """The log groups of its nodes, but for :data:`LOG_GROUP`."""
+        return {node.log_group for node in self.nodes if node.log_group}
+
+    @property
     def spec(self) -> Mapping[str, Any] | None:
         """The spec that the job was compiled from; None for a job that came through the Batch API. Raises ValueError."""
         return self.nodes[self.main].spec

@@ -15,17 +15,24 @@ MOST = 1000
 """Log groups of a controller."""
 
 
-def check_room(session: Session, more: int = 1) -> None:
-    """Raise RequestError where so many ``more`` groups would be too many."""
+def check_room(session: Session, names: Collection[str]) -> None:
+    """Raise RequestError where those of the groups that do not exist yet would be too many."""
+    if not (more := _missing(session, names)):
+        return
     there = session.scalar(select(func.count()).select_from(LogGroup)) or 0
-    if there + more > MOST:
+    if there + len(more) > MOST:
         raise RequestError(f"there are {there} log groups, and {MOST} at most; delete some, or log to {LOG_GROUP}")
 
 
 def add_missing(session: Session, names: Collection[str], owner: str | None) -> None:
     """Create those of the groups that do not exist yet."""
-    there = set(session.scalars(select(LogGroup.name).where(LogGroup.name.in_(names)))) if names else set()
-    session.add_all(LogGroup(name=name, owner=owner) for name in sorted(set(names) - there))
+    session.add_all(LogGroup(name=name, owner=owner) for name in sorted(_missing(session, names)))
+
+
+def _missing(session: Session, names: Collection[str]) -> set[str]:
+    if not names:
+        return set()
+    return set(names) - set(session.scalars(select(LogGroup.name).where(LogGroup.name.in_(names))))
 
 
 def record_logs(session: Session, job: Job, nodes: Sequence[Node]) -> None:

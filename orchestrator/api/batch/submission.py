@@ -66,6 +66,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         if teacher:
             hold_teacher(context, job.run, teacher)
     context.session.add(job)
+    log_groups.add_missing(context.session, gang.log_groups, job.owner)
     return answer(job)
 
 
@@ -132,7 +133,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     properties = rules.substitute(_properties(document, request), parameters)
     gang = rules.check_nodes(properties, document["type"], complete=True)
     _check_secrets(context, queue, gang)
-    _make_log_groups(context, gang)
+    log_groups.check_room(context.session, gang.log_groups)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     copy = context.making or context.teacher
@@ -172,13 +173,6 @@ def _check_secrets(context: Context, queue: JobQueue, gang: GangSpec) -> None:
             context.reconciler.engine.check_secrets(engines, containers, queue.name)
         except SecretsError as error:
             raise ClientError(str(error)) from None
-
-
-def _make_log_groups(context: Context, gang: GangSpec) -> None:
-    """The groups that its nodes log to exist from now on. Raises RequestError where there are too many."""
-    if names := {node.log_group for node in gang.nodes if node.log_group}:
-        log_groups.add_missing(context.session, names, permissions.current_identity.get().name)
-        log_groups.check_room(context.session, 0)
 
 
 def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict[str, Any]:

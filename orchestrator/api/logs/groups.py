@@ -142,7 +142,7 @@ def create_log_group(place: _Place, request: dict[str, Any]) -> None:
     if name == LOG_GROUP or session.get(LogGroup, name) is not None:
         raise present("log group", name)
     try:
-        log_groups.check_room(session)
+        log_groups.check_room(session, [name])
     except RequestError as error:
         raise LogsError("LimitExceededException", str(error)) from None
     session.add(LogGroup(name=name, owner=permissions.current_identity.get().name, tags=tags))
