@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from sqlalchemy import func, select, update
@@ -15,7 +15,7 @@ from orchestrator.api.batch.members import check_log_group
 from orchestrator.api.batch.rules import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.events import stored_bytes
-from orchestrator.api.logs.streams import find_stream, newest_streams
+from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import RequestError
@@ -90,18 +90,19 @@ def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict
             and (pattern or "") in name
             and (not identifiers or name in identifiers)
         )
-        found = [_describe(session, reconciler.store, rows[name], brief=pattern is not None) for name in names[:size]]
+        streams = {name: newest_streams(session, reconciler.store, (name,)) for name in names[:size] if pattern is None}
+        rows[LOG_GROUP].created_at = session.scalar(select(func.min(Job.created_at))) or 0
+        session.expunge_all()
+    found = [_describe(rows[name], streams.get(name)) for name in names[:size]]  # the store may hang, the database not
     return {"logGroups": found, **({"nextToken": f"after/{names[size - 1]}"} if len(names) > size else {})}
 
 
-def _describe(session: Session, store: Store, group: LogGroup, *, brief: bool) -> dict[str, Any]:
-    """``brief``: the members that AWS gives where a pattern was asked for."""
-    arn, created = log_group_arn(group.name), group.created_at
-    if group.name == LOG_GROUP:
-        created = session.scalar(select(func.min(Job.created_at))) or 0
-    described: dict[str, Any] = {"logGroupName": group.name, "creationTime": created, "arn": f"{arn}:*"}
-    if not brief:
-        size = sum(stored_bytes(stream.path) for stream in newest_streams(session, store, (group.name,)))
+def _describe(group: LogGroup, streams: Sequence[Stream] | None) -> dict[str, Any]:
+    """``streams``: of the group; None: the members that AWS gives where a pattern was asked for. Raises OSError."""
+    arn = log_group_arn(group.name)
+    described: dict[str, Any] = {"logGroupName": group.name, "creationTime": group.created_at, "arn": f"{arn}:*"}
+    if streams is not None:
+        size = sum(stored_bytes(stream.path) for stream in streams)
         described |= {"metricFilterCount": 0, "storedBytes": size, "logGroupClass": "STANDARD", "logGroupArn": arn}
         described |= {"retentionInDays": group.retention} if group.retention else {}
     return described
