@@ -21,7 +21,8 @@ from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.progress import Activity, loading
-from worker.telemetry.recording import Recording, recover
+from worker.telemetry.recording import Recording
+from worker.telemetry.recovering import recover
 from worker.telemetry.rows import Rows
 from worker.telemetry.segment import Segment
 
@@ -141,8 +142,9 @@ def main() -> int:
             if made is None:
                 print(f"{given.recover}: it is whole already; nothing had to be recovered", flush=True)
                 return 0
-            path, count = made
-            print(f"recovered: {counted(count, 'message')}; written: {path}", flush=True)
+            print(f"recovered: {counted(made.messages, 'message')}; written: {made.path}", flush=True)
+            if made.losses:
+                raise UserError(f"{given.recover}: {made.losses}; the rest is in {made.path.name}")
             return 0
         done = record(Run(given.run), given.job, given.worlds, given.episodes, given.output)
         lost = f", {counted(done.lost, 'step')} lost" if done.lost else ""

@@ -263,6 +263,8 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int],
             screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
             if stop:
                 return
+        if replay.losses:
+            print(f"note: {path.name} is {replay.losses}; the rest is shown", flush=True)
         if replay.cut:
             print(f"note: {path.name} was cut short; it is shown up to control step {replay.count}", flush=True)
         print(
