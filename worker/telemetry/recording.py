@@ -137,6 +137,12 @@ class Recording:
         """Number of episodes that have ended, at most ``episodes`` for each world."""
         return int(np.minimum(self._ended, episodes).sum())
 
+    def interrupt(self, text: str) -> None:
+        """The worlds begin anew, as after a crash: the episodes that were running have no end. ``text`` is for the log."""
+        self._sums[:] = 0.0
+        self._whole[:] = self._just_ended[:] = False
+        self.say(text, level=30)
+
     def say(self, text: str, level: int = 20, name: str = "muster") -> None:
         """Add a line of the job's log, at the time of the newest step."""
         now = self._time(self.steps, self._rate)
