@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import argparse
+import getpass
 import os
 import signal
+import socket
 import sys
 import time
 import webbrowser
@@ -312,6 +314,10 @@ def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | No
         page = Page(given.port, given.memory, file, given.framed_by)
         activity.end()
         print(f"the view is at {page.url}", flush=True)
+        if "SSH_CONNECTION" in os.environ:
+            port = page.url.rpartition(":")[2]
+            there = f"{getpass.getuser()}@{socket.gethostname()}"
+            print(f"on your own machine, for a browser there: ssh -N -L {port}:127.0.0.1:{port} {there}", flush=True)
         if given.browser:
             webbrowser.open(page.url)
         return page
