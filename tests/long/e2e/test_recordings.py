@@ -141,7 +141,7 @@ def test_a_recording_of_a_training_that_dies_goes_on_with_its_next_attempt(serve
     run = Store(server.home / "store").run(server.detail(job)["run"])
     wait_for(lambda: list_checkpoints(run), timeout=300, what="the first checkpoint")
     file = tmp_path / "dies.mcap"
-    command = [str(MUSTER), "record", job, "-o", str(file), "--worlds", "1", "--episodes", "2000"]
+    command = [str(MUSTER), "record", job, "-o", str(file), "--worlds", "1", "--episodes", "400"]
     recording = subprocess.Popen(
         command,
         env={**os.environ, "MUSTER_HOME": str(server.home)},
@@ -150,7 +150,7 @@ def test_a_recording_of_a_training_that_dies_goes_on_with_its_next_attempt(serve
         text=True,
     )
     partial = file.with_name("dies.mcap.partial")
-    wait_for(lambda: partial.exists() and partial.stat().st_size > 200_000, timeout=120, what="some steps")
+    wait_for(lambda: partial.exists() and partial.stat().st_size > 60_000, timeout=120, what="some steps")
     kill_rank(job, 0)
     wait_for(
         lambda: server.detail(job)["attempts"] and server.detail(job)["status"] == "RUNNING",
@@ -161,7 +161,7 @@ def test_a_recording_of_a_training_that_dies_goes_on_with_its_next_attempt(serve
     assert recording.returncode == 0, err
     assert "died; waiting for its next attempt on this machine" in err
     known = episodes(file)
-    assert len(known) >= 2000 and {each["run"] for each in known} == {run.name}
+    assert len(known) >= 400 and {each["run"] for each in known} == {run.name}
     assert all(each["length"] == "30" for each in known if each["complete"] == "true" and each["end"] == "time_out")
     with file.open("rb") as opened:
         lines = [message.data for _, _, message in make_reader(opened).iter_messages("/rosout")]
