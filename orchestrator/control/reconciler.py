@@ -94,11 +94,12 @@ class Reconciler:
         self.clock = clock or Clock()
         self.writing = threading.Lock()
         """Held while something is registered, submitted or changed: checks must still hold at the commit."""
-        self.texts = KeptTexts(database, store, peers.id, self.writing, lambda: self.disk.shortage("store"))
+        runs = runs or RunStore(store, peers, *([identity.check] if identity else []))
+        self.texts = KeptTexts(database, store, runs.peers.id, self.writing, lambda: self.disk.shortage("store"))
         self.monitoring, self.heartbeat = Monitoring(), Heartbeat()
         self.attempts = Attempts(
             engine,
-            runs or RunStore(store, peers, *([identity.check] if identity else [])),
+            runs,
             bus,
             self.clock,
             self.monitoring,
