@@ -33,8 +33,8 @@ DAYS = 7
 """For which a text is kept that nothing names."""
 A_DAY = 32 << 20
 """Bytes of texts that one key may upload in 24 hours."""
-_SWEEP_INTERVAL = 3600.0
-"""Seconds between two looks for texts that nothing needs."""
+_SWEEP_INTERVAL, _FIRST_SWEEP = 3600.0, 60.0
+"""Seconds between two looks for texts that nothing needs, and until the first one."""
 _MS_A_DAY = 24 * 3600 * 1000
 
 
@@ -78,7 +78,7 @@ class KeptTexts:
         self._writing, self._shortage = writing, shortage
         self._changing = threading.Lock()
         """Held while a text is written or deleted, together with its row."""
-        self._swept = machine.monotonic()
+        self._next_sweep = machine.monotonic() + _FIRST_SWEEP
 
     def keep(self, data: bytes, owner: str) -> str:
         """Keep a text durably; returns its digest. A text that is kept already only stays longer.
@@ -118,8 +118,8 @@ class KeptTexts:
 
     def sweep_when_due(self, later: Callable[[Callable[[], object]], None]) -> None:
         """Have ``later`` carry out :meth:`sweep` once in a while."""
-        if machine.monotonic() - self._swept > _SWEEP_INTERVAL:
-            self._swept = machine.monotonic()
+        if machine.monotonic() > self._next_sweep:
+            self._next_sweep = machine.monotonic() + _SWEEP_INTERVAL
             later(self.sweep)
 
     def sweep(self) -> list[str]:

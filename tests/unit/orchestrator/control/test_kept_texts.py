@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from orchestrator import machine
 from orchestrator.control import kept_texts
 from orchestrator.control.kept_texts import DAYS, KeptTexts, TextRefused
 from orchestrator.domain.errors import Unavailable
@@ -102,6 +103,19 @@ def test_a_text_stays_while_an_active_definition_or_a_job_that_has_not_ended_nam
             job.status = Status.SUCCEEDED
         session.get(JobDefinition, ("active", 1)).status = "INACTIVE"  # type: ignore[union-attr]
     assert sorted(texts.sweep()) == sorted([active, running])
+
+
+def test_the_look_for_what_nothing_needs_is_made_soon_after_a_start_and_then_rarely(
+    texts: KeptTexts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    for seconds, looks in ((0, 0), (59, 0), (61, 1), (3600, 1), (3662, 2)):
+        moment = machine.monotonic() + seconds
+        with monkeypatch.context() as patch:
+            patch.setattr(machine, "monotonic", lambda moment=moment: moment)
+            texts.sweep_when_due(asked.append)
+            texts.sweep_when_due(asked.append)
+        assert asked == [texts.sweep] * looks, seconds
 
 
 def test_leftovers_of_a_killed_upload_go_and_other_controllers_texts_stay(texts: KeptTexts, store: Store) -> None:
