@@ -58,8 +58,8 @@ def ensure_compute_environments(session: Session, engines: Sequence[str]) -> Non
             session.add(JobQueue(name=queue, compute_environments=[name]))
     default = session.get(JobQueue, "default")
     if default is not None and len(default.compute_environments) == 1 and default.compute_environments[0] in ENGINES:
-        if default.compute_environments != [engines[0]]:
-            default.compute_environments, default.sent_order = [engines[0]], None
+        default.sent_order = default.sent_order if default.compute_environments == [engines[0]] else None
+        default.compute_environments = [engines[0]]
 
 
 def is_built_in(compute_environment: ComputeEnvironment) -> bool:

@@ -32,6 +32,9 @@ class Status(StrEnum):
 TERMINAL = (Status.SUCCEEDED, Status.FAILED)
 """States of a job that has ended."""
 
+EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
+"""States of a job that has not begun to start: CancelJob ends no other."""
+
 TRANSITIONS = {
     Status.SUBMITTED: {Status.PENDING, Status.RUNNABLE, Status.FAILED},
     Status.PENDING: {Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},

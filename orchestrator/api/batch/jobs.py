@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, or_, select
+from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import selectinload
 
 from orchestrator.api import permissions
@@ -23,7 +23,6 @@ from orchestrator.persistence.queries import ask_to_end
 
 _BEFORE_NAME = len(definition_arn("", 1)) - 1
 """Position of the name in a definition's ARN, from 1."""
-_EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
 
 
 def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -203,7 +202,7 @@ def _terminate(context: Context, target: ColumnElement[bool], reason: str) -> No
 
 
 def _cancel(context: Context, target: ColumnElement[bool], reason: str) -> None:
-    ask_to_end(context.session, and_(target, Job.status.in_(_EARLY)), reason, cancelled=True)
+    ask_to_end(context.session, target, reason, cancel=True)
 
 
 class UnknownJob(ClientError):

@@ -143,6 +143,25 @@ def test_an_array_is_ended_with_its_children(batch: Batch, tmp_path: Path) -> No
     assert batch.describe(job)["isTerminated"] and batch.describe(f"{job}:0")["isTerminated"]
 
 
+@pytest.mark.parametrize("cancelled", [True, False])
+def test_an_array_that_is_cancelled_while_all_children_run_and_then_terminated_has_the_second_reason(
+    batch: Batch, tmp_path: Path, cancelled: bool
+) -> None:
+    definition = batch.single("one-array-both", UNTIL.format("never"), env={"GATE": str(tmp_path)})
+    job = batch.submit(definition, arrayProperties={"size": 2})
+    for index in range(2):
+        batch.wait(f"{job}:{index}", "RUNNING")
+    if cancelled:
+        batch.api.cancel_job(jobId=job, reason="too late")
+        detail = batch.describe(job)
+        assert (detail["status"], detail["isCancelled"], detail["isTerminated"]) == ("PENDING", False, False)
+    batch.api.terminate_job(jobId=job, reason="enough of it")
+    for each in (job, f"{job}:0", f"{job}:1"):
+        detail = batch.wait(each)
+        assert (detail["status"], detail["statusReason"]) == ("FAILED", "enough of it")
+        assert (detail["isCancelled"], detail["isTerminated"]) == (False, True)
+
+
 def test_children_come_one_by_one_in_a_sequential_array(batch: Batch, tmp_path: Path) -> None:
     script = f"echo begin {INDEX} >> $GATE/log; {UNTIL.format('go')}; echo end {INDEX} >> $GATE/log"
     definition = batch.single("one-sequential", script, env={"GATE": str(tmp_path)})
