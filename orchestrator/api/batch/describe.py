@@ -8,6 +8,7 @@ from typing import Any
 
 from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.api.batch.ecs import to_ecs
+from orchestrator.api.batch.fargate import is_fargate
 from orchestrator.api.damaged import DAMAGED
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Attempt, Job, JobDefinition
@@ -54,7 +55,10 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
         detail["nodeProperties"] = node_ranges(job.node_properties)  # an echo: range by range, as it was submitted
     else:
         spec = gang.nodes[node or 0]
-        shown = {**with_defaults(spec.container), **(_container(job, last, node or 0) if last else {})}
+        shown = {
+            **with_defaults(spec.container, {} if spec.ecs else document),
+            **(_container(job, last, node or 0) if last else {}),
+        }
         if spec.ecs is not None:
             detail["container"], detail["ecsProperties"] = {}, _in_ecs(shown, spec.ecs)
         else:
@@ -93,9 +97,10 @@ def retry_strategy(given: Mapping[str, Any]) -> dict[str, Any]:
     return {**given, "evaluateOnExit": [{**each, "action": each["action"].upper()} for each in conditions]}
 
 
-def with_defaults(container: Mapping[str, Any]) -> dict[str, Any]:
-    """``containerProperties`` with the empty lists that AWS shows for missing members."""
-    return {**{name: [] for name in _LISTS}, **container}
+def with_defaults(container: Mapping[str, Any], definition: Mapping[str, Any]) -> dict[str, Any]:
+    """``containerProperties`` with what AWS shows for missing members: empty lists, and Fargate's platform."""
+    platform = {"fargatePlatformConfiguration": {"platformVersion": "LATEST"}} if is_fargate(definition) else {}
+    return {**{name: [] for name in _LISTS}, **platform, **container}
 
 
 def node_ranges(properties: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,7 +126,7 @@ def _range(entry: Mapping[str, Any]) -> dict[str, Any]:
     rest = {key: value for key, value in entry.items() if key != "ecs"}
     if "ecsProperties" in entry:
         return {**rest, "ecsProperties": ecs_with_defaults(entry["ecsProperties"])}
-    container = with_defaults(entry["container"])
+    container = with_defaults(entry["container"], {})
     if "ecs" in entry:  # of a job, which keeps all in one form
         del rest["container"]
         return {**rest, "ecsProperties": to_ecs(container, entry["ecs"], {})}

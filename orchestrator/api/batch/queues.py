@@ -9,7 +9,7 @@ from sqlalchemy import select
 
 from orchestrator.api import permissions
 from orchestrator.api.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
@@ -150,9 +150,13 @@ def _checked_order(context: Context, order: Sequence[Mapping[str, Any]]) -> list
     names = [plain_name(each["computeEnvironment"], "compute-environment") for each in order]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
         raise ClientError("computeEnvironmentOrder: every compute environment and every order once")
+    kinds = set()
     for name in names:
-        if context.session.get(ComputeEnvironment, name) is None:
+        if (found := context.session.get(ComputeEnvironment, name)) is None:
             raise ClientError(f"Compute environment {name[:200]} does not exist")
+        kinds.add(fargate.of_environment(found.document))
+    if len(kinds) > 1:
+        raise ClientError("computeEnvironmentOrder: compute environments of EC2 and of Fargate can't be mixed")
     return [{"order": each["order"], "computeEnvironment": name} for each, name in zip(order, names, strict=True)]
 
 

@@ -21,6 +21,11 @@ DIGEST, GANG = "muster:digest", "muster:gang"
 _MOST_RANGES = 5
 _TIMEOUT_SLACK = 600
 """Seconds after the controller's own timeout at which AWS ends an attempt whose controller is away."""
+_OURS = (
+    *("vcpus", "memory", "networkConfiguration", "fargatePlatformConfiguration", "platformVersion"),
+    *("ephemeralStorage", "runtimePlatform"),
+)
+"""Members of a container that are not passed on: the placement says the first two, and a job on EC2 must not have Fargate's."""
 _NODE_FIELDS = ("node_index", "node_count", "main_index", "master_address", "address", "bus", "bus_token")
 
 
@@ -138,9 +143,7 @@ def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> di
         resources.append({"type": "GPU", "value": str(len(placement.gpus))})
     image = _image(gang, index)
     container: dict[str, Any] = {
-        **{
-            key: value for key, value in given.items() if key not in ("vcpus", "memory") and value not in ([], {}, None)
-        },
+        **{key: value for key, value in given.items() if key not in _OURS and value not in ([], {}, None)},
         "image": config.image if image in ("", "muster") else image,
         "resourceRequirements": resources,
         "command": list(node.command) if plain else ["python", "-P", "-m", "worker.aws_node", "--", *node.command],

@@ -50,7 +50,10 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
     assert batch.api.describe_compute_environments(computeEnvironments=["q-ce"])["computeEnvironments"] == []
     for change, message in [
         ({"type": "OTHER"}, "MANAGED or UNMANAGED"),
-        ({"computeResources": {**resources, "type": "FARGATE"}}, "FARGATE is not supported"),
+        (
+            {"computeResources": {**resources, "type": "ECS_MANAGED_INSTANCES"}},
+            "'ECS_MANAGED_INSTANCES' is not supported",
+        ),
         ({"computeResources": {**resources, "maxvCpus": -1}}, "maxvCpus is -1"),
         ({"computeEnvironmentName": "a b"}, "computeEnvironmentName"),
         ({"state": "ON"}, "ENABLED or DISABLED"),

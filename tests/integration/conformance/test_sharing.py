@@ -112,10 +112,13 @@ def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch
         batch.submit(definition, queue="q-shares")
     with refused("1 to 255 letters and digits"):
         batch.submit(definition, queue="q-shares", shareIdentifier="a b")
+    for share in ("*", "A**", "A*1", "A" * 256):
+        with refused("1 to 255 letters and digits, a * at the end at most"):
+            batch.submit(definition, queue="q-shares", shareIdentifier=share)
     with refused("must be 0 to 9999"):
         batch.submit(definition, queue="q-shares", shareIdentifier="A", schedulingPriorityOverride=10000)
     shares: dict[str, str] = {}
-    for share in ["Light"] * 4 + ["Heavy1"] * 8:
+    for share in ["Light"] * 4 + ["Heavy1*"] * 8:  # AWS's reference allows an asterisk at the end
         shares[batch.submit(definition, queue="q-shares", shareIdentifier=share)] = share
     urgent = batch.submit(definition, queue="q-shares", shareIdentifier="Light", schedulingPriorityOverride=6)
     shares[urgent] = "Light"
@@ -128,6 +131,8 @@ def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch
     assert light == [urgent, *rest], "the higher priority first, then the older"
     detail = batch.describe(urgent)
     assert (detail["shareIdentifier"], detail["schedulingPriority"]) == ("Light", 6)
+    heavy = next(job for job in order if shares[job] == "Heavy1*")
+    assert batch.describe(heavy)["shareIdentifier"] == "Heavy1*"
     assert batch.describe(rest[0])["schedulingPriority"] == 5, "the definition's"
     found = batch.api.list_jobs(jobQueue="q-shares", filters=[{"name": "SHARE_IDENTIFIER", "values": ["Light"]}])
     assert [each["jobId"] for each in found["jobSummaryList"]] == [urgent, *reversed(rest)]

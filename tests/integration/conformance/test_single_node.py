@@ -202,6 +202,10 @@ def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
         ({"arrayProperties": {"size": 2}, "dependsOn": [{"jobId": "JOB", "type": "N_TO_N"}]}, "same size"),
         ({"dependsOn": [{"jobId": "ARRAY", "type": "N_TO_N"}]}, "for array jobs"),
         ({"dependsOn": [{}]}, "needs a jobId"),
+        (
+            {"arrayProperties": {"size": 2}, "dependsOn": [{"jobId": "ARRAY", "type": "SEQUENTIAL"}]},
+            "SEQUENTIAL is among the children of the array itself and takes no jobId",
+        ),
         ({"nodeOverrides": {"numNodes": 2}}, "use containerOverrides"),
     ],
 )
@@ -352,6 +356,3 @@ def test_a_container_definition_needs_no_image_of_ours_and_refuses_what_is_not_r
     ]:
         with refused(message):
             batch.register("one-bad", "container", containerProperties=properties)
-    with refused("FARGATE is not supported"):
-        fargate = {"platformCapabilities": ["FARGATE"]}
-        batch.register("one-bad", "container", containerProperties=container("true", {}), **fargate)
