@@ -102,6 +102,10 @@ class EngineSet:
         runner = self._runner(engine_of(gang.placements[0].host))
         engine = runner.engine
         traits = engine.traits
+        if not traits.images and not all(gang.commands):
+            raise EngineError(
+                f"the job has no command, and the {engine.name} engine runs no image that could have one; give it one"
+            )
         named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
         if named and not traits.images and gang.options.get("images") == "refuse":
             raise EngineError(
@@ -140,6 +144,10 @@ class EngineSet:
         """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
         if any(self._traits(name).secrets is not SecretValues.REFERENCES for name in names):
             self.secrets.check(containers, queue)
+
+    def without_images(self, names: Iterable[str]) -> Sequence[str]:
+        """Those of these engines that do not run a job's image."""
+        return [name for name in names if not self._traits(name).images]
 
     def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]], again: bool = True) -> str:
         """The handle of a gang, as text, once it is started; does not wait. Raises NotYet until then, and EngineError.

@@ -84,8 +84,8 @@ def _check_condition(condition: Mapping[str, str]) -> None:
         raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
-def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = False) -> GangSpec:
-    """Check the nodes of a definition of type ``kind``, or of a job (``complete``: its overrides are applied). Raises ClientError.
+def check_nodes(properties: Mapping[str, Any], kind: str) -> GangSpec:
+    """Check the nodes of a definition of type ``kind``, or of a job of it once its overrides are applied. Raises ClientError.
 
     ``properties``: as :func:`node_properties` gives them. Returns the gang that they ask for.
     """
@@ -100,8 +100,6 @@ def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = Fa
         target = entry["targetNodes"]
         where = _where(entry, kind)
         check_container(entry["container"], where)
-        if complete and not entry["container"].get("command"):
-            raise ClientError(f"{where}: has no command; give one in the definition or in the overrides")
         _check_target(target, count)
     try:
         gang = gang_needs(properties)

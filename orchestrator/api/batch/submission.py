@@ -129,7 +129,8 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     document, name = definition.document, request["jobName"]
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
-    gang = rules.check_nodes(properties, document["type"], complete=True)
+    gang = rules.check_nodes(properties, document["type"])
+    _check_commands(context, queue, gang, definition.name)
     fargate.check_platform(document, properties, f"job definition {definition.name}")
     fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     _check_secrets(context, queue, gang)
@@ -162,6 +163,19 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     )
     gangs.remember(job.id, properties, gang)
     return job, gang
+
+
+def _check_commands(context: Context, queue: JobQueue, gang: GangSpec, definition: str) -> None:
+    """A node without a command runs that of its image, where its engine runs images. Raises ClientError."""
+    if all(node.command for node in gang.nodes):
+        return
+    engine = context.reconciler.engine
+    if without := engine.without_images(queue_engines(context.session, queue.name, engine.names[0])):
+        raise ClientError(
+            f"job definition {definition} has no command, and engine {without[0]} of job queue {queue.name} runs no image, whose ENTRYPOINT "
+            "and CMD could stand for one: give a command in the definition or in the overrides, or use a queue of an engine with images "
+            "(docker, aws-batch)"
+        )
 
 
 def _check_secrets(context: Context, queue: JobQueue, gang: GangSpec) -> None:

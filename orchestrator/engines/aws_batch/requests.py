@@ -61,6 +61,11 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
     supervisor; any other one, of a job that came through the Batch API, runs it as it is.
     """
     plain = [not _has_muster(gang, index, config) for index in range(len(nodes))]
+    if missing := [index for index, each in enumerate(plain) if not each and not nodes[index].command]:
+        raise EngineError(
+            f"node {missing[0]} has no command, and that of image {_image(gang, missing[0]) or 'muster'} can't be looked up at AWS to "
+            "run it under Muster's supervisor; give it one"
+        )
     ranges, overrides = [], []
     for _, group in groupby(range(len(nodes)), key=lambda index: json.dumps(_like(gang, nodes[index]), default=str)):
         indices = list(group)
@@ -149,6 +154,8 @@ def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> di
         "command": list(node.command) if plain else ["python", "-P", "-m", "worker.aws_node", "--", *node.command],
         "environment": _pairs(node.environment if plain else _supervised(node.environment, config)),
     }
+    if plain and not node.command:
+        del container["command"]  # the image's own runs
     linux = {"sharedMemorySize": max(64, placement.memory // 2), **(given.get("linuxParameters") or {})}
     if config.efa:
         device = {"hostPath": "/dev/infiniband/uverbs0", "containerPath": "/dev/infiniband/uverbs0"}

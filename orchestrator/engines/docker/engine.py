@@ -247,13 +247,13 @@ class DockerEngine:
         supervised = _VERSION in (image.labels or {})
         if supervised:
             self._kernels.mkdir(parents=True, exist_ok=True)
-        entrypoint = (image.attrs.get("Config") or {}).get("Entrypoint") or []
+        entrypoint, default = _own_command(image)
         place = self._client.api.create_endpoint_config(ipv4_address=request.contract.address)
         return self._client.containers.create(
             image,
             network=network.name,
             networking_config={network.name: place},
-            **request.arguments(entrypoint, self._kernels if supervised else None),
+            **request.arguments(entrypoint, default, self._kernels if supervised else None),
         )
 
     # -- watching -----------------------------------------------------------------------------------------------------
@@ -347,7 +347,12 @@ def _ended(state: Mapping[str, Any], address: str) -> NodeStatus:
 
 
 def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
-    """Raises EngineError where the image lacks the Muster that the command needs, or has another one than the controller."""
+    """Raises EngineError where the image lacks the command or the Muster that the job needs, or has another one than the controller."""
+    if not command and not any(_own_command(image)):
+        raise EngineError(
+            f"CannotCreateContainerError: No command specified: image {name} has neither ENTRYPOINT nor CMD, and the job no command; "
+            "give it one"
+        )
     version = (image.labels or {}).get(_VERSION)
     module = next((b for a, b in pairwise(command) if a == "-m" and b.startswith("worker.")), None)
     if version is None and module is not None:
@@ -359,6 +364,12 @@ def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
         raise EngineError(
             f"image {name} has Muster {version}, the controller {__version__}: build it anew with the controller's version"
         )
+
+
+def _own_command(image: Image) -> tuple[list[str], list[str]]:
+    """``ENTRYPOINT`` and ``CMD`` of an image."""
+    config = image.attrs.get("Config") or {}
+    return config.get("Entrypoint") or [], config.get("Cmd") or []
 
 
 def _is_here(url: str, name: str) -> bool:

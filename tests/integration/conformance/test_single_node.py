@@ -344,8 +344,17 @@ def test_the_command_may_come_with_the_submission(batch: Batch) -> None:
     definition = batch.register("one-open", "container", containerProperties=properties)
     job = batch.submit(definition, containerOverrides={"command": ["echo", "from the submission"]})
     assert batch.wait(job)["status"] == "SUCCEEDED" and batch.lines(job) == ["from the submission"]
-    with refused("has no command; give one in the definition or in the overrides"):
-        batch.submit(definition)
+    empty = batch.register("one-empty", "container", containerProperties={**properties, "command": []})
+    for each, name in ((definition, "one-open"), (empty, "one-empty")):
+        why = f"job definition {name} has no command, and engine local of job queue default runs no image"
+        with refused(why, "give a command in the definition or in the overrides", "docker"):
+            batch.submit(each)
+    ranges = [
+        {"targetNodes": "0:0", "container": container("true", {})},
+        {"targetNodes": "1:", "container": properties},
+    ]
+    with refused("job definition one-part has no command, and engine local"):
+        batch.submit(batch.multinode("one-part", "", ranges=ranges))
 
 
 def test_a_container_definition_needs_no_image_of_ours_and_refuses_what_is_not_run(batch: Batch) -> None:
