@@ -85,6 +85,8 @@ class NodeContract:
     standard PATH. ``muster``: the same with Muster's own environment on PATH, as in Muster's own image. Empty: neither."""
     user: str | None = None
     """``UID:GID`` of the program, if it differs from the supervisor's."""
+    note: str = ""
+    """A line for the beginning of the node's log; empty for none."""
     address: str | None = None
     """The node's own address, if the engine sets one."""
     bus: str | None = None
@@ -136,6 +138,7 @@ class NodeContract:
             "MUSTER_STALL_TIMEOUT": stall,
             "MUSTER_ISOLATION": self.isolation,
             "MUSTER_USER": self.user,
+            "MUSTER_NOTE": self.note,
             "MUSTER_ADDRESS": self.address,
             "MUSTER_BUS": self.bus,
             "MUSTER_BUS_TOKEN": self.bus_token,
@@ -207,6 +210,7 @@ class NodeContract:
             array=array if "AWS_BATCH_JOB_ARRAY_INDEX" in env else None,
             isolation=env.get("MUSTER_ISOLATION", ""),
             user=env.get("MUSTER_USER"),
+            note=env.get("MUSTER_NOTE", ""),
             address=env.get("MUSTER_ADDRESS"),
             bus=env.get("MUSTER_BUS"),
             bus_token=env.get("MUSTER_BUS_TOKEN"),

@@ -22,6 +22,7 @@ from orchestrator.engines.api import (
     SecretValues,
     Traits,
     read_handle,
+    unused_user,
 )
 from orchestrator.engines.installed import traits_of
 from orchestrator.engines.runner import Health, Runner
@@ -116,10 +117,10 @@ class EngineSet:
             raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
         if traits.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
-        elif not traits.users and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
-            raise EngineError(
-                f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out"
-            )
+        elif not traits.users:
+            why = f"the {engine.name} engine runs jobs as the user of its nodes"
+            users = [container.get("user") for container in gang.containers]
+            gang = replace(gang, notes=[unused_user(user, why) if user else "" for user in users])
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)

@@ -106,6 +106,8 @@ class Supervisor:
                         self.contract.node_index, self.contract.epoch, 127, None, reason, None, started, time.time()
                     )
                 )
+            if self.contract.note:
+                self.write(None, "e", self.contract.note)
             if self.stopping:  # asked while the ranks were being started: they have not heard it
                 self._ask_ranks()
             while any(rank.running for rank in self.ranks):

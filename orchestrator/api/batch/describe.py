@@ -10,7 +10,7 @@ from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.api.batch.ecs import to_ecs
 from orchestrator.api.batch.fargate import is_fargate
 from orchestrator.api.damaged import DAMAGED
-from orchestrator.domain.job import Status
+from orchestrator.domain.job import Status, container_reason
 from orchestrator.persistence.models import Attempt, Job, JobDefinition
 
 _LISTS = ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes")
@@ -159,7 +159,8 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
     index = gang.main if node is None else node
     record = job.attempts[-1].node(index) if job.attempts else None
     if record is not None and record.exit_code is not None:
-        summary["container"] = {"exitCode": record.exit_code, "reason": (record.reason or "")[:255]}
+        reason = container_reason(record.reason, record.status_reason)
+        summary["container"] = {"exitCode": record.exit_code, **({"reason": reason[:255]} if reason else {})}
     if job.share:
         summary["shareIdentifier"] = job.share
     if job.stop_reason is not None:  # AWS shows only the one that is true
@@ -227,9 +228,10 @@ def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
 
 def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
     record = attempt.node(node)
+    reason = container_reason(record.reason, record.status_reason) if record else None
     detail = {
         "exitCode": record.exit_code if record else None,
-        "reason": record.reason[:255] if record and record.reason else None,
+        "reason": reason[:255] if reason else None,
         "logStreamName": stream_name(job, attempt.number, node) if attempt.started_at else None,
         "containerInstanceArn": ecs_arn("container-instance", attempt.environment, record.host) if record else None,
         "taskArn": ecs_arn(

@@ -33,6 +33,7 @@ from orchestrator.engines.api import (
     Plan,
     Transient,
     node_plans,
+    unused_user,
 )
 from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
@@ -110,7 +111,8 @@ class LocalEngine:
         nodes = node_plans(gang, addresses, first_port(gang.name))
         for index, container in enumerate(gang.containers):
             if user := container.get("user"):
-                nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=_user(user)))
+                taken, note = _user(user)
+                nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=taken, note=note))
         return Plan(gang, nodes, [self._process(gang, node) for node in nodes])
 
     def launch(self, plan: Plan[Sequence[NodeProcess]]) -> Handle:
@@ -248,25 +250,28 @@ class LocalEngine:
         return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.{kind}"
 
 
-def _user(given: str) -> str:
-    """``UID:GID`` of ``user`` in a job definition. Raises EngineError where it is not there, or can't be taken on."""
-    if os.geteuid() != 0:
-        raise EngineError(
-            f"user {given}: only a controller that runs as root can run a job as another user; leave user out"
-        )
+def _user(given: str) -> tuple[str | None, str]:
+    """``UID:GID`` of ``user`` in a job definition, where it can be taken on, and a note for the log where not all of it is.
+
+    Nodes have no image, so a name that this machine does not have is the image's, and is passed over like it. One that it has is taken
+    on: that gives the job no more than a controller that runs as root would have given it.
+    """
     name, _, group = given.partition(":")
+    if os.geteuid() != 0:
+        return None, unused_user(given, "the controller does not run as root")
     try:
         user = pwd.getpwuid(int(name)) if _ID.fullmatch(name) else pwd.getpwnam(name)
         uid, gid = user.pw_uid, user.pw_gid
     except KeyError:
         if not _ID.fullmatch(name):
-            raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
+            return None, unused_user(given, f"this machine has no user {name}")
         uid = gid = int(name)
+    note = ""
     try:
         gid = int(group) if _ID.fullmatch(group) else grp.getgrnam(group).gr_gid if group else gid
-    except KeyError:
-        raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
-    return f"{uid}:{gid}"
+    except KeyError:  # the user alone: without it the job would have more rights, not fewer
+        note = f"muster: group {group} is not used: this machine has no such group; the job runs with group {gid}"
+    return f"{uid}:{gid}", note
 
 
 def _address(gang: Gang, index: int) -> str:

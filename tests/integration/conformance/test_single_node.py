@@ -42,7 +42,11 @@ def test_a_container_job_has_a_container_and_knows_nothing_of_nodes(batch: Batch
     assert batch.api.describe_jobs(jobs=[f"{job}#0", f"{job}:0"])["jobs"] == []
     listed = batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
     [summary] = [each for each in listed if each["jobId"] == job]
-    assert "nodeProperties" not in summary and summary["container"]["exitCode"] == 4
+    assert "nodeProperties" not in summary and summary["container"] == {"exitCode": 4}, "no reason: an ordinary exit"
+    assert "reason" not in detail["container"] and "reason" not in detail["attempts"][0]["container"]
+    [node] = batch.server.client.get(f"/api/jobs/{job}")["attempts"][0]["nodes"]
+    assert node["reason"].startswith("rank 0 exited with code 4"), "Muster's own words"
+    assert "rank 0 exited with code 4" in batch.server.muster("show", job, MUSTER_URL=batch.server.url).stdout
 
 
 def test_parameters_replace_references_the_submissions_before_the_definitions(batch: Batch, parked: str) -> None:
@@ -261,8 +265,8 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         ([{"onExitCode": "1*", **AGAIN}, {"onExitCode": "12", **END}], 3),
         ([{"onExitCode": "12", **END}, {"onExitCode": "1*", **AGAIN}], 1),
         ([{"onExitCode": "1", **END}, {"onExitCode": "2*", **END}], 3),  # none matches: tried again
-        ([{"onReason": "rank 0 exited with code 12*", **END}], 1),
-        ([{"onReason": "exited with code 12*", **END}], 3),  # only the end may be left open
+        ([{"onReason": "rank 0 exited with code 12*", **END}], 3),  # an ordinary exit has no reason
+        ([{"onStatusReason": f"{EXITED[1:9]}*", **END}], 3),  # only the end may be left open
         ([{"onExitCode": "12", "onReason": "CannotPull*", **END}], 3),  # all of an entry must match
         ([{"onStatusReason": f"{EXITED[:9]}*", "onExitCode": "12", "action": "exit"}], 1),
         ([{"onExitCode": "0", **END}, {"onReason": "*", **END}], 1),  # the documentation's catch-all
@@ -290,7 +294,9 @@ def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tm
     detail = batch.wait(job)
     lost, failed = detail["attempts"]
     assert lost["statusReason"].startswith("Host EC2 (instance ") and lost["statusReason"].endswith(") terminated.")
+    assert lost["container"]["reason"] == lost["statusReason"]
     assert (failed["container"]["exitCode"], failed["statusReason"]) == (3, EXITED)
+    assert "reason" not in failed["container"]
     assert detail["status"] == "FAILED"
 
 
