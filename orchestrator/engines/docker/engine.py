@@ -48,14 +48,14 @@ from orchestrator.engines.docker import TRAITS
 from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
-from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
+from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store import __version__
 from shared_store.files import DamagedFile
 from shared_store.layout import Store
-from shared_store.outcomes import read_outcome
+from shared_store.outcomes import OUT_OF_MEMORY, read_outcome
 from shared_store.wording import counted
 
 log = logging.getLogger("muster.engines")

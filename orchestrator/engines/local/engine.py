@@ -43,8 +43,9 @@ from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.cgroups import own_group, remove_abandoned_groups
-from shared_store.contract import sealed
+from shared_store.contract import NodeContract, sealed
 from shared_store.layout import Store
+from shared_store.memory_groups import memory_group, memory_home
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.outcomes import read_outcome
 from shared_store.ports import first_port, free_port
@@ -98,7 +99,10 @@ class LocalEngine:
         self._children: dict[int, subprocess.Popen[bytes]] = {}
         self._groups = own_group()
         """Directory in which control groups of nodes are made; empty where they can't be."""
-        remove_abandoned_groups(self._groups)
+        self._memory = memory_home(self._groups, arrange=True)
+        """Directory below which the memory of jobs of the Batch API is limited; empty where it can't be."""
+        for directory in {self._groups, self._memory}:
+            remove_abandoned_groups(directory)
         self._ended: dict[str, GangStatus] = {}
         self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
@@ -113,6 +117,8 @@ class LocalEngine:
             if user := container.get("user"):
                 taken, note = _user(user)
                 nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=taken, note=note))
+        if self._memory and gang.isolated:  # of a job from YAML it is for the scheduler alone
+            nodes = [replace(node, contract=self._limited(gang.name, node)) for node in nodes]
         return Plan(gang, nodes, [self._process(gang, node) for node in nodes])
 
     def launch(self, plan: Plan[Sequence[NodeProcess]]) -> Handle:
@@ -136,7 +142,8 @@ class LocalEngine:
                     pid = self._start(plan.request[index], port, gang.name, index)
                 process, address = find_process(pid), plan.nodes[index].contract.address
                 start = process.start if process else ""
-                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group}
+                memory = plan.nodes[index].contract.memory_group
+                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group, "memory": memory}
         except BaseException as error:  # never half a gang
             # by its pid: for a moment after it was started a process has no environment yet by which it would be found
             for pid in self._children.keys() - before:
@@ -188,8 +195,13 @@ class LocalEngine:
             except OSError:
                 pass  # it was never started, or this was done before
 
+    def _limited(self, gang: str, node: NodePlan) -> NodeContract:
+        """The contract of a node whose job has no more than its memory."""
+        group = memory_group(self._memory, _group_name(gang, node.contract.node_index))
+        return replace(node.contract, memory_group=group, memory_limit=node.placement.memory)
+
     def _group(self, gang: str, index: int) -> str:
-        return f"{self._groups}/muster-{gang.replace('/', '-')}-{index}" if self._groups else ""
+        return f"{self._groups}/{_group_name(gang, index)}" if self._groups else ""
 
     def _process(self, gang: Gang, node: NodePlan) -> NodeProcess:
         own = inherited(["SLURM_JWT"])
@@ -274,6 +286,10 @@ def _user(given: str) -> tuple[str | None, str]:
     return f"{uid}:{gid}", note
 
 
+def _group_name(gang: str, index: int) -> str:
+    return f"muster-{gang.replace('/', '-')}-{index}"
+
+
 def _address(gang: Gang, index: int) -> str:
     """A loopback address of the node's own in 127.64.0.0/10, so that two gangs can use the same ports: 254 nodes to each /24."""
     digest = hashlib.sha256(gang.name.encode()).digest()
@@ -316,8 +332,9 @@ def _shims(gang: str) -> dict[int, _Shim]:
 
 
 def _processes(node: Mapping[str, object]) -> NodeProcesses:
-    """Of a node in a handle; handles of older versions have no group."""
-    return NodeProcesses(int(str(node["pid"])), str(node["start"]), str(node.get("group") or ""))
+    """Of a node in a handle; handles of older versions have no groups."""
+    groups = (str(node.get(name) or "") for name in ("group", "memory"))
+    return NodeProcesses(int(str(node["pid"])), str(node["start"]), *groups)
 
 
 def _signal(pid: int, number: int) -> None:
