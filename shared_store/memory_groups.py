@@ -39,6 +39,13 @@ def memory_home(groups: str, *, arrange: bool = False) -> str:
     return ""
 
 
+def limits_memory(groups: str) -> bool:
+    """Whether a controller that is started as this process was could limit memory; ``groups`` as in :func:`memory_home`."""
+    if memory_home(groups):
+        return True
+    return bool(groups) and _is_delegated(groups) and "memory" in _words(f"{groups}/cgroup.controllers")
+
+
 def memory_group(home: str, name: str) -> str:
     """Directory of the memory group of a node, below ``home``; ``name``: of its control group, which has it inside in version 2."""
     return f"{home}/{name}/{_JOB}" if _is_newer(home) else f"{home}/{name}"
@@ -84,8 +91,7 @@ def _limit(path: str, limit: int) -> None:
 def _has_memory(home: str, arrange: bool) -> bool:
     """Whether groups below ``home``, of version 2, can be limited."""
     if not arrange:
-        with open(f"{home}/cgroup.subtree_control") as file:
-            return "memory" in file.read().split()
+        return "memory" in _words(f"{home}/cgroup.subtree_control")
     try:
         return _enable(home)
     except OSError as error:
@@ -102,9 +108,8 @@ def _has_memory(home: str, arrange: bool) -> bool:
 
 
 def _enable(home: str) -> bool:
-    with open(f"{home}/cgroup.controllers") as file:
-        if "memory" not in file.read().split():
-            return False
+    if "memory" not in _words(f"{home}/cgroup.controllers"):
+        return False
     _write(f"{home}/cgroup.subtree_control", "+memory")
     return True
 
@@ -120,6 +125,11 @@ def _is_delegated(home: str) -> bool:
 def _is_newer(directory: str) -> bool:
     """Whether it is a group of version 2."""
     return os.path.exists(f"{directory}/cgroup.controllers")
+
+
+def _words(path: str) -> list[str]:
+    with open(path) as file:
+        return file.read().split()
 
 
 def _write(path: str, text: str) -> None:

@@ -88,9 +88,8 @@ def main(parent: str, group: str, files: str, exit_file: str, *command: str) -> 
     code = _wait(supervisor, watched)
     if _has_children() or not _removed(group):
         _end_the_rest(group, lambda: libc.prctl(_PR_SET_NAME, STUCK.encode(), 0, 0, 0))
-    if (memory := os.environ.get("MUSTER_MEMORY_GROUP")) and os.path.isdir(
-        memory
-    ):  # the supervisor did not get to remove it
+    memory = os.environ.get("MUSTER_MEMORY_GROUP", "")
+    if os.path.isdir(memory):
         from shared_store.cgroups import remove_group
 
         remove_group(memory)

@@ -35,7 +35,7 @@ def test_a_container_job_has_a_container_and_knows_nothing_of_nodes(batch: Batch
     assert not {"nodeProperties", "nodeDetails", "arrayProperties"} & detail.keys()
     assert detail["container"]["exitCode"] == detail["attempts"][0]["container"]["exitCode"] == 4
     assert detail["container"]["environment"] == pairs({"WHO": "I", "WHAT": "works"})
-    needs = [{"type": "VCPU", "value": "0.2"}, {"type": "MEMORY", "value": "16"}]
+    needs = [{"type": "VCPU", "value": "0.2"}, {"type": "MEMORY", "value": "64"}]
     assert detail["container"]["resourceRequirements"] == needs
     assert (detail["status"], detail["statusReason"]) == ("FAILED", EXITED)
     assert detail["parameters"] == {"unused": "1"} and detail["propagateTags"] is True
