@@ -13,14 +13,30 @@ import time
 
 from shared_store.processes import Process, find_process
 
+CONTROLLER = "muster"
+"""Name of the group of the controller inside a delegated one: its own, or that of systemd's ``DelegateSubgroup=``."""
 _TRIES = 25
 _NEW = 60.0
 """Seconds after its creation within which a group may still be waiting for its process."""
 
 
 def own_group() -> str:
-    """Directory of this process's control group of version 2; empty if it can't create groups below it."""
-    return find_group("")
+    """Directory of version 2 below which this process can create control groups; empty if it can't.
+
+    It is this process's own, or the one above where that was made for the controller in a group that was delegated to it.
+    """
+    directory = find_group("")
+    above, name = os.path.split(directory)
+    return above if name == CONTROLLER and is_delegated(above) else directory
+
+
+def is_delegated(group: str) -> bool:
+    """Whether systemd leaves the group to its processes."""
+    for name in ("user.delegate", "trusted.delegate"):
+        with contextlib.suppress(OSError):
+            if os.getxattr(group, name) == b"1":
+                return True
+    return False
 
 
 def find_group(controller: str) -> str:

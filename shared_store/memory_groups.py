@@ -9,10 +9,8 @@ import contextlib
 import errno
 import os
 
-from shared_store.cgroups import find_group, members
+from shared_store.cgroups import CONTROLLER, find_group, is_delegated
 
-_DELEGATED = ("user.delegate", "trusted.delegate")
-"""Attributes by which systemd marks a group that it leaves to its processes."""
 _JOB = "job"
 
 
@@ -21,7 +19,7 @@ def memory_home(groups: str, *, arrange: bool = False) -> str:
 
     Args:
         groups: Directory in which control groups of nodes are made; empty where they can't be.
-        arrange: Make way in a group of version 2 that was delegated: its processes move into a group below it, since one that limits
+        arrange: Make way in a scope of version 2 that was delegated: its processes move into a group below it, since one that limits
             others must have none.
     """
     for home in (groups, find_group("memory")):
@@ -43,7 +41,8 @@ def limits_memory(groups: str) -> bool:
     """Whether a controller that is started as this process was could limit memory; ``groups`` as in :func:`memory_home`."""
     if memory_home(groups):
         return True
-    return bool(groups) and _is_delegated(groups) and "memory" in _words(f"{groups}/cgroup.controllers")
+    made_way = is_delegated(groups) and (groups.endswith(".scope") or not _words(f"{groups}/cgroup.procs"))
+    return made_way and "memory" in _words(f"{groups}/cgroup.controllers")
 
 
 def memory_group(home: str, name: str) -> str:
@@ -64,7 +63,7 @@ def make_memory_group(path: str, limit: int) -> None:
 
 def entering(path: str) -> list[str]:
     """A command that enters the group and becomes the command after it."""
-    return ["sh", "-c", 'echo 0 > "$0"; exec "$@"', f"{path}/cgroup.procs"]
+    return ["/bin/sh", "-c", 'echo 0 > "$0"; exec "$@"', f"{path}/cgroup.procs"]
 
 
 def killed_for_memory(path: str) -> bool:
@@ -95,13 +94,14 @@ def _has_memory(home: str, arrange: bool) -> bool:
     try:
         return _enable(home)
     except OSError as error:
-        if error.errno != errno.EBUSY or not _is_delegated(home):
+        # systemd starts a service's processes in its own group, also again while nodes of the last start run below it
+        if error.errno != errno.EBUSY or not (is_delegated(home) and home.endswith(".scope")):
             return False
     try:
-        os.makedirs(f"{home}/muster", exist_ok=True)
-        for process in members(home):
+        os.makedirs(f"{home}/{CONTROLLER}", exist_ok=True)
+        for pid in _words(f"{home}/cgroup.procs"):
             with contextlib.suppress(ProcessLookupError):
-                _write(f"{home}/muster/cgroup.procs", str(process.pid))
+                _write(f"{home}/{CONTROLLER}/cgroup.procs", pid)
         return _enable(home)
     except OSError:
         return False
@@ -112,14 +112,6 @@ def _enable(home: str) -> bool:
         return False
     _write(f"{home}/cgroup.subtree_control", "+memory")
     return True
-
-
-def _is_delegated(home: str) -> bool:
-    for name in _DELEGATED:
-        with contextlib.suppress(OSError):
-            if os.getxattr(home, name) == b"1":
-                return True
-    return False
 
 
 def _is_newer(directory: str) -> bool:
