@@ -202,6 +202,20 @@ def test_a_definition_without_a_command_runs_that_of_its_image_unless_the_submis
     docker_client.images.remove("muster-test-own:1", force=True)
 
 
+def test_an_image_that_can_t_be_pulled_is_the_container_s_reason(served: Serving) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        image = f"127.0.0.1:{closed.getsockname()[1]}/none:1"
+    needs = {"resourceRequirements": definitions.NEEDS, "image": image}
+    arn = served.client.batch("RegisterJobDefinition", **definitions.single("far", needs))["jobDefinitionArn"]
+    job = served.client.batch("SubmitJob", jobName="far", jobQueue="default", jobDefinition=arn)["jobId"]
+    assert served.wait(job)["status"] == "FAILED"
+    [detail] = served.client.batch("DescribeJobs", jobs=[job])["jobs"]
+    assert (
+        detail["container"]["reason"].startswith("CannotPullContainerError: ") and "exitCode" not in detail["container"]
+    )
+    assert detail["attempts"][0]["container"]["reason"] == detail["container"]["reason"]
+
+
 def ask_stacks(served: Serving, job: str) -> Any:
     try:
         return served.client.get(f"/api/jobs/{job}/stacks")
