@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,13 @@ def end_of(container: dict[str, Any]) -> tuple[Any, Any]:
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_left(batch: Batch) -> Any:
-    """No memory group of a job of this test."""
-    home = memory_home(own_group())
-    before = set(os.listdir(home))
+def nothing_is_left(batch: Batch) -> Iterator[None]:
+    """No memory group of a job of these tests."""
     yield
-    wait_for(
-        lambda: not [name for name in set(os.listdir(home)) - before if name.startswith("muster-")], 30, "no group"
-    )
+    home, named = memory_home(own_group()), [{"name": "JOB_NAME", "values": ["mem-*"]}]
+    jobs = [each["jobId"] for each in batch.api.list_jobs(jobQueue="default", filters=named)["jobSummaryList"]]
+    assert jobs
+    wait_for(lambda: not [name for name in os.listdir(home) if any(job in name for job in jobs)], 30, "no group")
 
 
 @pytest.mark.parametrize(
