@@ -59,13 +59,13 @@ def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch,
     too_wide = batch.submit(wide, queue="q-low")
     impossible = batch.submit(gang)
     pending = batch.submit(plain, queue="q-low", dependsOn=[{"jobId": head}])
-    needs = "needs 1 node with 0.5 CPUs, 0 GPUs, 16 MiB in all"
+    needs = "needs 1 node with 0.5 CPUs, 0 GPUs, 64 MiB in all"
     free = f"{NO_ROOM} - {needs}; compute environment q-one-cpu may use 0 CPUs"
     assert batch.reason(head, NO_ROOM) == f"{free} more at this time until job q-holds ({first[:8]}) ends"
     behind = f"2nd in queue q-low, behind job q-plain ({head[:8]}), which {needs}"
     assert batch.reason(second, "2nd") == behind
     assert batch.reason(too_wide, "MISCONFIGURATION") == (
-        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 1 node with 2 CPUs, 0 GPUs, 16 MiB in all; "
+        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 1 node with 2 CPUs, 0 GPUs, 64 MiB in all; "
         "compute environment q-one-cpu has at most 1 CPU"
     )
     said = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
