@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -284,6 +284,11 @@ class Spec(Section):
         """Notes for the submitter."""
         return self._notes
 
+    def with_notes(self, notes: Iterable[str]) -> Spec:
+        """This spec, with further notes."""
+        self._notes += tuple(notes)
+        return self
+
     @property
     def kind(self) -> str:
         """Which of :data:`KINDS` this job is."""
@@ -333,8 +338,7 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
-    spec._notes = tuple(notes)
-    return spec
+    return spec.with_notes(notes)
 
 
 def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
