@@ -134,8 +134,7 @@ class Context:
 
     def definition_of(self, job: Job) -> JobDefinition:
         """The definition of a job, active or not. Raises DamagedRow where the database has lost it."""
-        name, _, revision = plain_name(job.definition, "job-definition").partition(":")
-        definition = self.session.get(JobDefinition, (name, int(revision)))
+        definition = named_definition(self.session, job.definition)
         if definition is None:
             raise DamagedRow(job)
         return definition
@@ -156,6 +155,12 @@ def reconciler_of(request: Request) -> Reconciler:
     """The controller that the application serves."""
     reconciler: Reconciler = request.app.state.reconciler
     return reconciler
+
+
+def named_definition(session: Session, arn: str) -> JobDefinition | None:
+    """The definition with this ARN, active or not; None where the database has lost it."""
+    name, _, revision = plain_name(arn, "job-definition").partition(":")
+    return session.get(JobDefinition, (name, int(revision)))
 
 
 def queue_names(session: Session) -> list[str]:

@@ -27,7 +27,7 @@ from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefus
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
-from orchestrator.domain.attempt import FINISHING, Phase, State, Terms, step
+from orchestrator.domain.attempt import FINISHING, NOT_STARTED, Phase, State, Terms, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -246,8 +246,8 @@ class Attempts:
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
-                if attempt.ending == Ending.FAILED:  # as AWS shows why a container did not start
-                    attempt.nodes[job.gang.main].reason = attempt.status_reason
+                if attempt.ending in (Ending.FAILED, Ending.FATAL):  # as AWS shows why a container did not start
+                    attempt.nodes[job.gang.main].reason = (attempt.status_reason or "").removeprefix(NOT_STARTED)
                 return Gone(self.clock.now(), [], "")
             case Close():
                 self._close(session, job, attempt, instruction)

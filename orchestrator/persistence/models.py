@@ -64,6 +64,8 @@ class JobQueue(Base):
     """The highest is served first."""
     compute_environments: Mapped[list[str]]
     """Their names, in the order in which they are tried."""
+    sent_order: Mapped[list[dict[str, Any]] | None] = mapped_column(_JSON_OR_NULL, default=None)
+    """``computeEnvironmentOrder`` as it was sent, with names; None: 1, 2, … in the order above."""
     policy: Mapped[str | None] = mapped_column(default=None)
     """Name of its scheduling policy; None: first in, first out."""
     limits: Mapped[list[dict[str, Any]]] = mapped_column(default=list)

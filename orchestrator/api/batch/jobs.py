@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, or_, select
+from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import selectinload
 
 from orchestrator.api import permissions
@@ -20,8 +20,6 @@ from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
-
-_EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
 
 
 def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -202,7 +200,7 @@ def _terminate(context: Context, target: ColumnElement[bool], reason: str) -> No
 
 
 def _cancel(context: Context, target: ColumnElement[bool], reason: str) -> None:
-    ask_to_end(context.session, and_(target, Job.status.in_(_EARLY)), reason, cancelled=True)
+    ask_to_end(context.session, target, reason, cancel=True)
 
 
 class UnknownJob(ClientError):

@@ -11,12 +11,7 @@ from typing import Any
 
 from orchestrator.api.errors import ClientError
 
-_FARGATE = "is for Fargate, which is not supported; leave it out"
 _REFUSED = {
-    "networkConfiguration": _FARGATE,
-    "fargatePlatformConfiguration": _FARGATE,
-    "ephemeralStorage": _FARGATE,
-    "runtimePlatform": _FARGATE,
     "enableExecuteCommand": "is not supported; leave it out",
     "repositoryCredentials": "is not supported; log the controller's Docker in to the registry: docker login",
 }
