@@ -32,14 +32,15 @@ def list_tracks(order: Order) -> list[Order]:
         found.append({**_told(order, track), "origin": {"preset": name}, "about": PRESETS[name].about})
     for name in stored.names(store):
         try:
-            rings = _rings(resolve(name, store)) if order.get("rings") else {}
-            found.append({**stored.StoredTrack(store.tracks / name).facts(), **rings})
+            track = resolve(name, store)
+            found.append({**stored.StoredTrack(store.tracks / name).facts(), **_told(order, track)})
         except (stored.TrackError, UserError) as error:
             found.append({"name": name, "problem": str(error)})
     return found
 
 
 def _told(order: Order, track: Track) -> Order:
+    """Measures of a track; they come from its points, also where another version kept others beside them."""
     return {**track.facts(), **(_rings(track) if order.get("rings") else {})}
 
 
@@ -56,7 +57,7 @@ def show(order: Order) -> Order:
     if track.name not in stored.names(store):
         return _told(order, track)
     kept = stored.find(store, track.name)
-    return {**_told(order, track), **kept.facts(), "path": str(kept.path)}
+    return {**kept.facts(), **_told(order, track), "path": str(kept.path)}
 
 
 def make(order: Order) -> Order:

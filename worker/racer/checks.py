@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.errors import UserError
-from worker.racer.arithmetic import Floats, cross, meetings, norm
+from worker.racer.arithmetic import Floats, cross, meetings, nearest_points, norm, segments_of
 
 WAYPOINTS = (20, 5000)
 """Greatest number; the car looks at all of them in every step."""
@@ -24,6 +24,8 @@ LEAST_RADIUS = 0.25
 """Of the centre line's curves [m]; with its wheels turned by 30° a car turns with a radius of 0.28 m."""
 CURVE = 0.3
 """Over this distance ahead and behind a curve is measured [m]: digitised tracks are not smooth from point to point."""
+LEVEL = 0.005
+"""By this share the borders may be nearer to a waypoint than their own rows: a file has corners where the road has curves."""
 RINGS = ("centre line", "inner border", "outer border")
 
 _BLOCK = 512
@@ -52,7 +54,6 @@ def check(center: Floats, inner: Floats, outer: Floats) -> None:
     for ring, name in zip(rings, RINGS, strict=True):
         check_numbers(ring, name)
     _check_steps(center)
-    _check_width(inner, outer)
     _check_curves(center)
     if crossing := first_crossing(rings):
         raise BadTrack(_crossing_told(rings, *crossing))
@@ -61,6 +62,7 @@ def check(center: Floats, inner: Floats, outer: Floats) -> None:
         raise BadTrack(f"the inner border lies outside the centre line: {at(inner, 0)}{turned}")
     if not inside(outer, center[:1])[0]:
         raise BadTrack(f"the outer border does not enclose the centre line: {at(outer, 0)}")
+    _check_width(*beside(center, inner, outer))
 
 
 def check_numbers(ring: Floats, name: str) -> None:
@@ -97,6 +99,19 @@ def radii_of(center: Floats) -> Floats:
     backwards = behind[:, 0] * ahead[:, 0] + behind[:, 1] * ahead[:, 1] < 0
     found: Floats = np.where(twice_area == 0, np.where(backwards, 0.0, np.inf), radii)
     return found
+
+
+def beside(center: Floats, inner: Floats, outer: Floats, closed: bool = True) -> tuple[Floats, Floats]:
+    """The points of both borders across the road from each waypoint, two of (N, 2) [m].
+
+    In many files the border rows are not level with those of the centre line. These points are the nearest ones of the borders, from
+    which AWS's simulator takes ``track_width``; a row that is level (to :data:`LEVEL`) stays as it is.
+    """
+    points = [nearest_points(border, center, closed) for border in (inner, outer)]
+    rows = norm(inner - center) + norm(outer - center)
+    level = rows <= (1 + LEVEL) * sum(norm(each - center) for each in points)
+    found = (np.where(level[:, None], border, each) for border, each in zip((inner, outer), points, strict=True))
+    return next(found), next(found)
 
 
 def area_of(ring: Floats) -> float:

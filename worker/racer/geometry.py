@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.racer.arithmetic import BLOCK, Floats, cross, meetings, norm
+from worker.racer.arithmetic import Floats, cross, meetings, nearest, norm
 from worker.racer.track import Track
 
 
@@ -55,7 +55,7 @@ def project(track: Track, points: Any, backwards: Any = False) -> Projection:
     points = np.asarray(points, np.float64).reshape(-1, 2)
     backwards = np.broadcast_to(np.asarray(backwards, bool), len(points))
     count = len(track.center)
-    row, share = _nearest(track, points)
+    row, share = nearest(track.center, points)
     # a segment has the waypoint at which its driver enters it, and not the one at which it leaves
     step_on = ~backwards & (share >= 1)
     step_back = backwards & (share <= 0)
@@ -127,21 +127,3 @@ def advance(track: Track, before: Any, after: Any) -> Floats:
 def degrees(angles: Any) -> Floats:
     """Angles [rad] in degrees from -180 to 180, as reward functions see them."""
     return np.asarray(angles, np.float64) * (180 / math.pi)
-
-
-def _nearest(track: Track, points: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """For each point the segment with the nearest point of the centre line, (P,) int64, and where on it that lies, (P,) from 0 to 1."""
-    start, segment = track.center, np.roll(track.center, -1, axis=0) - track.center
-    squared = track.steps * track.steps
-    rows, shares = np.empty(len(points), np.int64), np.empty(len(points))
-    size = max(1, BLOCK // len(start))
-    for begin in range(0, len(points), size):
-        here = slice(begin, begin + size)
-        x = points[here, None, 0] - start[:, 0]
-        y = points[here, None, 1] - start[:, 1]
-        share = np.clip((x * segment[:, 0] + y * segment[:, 1]) / squared, 0.0, 1.0)
-        x, y = x - share * segment[:, 0], y - share * segment[:, 1]
-        row = (x * x + y * y).argmin(axis=1)
-        rows[here] = row
-        shares[here] = np.take_along_axis(share, row[:, None], 1)[:, 0]
-    return rows, shares

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from worker.racer.arithmetic import norm
+from worker.racer.arithmetic import nearest_points, norm
 from worker.racer.geometry import project as project_all
 from worker.racer.track import Track
 
@@ -301,17 +301,5 @@ def clear_of(track: Track) -> float:
     The nearest point of a border is at one of its waypoints, or where it passes one of the centre line.
     """
     borders = project_all(track, np.concatenate((track.inner, track.outer))).distance.min()
-    passed = min(_distance(track.center, ring).min() for ring in (track.inner, track.outer))
+    passed = min(norm(nearest_points(ring, track.center) - track.center).min() for ring in (track.inner, track.outer))
     return float(min(borders, passed)) - 1e-4
-
-
-def _distance(points: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """From each point (P, 2) to the nearest one of a closed ring (N, 2), (P,) [m]."""
-    segment = np.roll(ring, -1, axis=0) - ring
-    squared = np.maximum((segment * segment).sum(axis=1), 1e-12)
-    found = []
-    for point in points:
-        away = point - ring
-        share = np.clip((away * segment).sum(axis=1) / squared, 0.0, 1.0)
-        found.append(norm(away - share[:, None] * segment).min())
-    return np.array(found)

@@ -131,7 +131,10 @@ def _track(rows: Floats, name: str) -> Imported:
     if not inside(center, inner).any() and inside(center, outer).all():
         inner, outer = outer, inner
         notes.append("the borders were swapped (columns 2 and 3 lie outside the centre line): taken the right way")
-    return Imported(Track(name, center, inner, outer), tuple(notes))
+    track = Track(name, center, inner, outer)
+    if track.slanted:
+        notes.append(track.slant)
+    return Imported(track, tuple(notes))
 
 
 def _different(center: Floats) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from worker.racer.arithmetic import Floats, norm
-from worker.racer.checks import area_of, check, radii_of, steps_of
+from worker.racer.checks import area_of, beside, check, radii_of, steps_of
 
 Direction = Literal["counter-clockwise", "clockwise"]
 COUNTER_CLOCKWISE: Direction = "counter-clockwise"
@@ -29,8 +29,8 @@ class Track:
     Args:
         name: What people call it.
         center: Waypoints of the centre line in driving order, (N, 2) float64 [m]; the start line is at row 0.
-        inner: The border inside the loop beside each waypoint, (N, 2) float64 [m]: on the left of a track that goes round
-            counter-clockwise, on the right of a clockwise one.
+        inner: The border inside the loop, (N, 2) float64 [m]: on the left of a track that goes round counter-clockwise, on the right of a
+            clockwise one. Its rows need not be level with the waypoints: :attr:`beside`.
         outer: The border outside, (N, 2) float64 [m].
 
     Raises:
@@ -50,9 +50,27 @@ class Track:
         check(self.center, self.inner, self.outer)
 
     @cached_property
+    def beside(self) -> tuple[Floats, Floats]:
+        """The points of the inner and the outer border across the road from each waypoint, two of (N, 2) [m]."""
+        return beside(self.center, self.inner, self.outer)
+
+    @cached_property
+    def slanted(self) -> int:
+        """How many rows of the borders are not level with their waypoint."""
+        inner, outer = self.beside
+        return int(((inner != self.inner) | (outer != self.outer)).any(axis=1).sum())
+
+    @property
+    def slant(self) -> str:
+        """What is to say of :attr:`slanted` rows, one line."""
+        rows = f"{self.slanted} of {len(self.center)} rows of its borders"
+        return f"{rows} are not level with their waypoint: widths are taken across the road"
+
+    @cached_property
     def width(self) -> Floats:
         """Of the road at each waypoint, (N,) [m]: from the one border to the other."""
-        return norm(self.outer - self.inner)
+        inner, outer = self.beside
+        return norm(outer - inner)
 
     @cached_property
     def steps(self) -> Floats:
