@@ -44,7 +44,7 @@ def resume(
             "checkpoint": checkpoint,
             "nodes": nodes,
             "set": [
-                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_),
+                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, client.keep_text),
                 *elsewhere,
                 *accepted,
             ],

@@ -27,7 +27,7 @@ from orchestrator.console.submit_fields import Group, document, filled, groups, 
 from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
 from orchestrator.console.tracks import track_names
 from orchestrator.domain.errors import SpecError
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
 from shared_store.wording import nearest
@@ -169,6 +169,8 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
     definition = compile_definition(spec, "")
     if unfit := _unfit(request, spec, PlanRequest(definition=definition, queue=spec.queue)):
         raise ClientError(unfit.message)
+    for text in long_texts(spec):
+        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
     registered = batch.call(reconciler, "RegisterJobDefinition", definition)
     answer = batch.call(reconciler, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
     return answer["jobId"], answer["jobName"]
