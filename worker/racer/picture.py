@@ -33,10 +33,11 @@ def picture_of(track: Track) -> bytes:
     size = (span + 2 * margin) * _SIDE / (span.max() + 2 * margin)
     figure = Figure(figsize=(max(size[0], 4.5) + 0.6, max(size[1], 2.0) + 1.1), dpi=100, layout="constrained")
     axes = figure.subplots()
-    rings = [np.vstack((ring, ring[:1])) for ring in (track.outer, track.inner[::-1])]
+    borders = track.outer, track.inner[::-1]
+    rings = [np.vstack((ring, ring[:1])) for ring in (borders if track.closed else [np.vstack(borders)])]
     codes = [[Path.MOVETO, *[Path.LINETO] * (len(ring) - 2), Path.CLOSEPOLY] for ring in rings]
     axes.add_patch(PathPatch(Path(np.vstack(rings), np.concatenate(codes)), facecolor=_ASPHALT, edgecolor="none"))
-    for ring in rings:
+    for ring in rings if track.closed else borders:
         axes.plot(*ring.T, color=_BORDER, linewidth=1.4)
     axes.plot(*track.center.T, ".", color=_CENTER, markersize=2.6)
     _number(axes, track)

@@ -21,6 +21,7 @@ from worker.racer.rewards.parameters import NUMBER_COLUMNS, OBJECT_COLUMNS
 from worker.racer.rewards.parameters import OBJECT_COUNT as COUNT
 from worker.racer.rewards.parameters import TRACK as TRACK_ROW
 from worker.racer.rewards.reward import RewardFunction, checked, compiled_function
+from worker.racer.road import is_open
 from worker.simulation.sensors.sensor import SensorContext
 from worker.tasks.configs.racer import FrontCameraConfig
 
@@ -146,7 +147,7 @@ def _tell(
         side = sides[track, number]
         if backwards:
             side = -side
-            if along > 0.0:
+            if along > 0.0 or is_open(car.road, track):
                 along = length - along
         row[O_PLACE] = box[0]
         row[O_PLACE + 1] = box[1]
@@ -220,8 +221,7 @@ class Racing:
         self._device = context.device
         self._worlds, self._seconds = context.worlds.world_count, 1.0 / context.control_hz
         circuit, front = declared.circuit, declared.front
-        # as in files, the first waypoint stands at the end once more
-        lines = [np.vstack((track.center, track.center[:1])).tolist() for track in circuit.tracks]
+        lines = [track.line().tolist() for track in circuit.tracks]
         reward, compiled = declared.reward, declared.function is not None
         # each rank has its own share of the processors, which torch knows
         processes = max(1, min(torch.get_num_threads(), -(-self._worlds // 16)))

@@ -54,7 +54,9 @@ def main() -> None:
         end(f"the function printed more than {confined.MOST_PRINTED >> 10} KiB of text in one call", line)
 
     alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
-    confined.confine(asked["memory"], keep=(steps.fileno(), out.fileno()))  # where it does not hold, the guard has told it
+    confined.confine(
+        asked["memory"], keep=(steps.fileno(), out.fileno())
+    )  # where it does not hold, the guard has told it
     with confined.printing(printed):
         try:
             alarm.set(60.0)  # imports, on a loaded machine

@@ -267,7 +267,9 @@ def program(machine: str, process: int) -> list[tuple[int, int, int, int]]:
     def word(argument: int, high: bool = False) -> tuple[int, int, int, int]:
         return (_LOAD, 0, 0, 16 + 8 * argument + 4 * high)
 
-    writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_PATH | os.O_TMPFILE & ~os.O_DIRECTORY
+    writing = (
+        os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_PATH | os.O_TMPFILE & ~os.O_DIRECTORY
+    )
     where(_OPENAT, word(2), (_ANY_BIT, 1, 0, writing))
     where(_OPEN, word(1), (_ANY_BIT, 1, 0, writing))
     where(_CLONE, word(0), (_ANY_BIT, 2, 0, _NAMESPACES), (_ANY_BIT, 0, 1, _THREAD))
