@@ -347,7 +347,8 @@ def lap_of(world: int, car: CarArrays) -> float:
     track = car.tracks[world]
     lap = car.road.length[track]
     if is_open(car.road, track):
-        lap = wp.max(car.travelled[world] + lap - car.along[world], 1.0e-3)
+        # what is left is exactly 0 at the end, where the lap is what was travelled
+        lap = wp.max(car.travelled[world] + (lap - car.along[world]), 1.0e-3)
     return lap
 
 

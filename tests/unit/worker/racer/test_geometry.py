@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.support.worker.racing import open_track
 from worker.racer import road
 from worker.racer.arithmetic import sine_cosine
 from worker.racer.bicycle import Motion, drive
@@ -158,7 +159,7 @@ def test_many_points_at_once_give_the_same_results_as_one() -> None:
     assert on_road(track, points)[2345] == on_road(track, points[2345])[0]
 
 
-TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3)]
+TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3), open_track()]
 
 
 @wp.struct
