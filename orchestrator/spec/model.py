@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -285,6 +285,11 @@ class Spec(Section):
         """It as JSON."""
         return self.model_dump(mode="json", exclude_none=True)
 
+    def with_notes(self, notes: Iterable[str]) -> Spec:
+        """This spec, with further notes."""
+        self._notes += tuple(notes)
+        return self
+
     @property
     def kind(self) -> str:
         """Which of :data:`KINDS` this job is."""
@@ -334,8 +339,7 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
-    spec._notes = tuple(notes)
-    return spec
+    return spec.with_notes(notes)
 
 
 def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

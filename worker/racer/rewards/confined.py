@@ -145,8 +145,7 @@ def told_result(result: Any) -> str:
 def told_error(error: BaseException) -> str:
     """The message for an exception that a function raised."""
     if isinstance(error, ModuleNotFoundError):
-        package = (error.name or "").partition(".")[0]
-        way = "; install it with: pip install 'muster[worker]'" if package in sandbox.PACKAGES else ""
+        way = f": pip install {error.name} (the extra 'worker' has it)" if error.name in sandbox.PACKAGES else ""
         return f"{error.name} is not installed here{way}"
     if isinstance(error, MemoryError):
         return f"it used more than {MEMORY >> 30} GiB of memory"

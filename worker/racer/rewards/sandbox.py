@@ -182,9 +182,9 @@ def _restrict(libc: ctypes.CDLL, version: int, files: list[str], listed: list[st
             if not stat.S_ISDIR(os.fstat(place).st_mode):
                 allowed = _READ_FILE
             libc.syscall(_LANDLOCK[1], rules, 1, struct.pack("=Qi", allowed, place), 0)
-    held = libc.syscall(_LANDLOCK[2], rules, 0) == 0
+    held = libc.syscall(_LANDLOCK[2], rules, 0)
     os.close(rules)
-    return held
+    return bool(held == 0)
 
 
 @contextlib.contextmanager

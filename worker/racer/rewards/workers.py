@@ -29,6 +29,8 @@ SECONDS = 2.0
 """For one call [s]."""
 _START = 120.0
 """For a process to start and import what the function imports [s]."""
+_MOST_SAID = 1 << 20
+"""Bytes of an answer."""
 
 
 class Workers:
@@ -157,6 +159,8 @@ class Workers:
             if not poll.poll(max(0.0, 1000.0 * (until - time.monotonic()))):
                 raise RewardFailed(f"{self.file}: {cars}: the function did not return, and its process takes no signal")
             part = os.read(process.stdout.fileno(), 1 << 16)
+            if len(said) > _MOST_SAID:
+                raise RewardFailed(f"{self.file}: {cars}: the function's process answers without end")
             if not part:
                 code = process.wait()
                 cause = f"signal {-code}" if code < 0 else f"exit code {code}"
