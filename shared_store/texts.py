@@ -23,6 +23,8 @@ LARGEST = 1 << 20
 IN_DEFINITION = 20 << 10
 """Bytes that a text may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+_HALF = re.compile("[\ud800-\udfff]")
+"""A half of a character, which JSON can name and no file can hold."""
 _SECTIONS = ("train", "evaluate", "race")
 
 
@@ -80,7 +82,7 @@ def referring(config: Mapping[str, Any], where: str) -> tuple[dict[str, Any], di
     result, texts = dict(config), {}
     for field, value in config.items():
         text = value.get("text") if isinstance(value, Mapping) and value.keys() <= {"file", "text"} else None
-        if isinstance(text, str) and size_in_definition(value) > IN_DEFINITION:
+        if isinstance(text, str) and size_in_definition(value) > IN_DEFINITION and not _HALF.search(text):
             reference = Reference(f"{where}.{field}", str(value.get("file") or field), digest_of(text))
             result[field] = {"file": reference.file, "sha256": reference.sha256}
             texts[reference] = text

@@ -15,7 +15,7 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import KeptText, now
 from shared_store.layout import Run
-from shared_store.texts import Reference, TextError, read, references
+from shared_store.texts import Reference, TextError, read, references, resolved_spec
 
 
 def check_texts(context: Context, gang: GangSpec) -> None:
@@ -41,6 +41,13 @@ def keep_again(reconciler: Reconciler, run: Run, spec: Mapping[str, Any] | None)
         except (TextError, OSError):
             continue
         reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
+
+
+def with_texts(reconciler: Reconciler, run: str, spec: Mapping[str, Any]) -> dict[str, Any]:
+    """The spec of a job of that run with its long texts, to be shown. On a thread of the store."""
+    with reconciler.database.session() as session:
+        folders = [reconciler.texts.source(session, reference) for reference in references(spec)]
+    return resolved_spec(spec, reconciler.store.run(run).texts, *folders)
 
 
 def _kept(context: Context, reference: Reference) -> KeptText:
