@@ -16,6 +16,7 @@ from worker.racer.car_arrays import CarArrays, ahead_of, progress_of
 from worker.racer.circuit import BOX, Circuit
 from worker.racer.geometry import project
 from worker.racer.rewards.compiled import RaceArrays
+from worker.racer.rewards.courses import courses_of
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import NUMBER_COLUMNS, OBJECT_COLUMNS
 from worker.racer.rewards.parameters import OBJECT_COUNT as COUNT
@@ -189,7 +190,7 @@ class RewardInputs:
         Raises:
             ValueError: The guard refuses it.
         """
-        problem, warnings = checked(reward.text, reward.file) if device else (None, ())
+        problem, warnings = checked(reward.text, reward.file, courses_of(circuit)) if device else (None, ())
         if problem:
             raise ValueError(f"config.reward_function: {problem}")
         function, _, reason, notes = compiled_function(reward.text, reward.file, device)
@@ -228,7 +229,14 @@ class Racing:
         # each rank has its own share of the processors, which torch knows
         processes = max(1, min(torch.get_num_threads(), -(-self._worlds // 16)))
         self.reward = RewardFunction(
-            reward.text, lines, self._worlds, self._device, reward.file, compiled=compiled, processes=processes
+            reward.text,
+            lines,
+            self._worlds,
+            self._device,
+            reward.file,
+            compiled=compiled,
+            processes=processes,
+            courses=courses_of(circuit),
         )
         weakref.finalize(self, self.reward.close)
         self.arrays = self.reward.race
