@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shared_store import tracks as stored
 from shared_store.files import write_atomic
 from shared_store.layout import Store
@@ -45,8 +47,9 @@ def _told(order: Order, track: Track) -> Order:
 
 
 def _rings(track: Track) -> Order:
-    """The borders in driving order, as pairs [m] rounded to centimetres; for drawings."""
-    return {"rings": {"inner": track.inner.round(2).tolist(), "outer": track.outer.round(2).tolist()}}
+    """The borders in driving order and the ends of the start line, as pairs [m] rounded to centimetres; for drawings."""
+    lines = {"inner": track.inner, "outer": track.outer, "start": np.stack([border[0] for border in track.beside])}
+    return {"rings": {name: line.round(2).tolist() for name, line in lines.items()}, "closed": track.closed}
 
 
 def show(order: Order) -> Order:
