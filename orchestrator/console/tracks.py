@@ -135,7 +135,7 @@ def facts(track: Mapping[str, Any]) -> dict[str, Any]:
         "Width": f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m",
         "Tightest radius": f"{track['least_radius']:.2f} m",
         "Direction": track["direction"],
-        "Waypoints": f"{track['waypoints']}, {track['length'] / track['waypoints']:.3f} m apart",
+        "Waypoints": f"{track['waypoints']}, {track['length'] / (track['waypoints'] - (not track['closed'])):.3f} m apart",
         "From": ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in origin.items() if key != "notes"),
         "Mended": "; ".join(map(str, origin.get("notes") or ())),
         "Digest": track["digest"],

@@ -49,7 +49,7 @@ def _told(order: Order, track: Track) -> Order:
 def _rings(track: Track) -> Order:
     """The borders in driving order and the ends of the start line, as pairs [m] rounded to centimetres; for drawings."""
     lines = {"inner": track.inner, "outer": track.outer, "start": np.stack([border[0] for border in track.beside])}
-    return {"rings": {name: line.round(2).tolist() for name, line in lines.items()}, "closed": track.closed}
+    return {"rings": {name: line.round(2).tolist() for name, line in lines.items()}}
 
 
 def show(order: Order) -> Order:

@@ -134,6 +134,7 @@ class Track:
             "width": [float(self.width.min()), float(self.width.max())],
             "least_radius": self.least_radius,
             "direction": self.direction,
+            "closed": self.closed,
             "waypoints": len(self.center),
             "digest": self.digest,
         }

@@ -60,7 +60,7 @@ def test_the_measures_of_an_open_track_end_at_its_last_waypoint() -> None:
     assert len(HORSESHOE.steps) == 79 and len(HORSESHOE.along) == len(HORSESHOE.width) == 80
     assert pytest.approx(OVAL.along[79], rel=1e-12) == END and HORSESHOE.along[-1] == END
     facts = HORSESHOE.facts()
-    assert (facts["direction"], facts["waypoints"]) == ("open", 80)
+    assert (facts["direction"], facts["waypoints"], facts["closed"]) == ("open", 80, False)
     assert HORSESHOE.rows().shape == (80, 6) and HORSESHOE.line().shape == (80, 2) and OVAL.line().shape == (134, 2)
     line = np.stack((np.arange(0, 6, 0.25), np.zeros(24)), -1)
     assert Track("line", line, line + np.array([0, 0.4]), line - np.array([0, 0.4]), closed=False).least_radius == 1e4
