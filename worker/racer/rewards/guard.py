@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
 import functools
 import io
 import json
@@ -131,11 +132,13 @@ def check_source(
 def _fault_on(course: Course, source: str, file: str, anyway: bool, notes: list[str]) -> Problem | None:
     """The fault that a function has on a track; None where it passes one of the track's trials."""
     first, *others = course.trials()
-    fault = try_out(source, file, first, course.where, anyway=anyway, note=notes.append)
+    fault = try_out(source, file, first, anyway=anyway, note=notes.append)
+    if fault is not None and fault.message.startswith("the sample "):
+        fault = dataclasses.replace(fault, message=f"{fault.message}{course.where}")
     if fault is None or fault.kind != "TEST_FAILURE":
         return fault
     for other in others:
-        if try_out(source, file, other, course.where, anyway=anyway, note=notes.append) is None:
+        if try_out(source, file, other, anyway=anyway, note=notes.append) is None:
             place = f"{file}:{fault.line}" if fault.line else file
             failing = (
                 f"it fails where there are no objects{', as in this job' if course.name else ''} ({fault.message})"
@@ -255,7 +258,6 @@ def try_out(
     source: str,
     file: str,
     samples: Mapping[str, Any],
-    where: str = "",
     *,
     anyway: bool = False,
     note: Note | None = None,
@@ -266,7 +268,6 @@ def try_out(
         source: The text.
         file: The name of its file.
         samples: By name.
-        where: The track, in messages.
         anyway: Run it without a sandbox.
         note: Called with one line.
 
@@ -277,7 +278,6 @@ def try_out(
         "source": source,
         "file": file,
         "samples": samples,
-        "where": where,
         "seconds": SECONDS,
         "root": root,
         "anyway": anyway,

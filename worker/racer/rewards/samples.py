@@ -118,7 +118,7 @@ def sample(
     """
     segment, (x, y), direction = line.at(car.way)
     after = (segment + 1) % (len(line.points) - 1) if line.closed else segment + 1
-    width = line.widths[segment]
+    width = line.width(car.way)
     if is_reversed:
         segment, after, direction = after, segment, direction + math.pi
     far = abs(car.offset)
@@ -186,9 +186,9 @@ class Course:
 
     @property
     def where(self) -> str:
-        """The track in messages, after a space; empty where it is none of a job's."""
+        """The end of a message: the track; empty where it is none of a job's."""
         waypoints = len(self.points) - self.closed
-        return f" on track {self.name} ({waypoints} waypoints)" if self.name else ""
+        return f", on track {self.name} with {waypoints} waypoints" if self.name else ""
 
     def trials(self) -> list[dict[str, dict[str, Any]]]:
         """Sample inputs with each of which a function may pass: with the job's objects, or without any, and as AWS tries it."""

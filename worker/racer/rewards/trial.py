@@ -1,7 +1,6 @@
 """The guard's process: tries a reward function on sample inputs, with limits, and says what happened in lines of JSON.
 
-Run by its path, in isolated mode. It reads one JSON object from standard input: ``source``, ``file``, ``samples``, ``where``: their
-track, ``seconds``, ``root``,
+Run by its path, in isolated mode. It reads one JSON object from standard input: ``source``, ``file``, ``samples``, ``seconds``, ``root``,
 ``anyway``: try it also where the sandbox does not hold.
 """
 
@@ -57,7 +56,7 @@ def main() -> None:
             alarm.set(asked["seconds"])
             function = confined.load(asked["source"], file)
             for name, params in asked["samples"].items():
-                now = f"the sample {name!r}{asked['where']}"
+                now = f"the sample {name!r}"
                 tell(trying=now)
                 _points(params)
                 given = copy.deepcopy(params)

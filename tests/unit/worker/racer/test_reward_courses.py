@@ -46,12 +46,12 @@ def test_a_function_that_needs_objects_is_valid_with_the_job_s_and_noted_without
     assert told(NEXT, "oval", boxes=BOXES) == ("", [])
     problem, (note,) = told(NEXT, "oval")
     assert problem == "" and note == (
-        "r.py:3: it fails where there are no objects, as in this job (the sample 'start' on track oval (133 waypoints): IndexError: list "
-        "index out of range); it is valid, since it passes with objects, with which AWS tries it: add obstacles"
+        "r.py:3: it fails where there are no objects, as in this job (the sample 'start': IndexError: list index out of range, "
+        "on track oval with 133 waypoints); it is valid, since it passes with objects, with which AWS tries it: add obstacles"
     )
     broken = NEXT.replace('["closest_objects"]', '["closest_object"]')
     assert told(broken, "oval") == (
-        "r.py:2: TEST_FAILURE: the sample 'start' on track oval (133 waypoints): KeyError: 'closest_object'",
+        "r.py:2: TEST_FAILURE: the sample 'start': KeyError: 'closest_object', on track oval with 133 waypoints",
         [],
     )
 
@@ -62,15 +62,13 @@ def test_a_function_that_fails_with_objects_is_valid_in_a_job_without() -> None:
     problem, _ = told(many, "oval", boxes=BOXES)
     assert (
         problem
-        == "r.py:2: TEST_FAILURE: the sample 'start' on track oval (133 waypoints): ZeroDivisionError: float division by zero"
+        == "r.py:2: TEST_FAILURE: the sample 'start': ZeroDivisionError: float division by zero, on track oval with 133 waypoints"
     )
 
 
 def test_a_waypoint_that_the_job_s_track_has_may_be_asked_for() -> None:
     assert told(FAR, "chicane") == ("", [])
-    problem = (
-        "r.py:2: TEST_FAILURE: the sample 'start' on track oval (133 waypoints): IndexError: list index out of range"
-    )
+    problem = "r.py:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track oval with 133 waypoints"
     assert told(FAR, "oval")[0] == told(FAR, "chicane", "oval")[0] == problem
     assert check_source(FAR, "r.py", [FINE_OVAL], anyway=True) is None
 
@@ -132,7 +130,7 @@ def test_the_command_tries_the_tracks_that_it_finds_and_says_which_it_does_not(
     assert (
         code == 1
         and problem
-        == f"{file}:2: TEST_FAILURE: the sample 'start' on track short (80 waypoints): IndexError: list index out of range"
+        == f"{file}:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track short with 80 waypoints"
     )
     code, notes = run({"track": "short"})
     assert code == 0 and notes[0].startswith(
@@ -157,7 +155,7 @@ def test_settings_that_are_wrong_are_another_s_to_refuse() -> None:
 def test_a_rank_tries_its_function_on_its_own_track_and_notes_what_needs_objects() -> None:
     words = refusal(racer, track="oval", reward_function=RewardFile("far.py", FAR), error=ValueError)
     assert words.endswith(
-        "far.py:2: TEST_FAILURE: the sample 'start' on track oval (133 waypoints): IndexError: list index out of range"
+        "far.py:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track oval with 133 waypoints"
     )
     task = racer(track="chicane", reward_function=RewardFile("far.py", FAR))
     assert not [note for note in task.notes() if "objects" in note]
