@@ -277,4 +277,6 @@ def test_a_reward_function_that_is_tried_tells_nothing_of_the_server(console: Co
         problem = checked(visitor, {"yaml": json.dumps({"name": "a", "queue": "lab", "train": train})}, whole="yes")[
             "problem"
         ]
-        assert problem["message"].endswith("r.py:6: TEST_FAILURE: the sample 'start': ValueError: []")
+        assert problem["message"].endswith(
+            "r.py:6: TEST_FAILURE: the sample 'start': ValueError: [], on track oval with 133 waypoints"
+        )
