@@ -158,8 +158,15 @@ def _spec(
     worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
     source = f"{'race' if kind == 'race' else 'evaluation'} of {run}"
     changed = override(document, [*worlds, *elsewhere])
-    task = (trained.get("train") or {}).get("task")
-    return validate(with_files(changed, source, task=task, note=tell_note), source)
+    train = trained.get("train") or {}
+    task, base = train.get("task"), train.get("config") or {}
+
+    def store() -> str | None:
+        place = str(client.get("/api/capacity")["store"])
+        return place if Path(place).is_dir() else None
+
+    whole = with_files(changed, source, task=task, base=base, store=store, note=tell_note)
+    return validate(whole, source)
 
 
 def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:

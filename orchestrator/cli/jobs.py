@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,9 +15,10 @@ from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client, named
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ApiError, ServerError, SpecError, Unavailable, Unreachable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
+from orchestrator.home import local_url, muster_home
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.json_schema import contract_schema, schema
@@ -94,7 +96,7 @@ def submit(
     as_json: JsonOption = False,
 ) -> None:
     """Submit a job to a running controller."""
-    loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)])
+    loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)], store_here)
     tell(loaded)
     with Client.connect() as client:
         if engine is not None:
@@ -111,6 +113,18 @@ def submit(
                 echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, submitted["jobId"]))
+
+
+def store_here(named: str | None = None) -> str | None:
+    """The path of the controller's store, or else of ``named`` or this home directory's; None where it is not on this machine."""
+    place = Path(named).expanduser() if named else muster_home() / "store"
+    if os.environ.get("MUSTER_URL") or local_url():
+        try:
+            with Client.connect() as client:
+                place = Path(client.get("/api/capacity")["store"])
+        except (ApiError, ServerError, Unavailable, Unreachable):
+            return None
+    return str(place) if place.is_dir() else None
 
 
 def tell(spec: Spec) -> None:

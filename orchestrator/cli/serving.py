@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, submit_spec, tell
+from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, store_here, submit_spec, tell
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
@@ -54,7 +54,7 @@ def run(
 
     Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
-    loaded = specfile.load(spec, set_)
+    loaded = specfile.load(spec, set_, lambda: store_here(store))
     tell(loaded)
     for name in engine or ():
         check_engine(name)

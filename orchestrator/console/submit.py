@@ -99,7 +99,7 @@ def check(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML of the filled fields, its problem, and help for a line; ``whole`` also tries a reward function."""
     permissions.check(Operation.SUBMIT_JOB)
     text, _ = _text(request, form)
-    spec, problem = _checked(text, form.one("whole") == "yes")
+    spec, problem = _checked(request, text, form.one("whole") == "yes")
     line = form.one("line")
     return JSONResponse(
         {
@@ -116,7 +116,7 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML with the hosts on which its nodes would start; or the form again, with its problem."""
     permissions.check(Operation.SUBMIT_JOB)
     text, task = _text(request, form)
-    spec, problem = _checked(text, whole=True)
+    spec, problem = _checked(request, text, whole=True)
     plan: dict[str, Any] = {}
     unplanned = ""
     if spec is not None:
@@ -163,7 +163,7 @@ def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
 def _submitted(request: Request, form: Form) -> tuple[str, str]:
     """Submit the job of a form; its id and its name."""
     text = _lines(form.one("yaml"))
-    spec, problem = _checked(text, whole=True)
+    spec, problem = _checked(request, text, whole=True)
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
@@ -193,7 +193,7 @@ def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
     return Problem(problem, "resources.cpus") if problem else None
 
 
-def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
+def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     """The spec of a text, or its problem.
 
     A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys the text of a reward function
@@ -202,7 +202,8 @@ def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     tries = whole and permissions.current_identity.get().queues is None
     try:
         with (_turns if tries else _checks).turn():
-            return from_text(text, SOURCE, whole=tries), None
+            store = str(reconciler_of(request).store.path)
+            return from_text(text, SOURCE, whole=tries, store=lambda: store), None
     except SpecError as error:
         return None, problem_of(str(error), text)
 

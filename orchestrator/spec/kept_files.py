@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +27,8 @@ from shared_store.texts import IN_DEFINITION, LARGEST, beside, size_in_definitio
 _SECTIONS = ("train", "evaluate", "race")
 Note = Callable[[str], object]
 """Is called with a line for the user."""
+Place = Callable[[], str | None]
+"""The path of the store in which a job finds what its configuration names, asked where a check needs it; None: not on this machine."""
 
 
 def with_files(
@@ -34,6 +37,8 @@ def with_files(
     lines: Mapping[tuple[str | int, ...], int] | None = None,
     *,
     task: str | None = None,
+    base: Mapping[str, Any] | None = None,
+    store: Place = lambda: None,
     note: Note | None = None,
 ) -> dict[str, Any]:
     """A job's document with the content of the files that its task's configuration names in the place of their paths.
@@ -45,6 +50,9 @@ def with_files(
         source: Its name in errors.
         lines: Line of each key path in the file, for errors.
         task: Name of the task, where the document does not say it.
+        base: The configuration that the document's changes. A file's content in it is checked anew where the document changes what the
+            check depends on.
+        store: Where checks find what the configuration names.
         note: Called with each line that a check has for the user.
 
     Raises:
@@ -54,11 +62,12 @@ def with_files(
     for section, field, value, how in _fields(document, task):
         if isinstance(value, str):
             try:
-                content = _content(value, how, note)
+                content = _content(value, how, _Checked(how, _whole(document[section], base), store, note))
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
             values = result[section]
             result[section] = {**values, "config": {**values["config"], field: content}}
+    _check_again(document, source, lines or {}, task, base or {}, store, note)
     return result
 
 
@@ -90,21 +99,59 @@ def check_texts(
     document: Mapping[str, Any],
     source: str,
     lines: Mapping[tuple[str | int, ...], int],
+    store: Place = lambda: None,
     note: Note | None = None,
 ) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     for section, field, value, how in _fields(document):
-        text = value.get("text") if isinstance(value, Mapping) else None
-        if how.form != "text" or not isinstance(text, str):
-            continue
-        name = str(value.get("file") or field)
         try:
-            with TemporaryDirectory() as folder:
-                path = Path(folder) / "text"
-                path.write_text(text, encoding="utf-8")
-                _check(str(path), how, note, name)
+            _check_text(value, field, _Checked(how, _whole(document[section], None), store, note))
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+
+
+def _check_again(
+    document: Mapping[str, Any],
+    source: str,
+    lines: Mapping[tuple[str | int, ...], int],
+    task: str | None,
+    base: Mapping[str, Any],
+    store: Place,
+    note: Note | None,
+) -> None:
+    """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
+    for section in _SECTIONS:
+        values = document.get(section)
+        if not isinstance(values, Mapping):
+            continue
+        config, name = values.get("config") or {}, values.get("task", task)
+        if not isinstance(config, Mapping):
+            continue
+        whole = _whole(values, base)
+        for field, how in kept_files(task_config(name) if isinstance(name, str) else None).items():
+            changed = [key for key in how.given if whole.get(key) != base.get(key)]
+            if field in config or not changed:
+                continue
+            try:
+                _check_text(base.get(field), field, _Checked(how, whole, store, note))
+            except SpecError as error:
+                raise SpecError(f"{place_of((section, 'config', changed[0]), source, lines)}{error}") from None
+
+
+def _whole(values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The configuration of a section, as far as it is known; a race names its track beside it."""
+    track = {"track": values["track"]} if values.get("track") else {}
+    return {**(base or {}), **(values.get("config") or {}), **track}
+
+
+def _check_text(value: Any, field: str, checked: _Checked) -> None:
+    """Raises SpecError."""
+    text = value.get("text") if isinstance(value, Mapping) else None
+    if checked.how.form == "text" and isinstance(text, str):
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "text"
+            path.write_text(text, encoding="utf-8")
+            _check(str(path), checked, str(value.get("file") or field))
 
 
 def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tuple[str, str, Any, KeptFile]]:
@@ -125,12 +172,13 @@ def changes_with_files(
     spec_of_run: Callable[[], Mapping[str, Any] | None],
     changes: Sequence[str] | None,
     keep: Callable[[str], object],
+    store: Place = lambda: None,
     note: Note | None = None,
 ) -> list[str]:
     """``--set`` assignments for a run that is resumed or cloned, with the content of files as :func:`with_files`.
 
-    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``note`` as of
-    :func:`with_files`.
+    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``store`` and
+    ``note`` as of :func:`with_files`.
 
     Raises:
         SpecError: As :func:`with_files`.
@@ -139,14 +187,24 @@ def changes_with_files(
     if not any(each.startswith(("train.config", "train=")) for each in given):
         return given
     trained = (spec_of_run() or {}).get("train") or {}
-    task = setting_at(override({"train": {"task": trained.get("task")}}, given), "train.task")
-    return [_embedded(each, task, keep, note) for each in given]
+    before = trained.get("config") or {}
+    changed = override({"train": {"task": trained.get("task"), "config": before}}, given)
+    task, config = (setting_at(changed, key) for key in ("train.task", "train.config"))
+    if isinstance(config, Mapping) and isinstance(task, str):
+        new = {field: value for field, value in config.items() if value != before.get(field)}
+        _check_again({"train": {"config": new}}, "--set", {}, task, before, store, note)
+    return [_embedded(each, task, config, keep, store, note) for each in given]
 
 
-def _embedded(assignment: str, task: Any, keep: Callable[[str], object], note: Note | None) -> str:
+def _embedded(
+    assignment: str, task: Any, config: Any, keep: Callable[[str], object], store: Place, note: Note | None
+) -> str:
     key = assignment.partition("=")[0]
     change = override({}, [assignment])
-    whole, texts = beside(with_files(change, "", {tuple(key.split(".")): 0}, task=task, note=note))
+    base = config if isinstance(config, Mapping) else {}
+    whole, texts = beside(
+        with_files(change, "", {tuple(key.split(".")): 0}, task=task, base=base, store=store, note=note)
+    )
     if whole == change:
         return assignment
     for text in texts.values():
@@ -160,7 +218,17 @@ def _embedded(assignment: str, task: Any, keep: Callable[[str], object], note: N
     return f"{key}={text}"
 
 
-def _content(path: str, how: KeptFile, note: Note | None) -> Any:
+@dataclass(frozen=True)
+class _Checked:
+    """How a file is checked, with the configuration in which it stands; the other attributes as of :func:`with_files`."""
+
+    how: KeptFile
+    config: Mapping[str, Any]
+    store: Place
+    note: Note | None
+
+
+def _content(path: str, how: KeptFile, checked: _Checked) -> Any:
     """The value in the configuration. Raises SpecError."""
     try:
         with Path(path).open("rb") as stream:
@@ -181,7 +249,7 @@ def _content(path: str, how: KeptFile, note: Note | None) -> Any:
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
     _check_size(path, value, how)
-    _check(path, how, note)
+    _check(path, checked)
     return value
 
 
@@ -196,15 +264,20 @@ def _check_size(name: str, value: Any, how: KeptFile) -> None:
         raise SpecError(f"{name}: {words}; shorten it")
 
 
-def _check(path: str, how: KeptFile, note: Note | None, name: str = "") -> None:
+def _check(path: str, checked: _Checked, name: str = "") -> None:
     """Have another process check the file, since the parts of tasks belong to the worker. Raises SpecError, in which ``name`` stands for the path."""
+    how, note = checked.how, checked.note
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False)
-    said = [line.replace(path, name or path, 1) for line in checked.stderr.strip().splitlines()]
-    if checked.returncode:
-        raise SpecError(said[-1] if said else f"{how.check} ended with exit code {checked.returncode}")
+    if how.given:
+        given = {field: checked.config[field] for field in how.given if field in checked.config}
+        command += ["--config", json.dumps(given)]
+        command += ["--store", store] if (store := checked.store()) is not None else []
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [line.replace(path, name or path, 1) for line in answer.stderr.strip().splitlines()]
+    if answer.returncode:
+        raise SpecError(said[-1] if said else f"{how.check} ended with exit code {answer.returncode}")
     if note is not None:
         for line in said:
             note(line)

@@ -16,11 +16,13 @@ from worker.racer.car_arrays import CarArrays, ahead_of, progress_of
 from worker.racer.circuit import BOX, Circuit
 from worker.racer.geometry import project
 from worker.racer.rewards.compiled import RaceArrays
+from worker.racer.rewards.courses import courses_of
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import NUMBER_COLUMNS, OBJECT_COLUMNS
 from worker.racer.rewards.parameters import OBJECT_COUNT as COUNT
 from worker.racer.rewards.parameters import TRACK as TRACK_ROW
 from worker.racer.rewards.reward import RewardFunction, checked, compiled_function
+from worker.racer.road import is_open
 from worker.simulation.sensors.sensor import SensorContext
 from worker.tasks.configs.racer import FrontCameraConfig
 
@@ -146,7 +148,7 @@ def _tell(
         side = sides[track, number]
         if backwards:
             side = -side
-            if along > 0.0:
+            if along > 0.0 or is_open(car.road, track):
                 along = length - along
         row[O_PLACE] = box[0]
         row[O_PLACE + 1] = box[1]
@@ -188,7 +190,7 @@ class RewardInputs:
         Raises:
             ValueError: The guard refuses it.
         """
-        problem, warnings = checked(reward.text, reward.file) if device else (None, ())
+        problem, warnings = checked(reward.text, reward.file, courses_of(circuit)) if device else (None, ())
         if problem:
             raise ValueError(f"config.reward_function: {problem}")
         function, _, reason, notes = compiled_function(reward.text, reward.file, device)
@@ -222,13 +224,19 @@ class Racing:
         self._device = context.device
         self._worlds, self._seconds = context.worlds.world_count, 1.0 / context.control_hz
         circuit, front = declared.circuit, declared.front
-        # as in files, the first waypoint stands at the end once more
-        lines = [np.vstack((track.center, track.center[:1])).tolist() for track in circuit.tracks]
+        lines = [track.line().tolist() for track in circuit.tracks]
         reward, compiled = declared.reward, declared.function is not None
         # each rank has its own share of the processors, which torch knows
         processes = max(1, min(torch.get_num_threads(), -(-self._worlds // 16)))
         self.reward = RewardFunction(
-            reward.text, lines, self._worlds, self._device, reward.file, compiled=compiled, processes=processes
+            reward.text,
+            lines,
+            self._worlds,
+            self._device,
+            reward.file,
+            compiled=compiled,
+            processes=processes,
+            courses=courses_of(circuit),
         )
         weakref.finalize(self, self.reward.close)
         self.arrays = self.reward.race

@@ -100,8 +100,9 @@ class Racer(DeclaredTask):
             self.sensors["race"].follow(self.sensors["car"].arrays)
 
     def notes(self) -> list[str]:
-        """Notes of the robot, and the place where a learner's reward function runs (device or host) with the reason."""
-        notes = [*super().notes()]
+        """Notes of the robot and the tracks, and the place where a learner's reward function runs (device or host) with the reason."""
+        slants = [f"track {track.name}: {track.slant}" for track in self.circuit.tracks if track.slanted]
+        notes = [*super().notes(), *slants]
         if self.race is None:
             return notes
         notes += self.race.warnings

@@ -282,7 +282,9 @@ def test_a_reward_function_that_is_tried_tells_nothing_of_the_server(console: Co
         problem = checked(visitor, {"yaml": json.dumps({"name": "a", "queue": "lab", "train": train})}, whole="yes")[
             "problem"
         ]
-        assert problem["message"].endswith("r.py:6: TEST_FAILURE: the sample 'start': ValueError: []")
+        assert problem["message"].endswith(
+            "r.py:6: TEST_FAILURE: the sample 'start': ValueError: [], on track oval with 133 waypoints"
+        )
 
 
 def test_a_long_reward_function_is_kept_beside_the_job_and_shown_with_it(console: Console) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from worker.racer.presets import make_preset
+from worker.racer.track import Track
 from worker.tasks.configs.racer import RacerConfig
 from worker.tasks.racer import Racer
 
@@ -31,3 +32,9 @@ def counted(task: Racer, name: str) -> float:
 def straight(task: Racer, speed: float = 0.0) -> torch.Tensor:
     """Actions of cars that do not steer."""
     return torch.tensor([[0.0, speed]] * task.world_count)
+
+
+def open_track() -> Track:
+    """Half an oval, driven from its start line to the end of its second straight, to the left: 12 m or so, 1 m wide."""
+    rows = slice(0, 80)
+    return Track("horseshoe", OVAL.center[rows], OVAL.inner[rows], OVAL.outer[rows], closed=False)

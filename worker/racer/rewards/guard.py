@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
 import functools
 import io
 import json
@@ -18,13 +19,13 @@ import sys
 import threading
 import tokenize
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from shared_store.wording import nearest
 from worker.racer.rewards.problems import KINDS, Problem, RewardRefused
-from worker.racer.rewards.samples import samples
+from worker.racer.rewards.samples import OVAL, Course
 
 LARGEST = 140_000
 """Characters of a file."""
@@ -66,15 +67,16 @@ _SUBMODULES = {
 _OWN = {"self", "cls"}
 
 
-def check(path: Path, note: Note | None = None) -> Problem | None:
+def check(path: Path, courses: Sequence[Course] = (OVAL,), note: Note | None = None) -> Problem | None:
     """The first fault of a reward function in a file, or None.
 
     Args:
         path: The file.
+        courses: As of :func:`check_source`.
         note: As of :func:`check_source`.
     """
     try:
-        return check_source(read_file(path), str(path), note=note)
+        return check_source(read_file(path), str(path), courses, note=note)
     except RewardRefused as refused:
         return refused.problem
 
@@ -100,17 +102,52 @@ def read_file(path: Path) -> str:
 
 
 def check_source(
-    source: str, file: str = "reward_function.py", *, anyway: bool = False, note: Note | None = None
+    source: str,
+    file: str = "reward_function.py",
+    courses: Sequence[Course] = (OVAL,),
+    *,
+    anyway: bool = False,
+    note: Note | None = None,
 ) -> Problem | None:
     """:func:`check`, of a text.
 
     Args:
         source: The text.
         file: The name of its file, for messages.
+        courses: The job's tracks with their objects, on which it is tried.
         anyway: Run it also where the sandbox does not hold: for a job's own node, which runs the function in any case.
-        note: Called with one line where the sandbox does not hold.
+        note: Called with one line where the sandbox does not hold, and for a function that passes with objects alone, on a track without.
     """
-    return read(source, file) or try_out(source, file, anyway=anyway, note=note)
+    if problem := read(source, file):
+        return problem
+    notes: list[str] = []
+    found = (_fault_on(course, source, file, anyway, notes) for course in courses)
+    problem = next((each for each in found if each is not None), None)
+    if note is not None:
+        for line in dict.fromkeys(notes):
+            note(line)
+    return problem
+
+
+def _fault_on(course: Course, source: str, file: str, anyway: bool, notes: list[str]) -> Problem | None:
+    """The fault that a function has on a track; None where it passes one of the track's trials."""
+    first, *others = course.trials()
+    fault = try_out(source, file, first, anyway=anyway, note=notes.append)
+    if fault is not None and fault.message.startswith("the sample "):
+        fault = dataclasses.replace(fault, message=f"{fault.message}{course.where}")
+    if fault is None or fault.kind != "TEST_FAILURE":
+        return fault
+    for other in others:
+        if try_out(source, file, other, anyway=anyway, note=notes.append) is None:
+            place = f"{file}:{fault.line}" if fault.line else file
+            failing = (
+                f"it fails where there are no objects{', as in this job' if course.name else ''} ({fault.message})"
+            )
+            notes.append(
+                f"{place}: {failing}; it is valid, since it passes with objects, with which AWS tries it: add obstacles"
+            )
+            return None
+    return fault
 
 
 @functools.lru_cache(maxsize=16)
@@ -217,8 +254,22 @@ def _function(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
         yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", found[0].lineno
 
 
-def try_out(source: str, file: str, *, anyway: bool = False, note: Note | None = None) -> Problem | None:
-    """Faults with sample inputs, found in a process of its own with limits. Arguments as of :func:`check_source`.
+def try_out(
+    source: str,
+    file: str,
+    samples: Mapping[str, Any],
+    *,
+    anyway: bool = False,
+    note: Note | None = None,
+) -> Problem | None:
+    """Faults with sample inputs, found in a process of its own with limits. Other arguments as of :func:`check_source`.
+
+    Args:
+        source: The text.
+        file: The name of its file.
+        samples: By name.
+        anyway: Run it without a sandbox.
+        note: Called with one line.
 
     The process may be in the hands of an attacker: its answer is bounded, and can say nothing but a fault of this function.
     """
@@ -226,7 +277,7 @@ def try_out(source: str, file: str, *, anyway: bool = False, note: Note | None =
     asked = {
         "source": source,
         "file": file,
-        "samples": samples(),
+        "samples": samples,
         "seconds": SECONDS,
         "root": root,
         "anyway": anyway,

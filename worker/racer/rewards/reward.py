@@ -13,6 +13,7 @@ from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, war
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
 from worker.racer.rewards.problems import Failure, Problem, RewardRefused, one_line
+from worker.racer.rewards.samples import OVAL, Course
 from worker.racer.rewards.translation import Outside, translate
 from worker.racer.rewards.workers import Workers
 
@@ -28,6 +29,7 @@ class RewardFunction:
         file: Name of the file, in messages.
         compiled: False: in Python workers, even if it could be compiled.
         processes: How many Python workers; by default as many as there are processors.
+        courses: On which the guard tries it.
 
     Attributes:
         race: The arrays that a step fills before the call (:class:`worker.racer.rewards.compiled.RaceArrays`).
@@ -51,8 +53,9 @@ class RewardFunction:
         *,
         compiled: bool = True,
         processes: int | None = None,
+        courses: tuple[Course, ...] = (OVAL,),
     ) -> None:
-        if problem := checked(source, file)[0]:
+        if problem := checked(source, file, courses)[0]:
             raise RewardRefused(problem)
         self.file = file
         self.function: Any = None
@@ -120,10 +123,10 @@ class RewardFunction:
 
 
 @functools.lru_cache(maxsize=64)
-def checked(source: str, file: str) -> tuple[Problem | None, tuple[str, ...]]:
+def checked(source: str, file: str, courses: tuple[Course, ...] = (OVAL,)) -> tuple[Problem | None, tuple[str, ...]]:
     """The guard's answer on a job's own node, asked once in a process for each function, with its warnings, a line each."""
     notes: list[str] = []
-    return check_source(source, file, anyway=True, note=notes.append), tuple(notes)
+    return check_source(source, file, courses, anyway=True, note=notes.append), tuple(notes)
 
 
 def compiled_function(source: str, file: str, device: str) -> tuple[Any, Any, str, tuple[str, ...]]:

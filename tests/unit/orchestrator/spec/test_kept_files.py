@@ -15,6 +15,8 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.kept_files import changes_with_files, with_files
 from orchestrator.spec.model import validate
+from orchestrator.spec.tracks import ask
+from shared_store.layout import Store
 from shared_store.texts import IN_DEFINITION, LARGEST, digest_of
 from tests.support.refusals import refusal
 
@@ -194,3 +196,55 @@ def test_a_text_that_fails_on_a_sample_is_refused_under_the_name_of_its_file_whe
     assert specfile.from_text(fails, "job", whole=False).name == "racer"
     with pytest.raises(SpecError, match=r"^job:7: train\.config\.reward_function: mine\.py:2: TEST_FAILURE: .*sped"):
         specfile.from_text(fails, "job")
+
+
+FAR = "def reward_function(params):\n    return params['waypoints'][140][0]\n"
+SHORT = (
+    "mine.py:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track oval with 133 waypoints"
+)
+
+
+def test_a_reward_function_is_tried_on_the_job_s_own_track(directory: Path) -> None:
+    (directory / "mine.py").write_text(FAR)
+    assert refusal(specfile.load, "job.yaml", error=SpecError) == f"job.yaml:7: train.config.reward_function: {SHORT}"
+    assert "TEST_FAILURE" not in str(specfile.load("job.yaml", ["train.config.track=chicane"]).notes)
+    with pytest.raises(
+        SpecError, match=r"^job:7: train\.config\.reward_function: .* on track oval with 133 waypoints$"
+    ):
+        specfile.from_text(in_yaml(FAR), "job")
+
+
+def test_a_track_of_the_store_is_tried_where_the_store_is_here_and_noted_where_it_is_not(directory: Path) -> None:
+    (directory / "mine.py").write_text(FAR)
+    store = Store(directory / "store").open()
+    ask(
+        {
+            "action": "make",
+            "name": "short",
+            "preset": "oval",
+            "seed": None,
+            "measures": {"length": 12.0},
+            "store": str(store.path),
+        }
+    )
+    changes = ["train.config.track=short"]
+    refused = refusal(specfile.load, "job.yaml", changes, lambda: str(store.path), error=SpecError)
+    assert "IndexError: list index out of range, on track short with 80 waypoints" in refused
+    notes = specfile.load("job.yaml", changes).notes
+    assert any("mine.py: it is not tried on track short, but on the job's nodes" in note for note in notes)
+
+
+def test_a_run_s_function_is_tried_anew_on_another_track() -> None:
+    kept = {"file": "mine.py", "text": FAR}
+    racer = {"train": {"task": "Racer", "config": {"track": "chicane", "reward_function": kept}}}
+    changes = ["train.iterations=9", "train.config.track=oval"]
+    refused = refusal(changes_with_files, lambda: racer, changes, no_text, error=SpecError)
+    assert refused.endswith(SHORT) and "train.config.track" in refused
+    same = ["train.config.speed_lag=0.1"]
+    assert changes_with_files(lambda: racer, same, no_text) == same
+    config = {"track": "oval"}
+    for document in ({"evaluate": {"config": config}}, {"race": {"track": "oval"}}):
+        with pytest.raises(SpecError, match="on track oval"):
+            with_files(document, "evaluation of r", task="Racer", base=racer["train"]["config"])
+    boxes = {"evaluate": {"config": {"obstacles": [{"distance": 3.0}]}}}
+    assert with_files(boxes, "evaluation of r", task="Racer", base=racer["train"]["config"]) == boxes

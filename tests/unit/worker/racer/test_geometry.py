@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.support.worker.racing import open_track
 from worker.racer import road
 from worker.racer.arithmetic import sine_cosine
 from worker.racer.bicycle import Motion, drive
@@ -51,7 +52,8 @@ def test_sines_are_made_of_nothing_but_operations_that_are_rounded_alike_everywh
 def test_the_measures_of_a_square_are_those_of_its_sides() -> None:
     track = square()
     assert (track.length, track.direction, len(track.center)) == (16.0, COUNTER_CLOCKWISE, 32)
-    assert track.width.min() == 1.0 and track.width.max() == pytest.approx(math.sqrt(2))  # the diagonal at a corner
+    # at a corner from the inner one to a side: the borders' nearest points, as in AWS's simulator
+    assert track.width.min() == 1.0 and track.width.max() == pytest.approx(math.hypot(0.5, 1.0))
     assert list(track.along[:4]) == [0.0, 0.5, 1.0, 1.5]
     assert track.rows().shape == (33, 6) and (track.rows()[0] == track.rows()[-1]).all()
 
@@ -66,9 +68,10 @@ def test_a_point_is_projected_onto_the_centre_line_and_the_width_between_waypoin
     np.testing.assert_allclose(found.heading, [0, math.pi / 2, math.pi, -math.pi / 2])
     np.testing.assert_allclose(degrees(found.heading), [0, 90, 180, -90])
     assert list(found.before) == [2, 13, 18, 30] and list(found.after) == [3, 14, 19, 31]
-    # from the corner, where the road is √2 wide, to the next waypoint: 2.5 from the middle, its borders are half as far apart
+    # from the corner to the next waypoint, beside the corner of the inner border
     found = project(square(), [[0.125, 0.0], [2.0, 0.3]])
-    np.testing.assert_allclose(found.width, [math.sqrt(2) + 0.25 * (1.25 - math.sqrt(2)), 1.0])
+    corner = math.hypot(0.5, 1.0)
+    np.testing.assert_allclose(found.width, [corner + 0.25 * (1.0 - corner), 1.0])
     found = project(square(), [[4.3, -0.4]])
     np.testing.assert_allclose(found.point, [[4, 0]], err_msg="the corner is the nearest point for a car outside it")
     assert found.distance[0] == pytest.approx(0.5) and not found.left[0]
@@ -156,7 +159,7 @@ def test_many_points_at_once_give_the_same_results_as_one() -> None:
     assert on_road(track, points)[2345] == on_road(track, points[2345])[0]
 
 
-TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3)]
+TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3), open_track()]
 
 
 @wp.struct
