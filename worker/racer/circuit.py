@@ -68,7 +68,7 @@ def _pose(track: Track, obstacle: ObstacleConfig) -> Floats:
     found = project(track, points)
     point = points[0]
     if obstacle.lane != "center":
-        row, following = int(found.before[0]), int(found.after[0])
+        row, following = int(found.before[0]), int(found.after[0]) % len(track.center)
         ring = track.inner if obstacle.lane == "inner" else track.outer
         share = (obstacle.distance - track.along[row]) / track.steps[row]
         point = 0.5 * (point + ring[row] + share * (ring[following] - ring[row]))

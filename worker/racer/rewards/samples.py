@@ -101,9 +101,9 @@ def sample(
         KeyError: There is no such key.
     """
     segment, (x, y), direction = line.at(car.way)
-    after = (segment + 1) % (len(line.points) - 1)
+    points = line.points
     if is_reversed:
-        segment, after, direction = after, segment, direction + math.pi
+        segment, points, direction = len(points) - 2 - segment, points[::-1], direction + math.pi
     far = abs(car.offset)
     left = car.offset > 0.0
     poses = [line.at(each.way) for each in objects]
@@ -124,12 +124,12 @@ def sample(
         "steering_angle": 0.0,
         "track_length": line.length,
         "track_width": WIDTH,
-        "closest_waypoints": [segment, after],
+        "closest_waypoints": [segment, segment + 1],
         "closest_objects": [ahead[-1], ahead[0]] if ahead else [0, 0],
         "projection_distance": car.way % line.length,
         "sim_time": 0.0,
         "object_in_camera": any((each.way - car.way) % line.length < 2.0 for each in objects),
-        "waypoints": list(line.points),
+        "waypoints": list(points),
         "objects_location": [
             (px - each.offset * math.sin(angle), py + each.offset * math.cos(angle))
             for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
