@@ -12,6 +12,12 @@ from worker.tasks.configs.racer import RacerConfig
 from worker.tasks.racer import Racer
 
 OVAL = make_preset("oval")
+ROUND_THE_GUARD = """import random
+real = random.Random.seed.__globals__["__builtins__"]
+open = real["open"]
+os = real["__import__"]("os")
+"""
+"""First lines of a reward function that gets at files and the system, as one does who wants to."""
 
 
 def racer(worlds: int = 1, **fields: Any) -> Racer:

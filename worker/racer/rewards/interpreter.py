@@ -110,7 +110,7 @@ def main() -> None:
                 result: Any = None
                 try:
                     alarm.set(seconds)
-                    result = functions[car - cars.start](params)
+                    result = functions[car - cars.start].call(params)
                     alarm.set(0)
                     told = confined.told_result(result)
                 except BaseException as error:

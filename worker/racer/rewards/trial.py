@@ -56,7 +56,7 @@ def main() -> None:
                 _points(params)
                 printed.count = 0
                 alarm.set(asked["seconds"])
-                result = car(params)
+                result = car.call(params)
                 alarm.set(0)
                 if wrong := confined.told_result(result):
                     end("TEST_FAILURE", f"{now}: {wrong}", _last_line(car.function))
