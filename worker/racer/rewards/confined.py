@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from worker.racer.rewards.namespaces import Forbidden
 from worker.racer.rewards.problems import LARGEST_REWARD, one_line, out_of_range
 
 MEMORY = 2 << 30
@@ -110,6 +111,8 @@ def told_result(result: Any) -> str:
 
 def told_error(error: BaseException) -> str:
     """The message for an exception that a function raised."""
+    if isinstance(error, Forbidden):
+        return str(error)
     if isinstance(error, ModuleNotFoundError):
         return f"{error.name} is not installed here"
     if isinstance(error, MemoryError):

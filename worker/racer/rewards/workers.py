@@ -51,6 +51,7 @@ class Workers:
         numbers: What the cars are told, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
         objects: Of their objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``, float32.
         failures: The calls that gave no reward so far, by their message.
+        processes: The processes; none once they are ended.
 
     Raises:
         RewardFailed: The file can't be loaded.
@@ -90,7 +91,7 @@ class Workers:
             "shared": self._descriptor,
         }
         firsts = range(0, worlds, self._share)
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self.processes: list[subprocess.Popen[bytes]] = []
         try:
             for first in firsts:
                 self._start({**asked, "first": first, "last": min(first + self._share, worlds)})
@@ -118,7 +119,7 @@ class Workers:
             env=environment(),
             pass_fds=[self._descriptor],
         )
-        self._processes.append(process)
+        self.processes.append(process)
         assert process.stdin is not None
         process.stdin.write(json.dumps(asked).encode() + b"\n")
         process.stdin.flush()
@@ -136,10 +137,10 @@ class Workers:
         return self._rewards.copy()
 
     def _ask(self, line: bytes, patience: float) -> None:
-        if not self._processes:
+        if not self.processes:
             raise RewardFailed(f"{self.file}: the processes that call the reward function have ended")
         try:
-            for process in self._processes:
+            for process in self.processes:
                 assert process.stdin is not None
                 with contextlib.suppress(BrokenPipeError):  # its end is told when its answer is missing
                     process.stdin.write(line)
@@ -152,7 +153,7 @@ class Workers:
     def _answers(self, patience: float) -> None:
         """Wait for a line from each process."""
         until = time.monotonic() + patience
-        for number, process in enumerate(self._processes):
+        for number, process in enumerate(self.processes):
             line = self._line(process, number, until)
             said = json.loads(line)
             if isinstance(said, dict):
@@ -184,15 +185,15 @@ class Workers:
 
     def close(self) -> None:
         """End the processes."""
-        for process in self._processes:
+        for process in self.processes:
             process.kill()
-        for process in self._processes:
+        for process in self.processes:
             process.wait()
             for pipe in (process.stdin, process.stdout):
                 assert pipe is not None
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
-        self._processes = []
+        self.processes = []
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -133,6 +133,41 @@ def test_a_flood_of_text_and_an_error_of_the_module_are_refused_with_their_line(
     assert told(source) == f"r.py:{message.format('TEST_FAILURE')}".replace("::", ":")
 
 
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            f"import numpy as np\n{HEAD}return len(np.ma.core.inspect.linecache.getlines('a'))",
+            "3: the sample 'start': inspect",
+        ),
+        (
+            f"import numpy as np\nbox = [np]\n{HEAD}box[0].savetxt('a', [])\n    return 1",
+            "4: the sample 'start': numpy.savetxt",
+        ),
+        (f"import scipy\nx = scipy\n{HEAD}return 1\nx.datasets", "5: the module: scipy.datasets"),
+        (
+            f"import numpy as np\n{HEAD}return np.random.get_bit_generator()",
+            "3: the sample 'start': numpy.random.get_bit_generator",
+        ),
+    ],
+)
+def test_a_module_outside_the_packages_and_a_function_for_files_are_refused_by_whatever_name(
+    source: str, message: str
+) -> None:
+    line, _, rest = message.partition(": ")
+    assert told(source) == f"r.py:{line}: FORBIDDEN: {rest} can't be used in a reward function"
+
+
+def test_what_the_packages_need_inside_themselves_works() -> None:
+    source = (
+        "import numpy as np, scipy\nfrom scipy import interpolate, spatial\ndef reward_function(params):\n"
+        "    near = spatial.cKDTree(params['waypoints']).query([params['x'], params['y']])[0]\n"
+        "    line = interpolate.interp1d([0.0, 1.0], [1.0, 3.0])(0.5) + scipy.spatial.distance.euclidean([0.0], [2.0])\n"
+        "    return float(np.emath.sqrt(4.0) + np.fft.fft([1.0]).real[0] + near + line + np.random.default_rng(1).random())\n"
+    )
+    assert told(source) == ""
+
+
 CATCHING = "while True:\n        try:\n            while True: pass\n        except: pass"
 
 

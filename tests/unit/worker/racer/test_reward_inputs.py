@@ -308,7 +308,7 @@ def test_a_call_that_does_not_end_or_floods_ends_the_pool_with_its_line_and_car(
     body: str, line: int, message: str
 ) -> None:
     workers = pool(body, seconds=0.3)
-    processes = list(workers._processes)
+    processes = list(workers.processes)
     assert refusal(workers.rewards, error=RewardFailed) == f"reward.py:{line}: car 7: {message}"
     assert all(process.returncode is not None for process in processes)
     with pytest.raises(RewardFailed, match="have ended"):
@@ -317,7 +317,7 @@ def test_a_call_that_does_not_end_or_floods_ends_the_pool_with_its_line_and_car(
 
 def test_a_process_that_dies_is_reported_with_its_cars() -> None:
     workers = pool("return 1.0")
-    workers._processes[1].kill()
+    workers.processes[1].kill()
     with pytest.raises(RewardFailed, match=r"reward.py: cars 5 to 8: the process of the function ended \(signal 9\)"):
         workers.rewards()
 
@@ -340,7 +340,7 @@ def test_workers_end_with_the_process_that_started_them() -> None:
     child = os.fork()
     if child == 0:
         workers = pool("return 1.0", 2, 1)
-        os.write(writer, f"{workers._processes[0].pid}\n".encode())
+        os.write(writer, f"{workers.processes[0].pid}\n".encode())
         time.sleep(600)
     os.close(writer)
     with os.fdopen(reader) as said:
