@@ -167,7 +167,7 @@ def test_a_function_that_fails_in_too_many_worlds_ends_the_job_which_is_not_trie
     fault: str, before: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(
-        UserError, match="its reward term reward was not finite: reward.py.*; that is more than nan_limit"
+        UserError, match=r"its reward term reward was not finite: reward\.py.*; that is more than nan_limit"
     ):
         trained(f"{before}def reward_function(params):\n    return {fault}\n", tmp_path, nan_limit=0.0)
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: reward.py")]
