@@ -144,10 +144,10 @@ LATE = "def reward_function(params):\n    n = 0\n    while params['steps'] == 7:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (LATE, r"reward\.py: car 0: line 3: the loops of one call went round more than 1,000,000 times"),
+        (LATE, r"reward\.py:3: car 0: the loops of one call went round more than 1,000,000 times"),
         (
-            f"kept = []\n{LATE.replace('n = 0', 'n = len(kept)')}",
-            r"reward\.py:[45]: car 0: the function did not return within 2 s",
+            f"kept = []\n{LATE.replace('n = 0', 'kept.append(n := 0)')}",
+            r"reward\.py:[45]: car \d: the function did not return within 2 s",
         ),
     ],
 )
@@ -161,7 +161,7 @@ def test_a_call_that_does_not_end_ends_the_job_which_is_not_tried_again(
 
 @pytest.mark.parametrize("before", ["", "kept = []\nkept.append(1)\n"])
 @pytest.mark.parametrize(
-    "fault", ["1 / (params['steps'] - 7)", "1.0 if params['steps'] < 7 else 1e30 * params['steps']"]
+    "fault", ["1 / (params['steps'] - 7)", "1e30 * (9 + params['x']) if params['steps'] == 7 else 1.0"]
 )
 def test_a_function_that_fails_in_too_many_worlds_ends_the_job_which_is_not_tried_again(
     fault: str, before: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -171,6 +171,4 @@ def test_a_function_that_fails_in_too_many_worlds_ends_the_job_which_is_not_trie
     ):
         trained(f"{before}def reward_function(params):\n    return {fault}\n", tmp_path, nan_limit=0.0)
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: reward.py")]
-    assert len(told) == 1 and (
-        "ZeroDivisionError" in told[0] or "it returned 7e+30; a reward is from -100,000" in told[0]
-    )
+    assert len(told) == 1 and ("ZeroDivisionError" in told[0] or "e+30; a reward is from -100,000" in told[0])

@@ -14,7 +14,7 @@ from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
 from worker.racer.rewards.problems import Failure, RewardFailed, RewardRefused, one_line
 from worker.racer.rewards.translation import Outside, translate
-from worker.racer.rewards.translation.prelude import LOOP
+from worker.racer.rewards.translation.prelude import ERRORS, LOOP
 from worker.racer.rewards.workers import Workers
 
 
@@ -111,7 +111,7 @@ class RewardFunction:
             found = {}
             for code, (told, failure) in failures_of(self.race).items():
                 if code % 16 == LOOP:
-                    raise RewardFailed(f"{self.file}: car {failure.car}: {told}")
+                    raise RewardFailed(f"{self.file}:{code // 16}: car {failure.car}: {ERRORS[LOOP]}")
                 found[f"{self.file}: {self._told.setdefault(code, told)}"] = failure
         return dict(sorted(found.items(), key=lambda item: -item[1].count))
 
