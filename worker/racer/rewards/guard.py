@@ -27,7 +27,7 @@ from worker.racer.rewards.samples import samples
 LARGEST = 140_000
 """Characters of a file."""
 SECONDS = 5.0
-"""For a call on one sample, and for the file's own statements with their imports [s]."""
+"""For a call on one sample; the file's own statements, with their imports, have four times as long [s]."""
 _LOOKS_UP = ("LOAD_NAME", "LOAD_GLOBAL", "LOAD_FROM_DICT_OR_GLOBALS")
 """Instructions that look a name up among the built-in functions, too."""
 _MOST_COUNTED = 100_000_000
@@ -116,9 +116,9 @@ def _findings(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]
             imported |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
         yield from _import(node)
     starred = any(isinstance(node, ast.ImportFrom) and node.names[0].name == "*" for node in nodes)
-    used = dict(_unbound(code, NAMES | FILES if starred else NAMES, _bound(code)))
-    named = {node.id: node.lineno for node in reversed(nodes) if isinstance(node, ast.Name) and node.id[:2] == "__"}
-    for name, line in sorted((used | named).items(), key=lambda item: item[1]):
+    used = [*_unbound(code, NAMES | FILES if starred else NAMES, _bound(code))]
+    used += [(node.id, node.lineno) for node in nodes if isinstance(node, ast.Name) and node.id[:2] == "__"]
+    for name, line in sorted(used, key=lambda item: item[1]):
         if name != "__name__":
             yield "FORBIDDEN", f"{name} can't be used in a reward function", line
     for node in nodes:
@@ -153,24 +153,18 @@ def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
                 yield "FORBIDDEN", f"{name}.{alias.name} can't be used in a reward function", node.lineno
 
 
-def _bound(code: CodeType) -> set[str]:
+def _bound(code: CodeType, stores: tuple[str, ...] = ("STORE_NAME", "STORE_GLOBAL")) -> set[str]:
     """The global names to which a file gives values, also in its functions."""
-    found = {each.argval for each in dis.get_instructions(code) if each.opname in ("STORE_NAME", "STORE_GLOBAL")}
-    return found.union(*(_globals(part) for part in _parts(code)))
-
-
-def _globals(code: CodeType) -> set[str]:
-    """The global names to which a function, or one inside it, gives values."""
-    found = {each.argval for each in dis.get_instructions(code) if each.opname == "STORE_GLOBAL"}
-    return found.union(*(_globals(part) for part in _parts(code)))
+    found = {each.argval for each in dis.get_instructions(code) if each.opname in stores}
+    return found.union(*(_bound(part, ("STORE_GLOBAL",)) for part in _parts(code)))
 
 
 def _unbound(code: CodeType, names: frozenset[str], bound: set[str]) -> Iterator[tuple[str, int]]:
-    """Those of ``names`` that stand for built-in functions, with a line each: the compiler knows what is a variable."""
+    """Uses of those of ``names`` that stand for built-in functions, with their lines: the compiler knows what is a variable."""
     instructions = list(dis.get_instructions(code))
-    bound = bound | {each.argval for each in instructions if each.opname == "STORE_NAME"}  # of a class
+    own = bound | {each.argval for each in instructions if each.opname == "STORE_NAME"}  # of a class
     for each in instructions:
-        if each.opname in _LOOKS_UP and each.argval in names - bound and each.positions:
+        if each.opname in _LOOKS_UP and each.argval in names - own and each.positions:
             yield each.argval, each.positions.lineno or 0
     for part in _parts(code):
         yield from _unbound(part, names, bound)

@@ -70,7 +70,10 @@ ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_fu
         (f"{HEAD}return float(len(dir(params)))", forbidden(2, "dir")),
         (f"{HEAD}return max([1], key=vars)", forbidden(2, "vars")),
         (f"def other():\n    dir = 1\n    return dir\n{HEAD}return len(dir())", forbidden(5, "dir")),
-        (f"class A:\n    input = 1\n    x = input\n{HEAD}return [input for _ in 'a']", forbidden(5, "input")),
+        (
+            f"class A:\n    input = 1\n    x = input\n    def y(self): return input\n{HEAD}return [input for _ in 'a']",
+            forbidden(4, "input"),
+        ),
         (f"from numpy import *\n{HEAD}return load('a')", forbidden(3, "load")),
         ("from math import *\nx = 1", ": TEST_FAILURE: there is no def reward_function(params); the file defines none"),
     ],
