@@ -63,7 +63,7 @@ PARAMETERS = (
     ),
     Parameter("distance_from_center", "float", "one", "m", "Distance from the centre line", (0.0, None)),
     Parameter("is_left_of_center", "bool", "one", "", "Whether the car is on the left of the centre line"),
-    Parameter("is_reversed", "bool", "one", "", "Whether the car drives against the order of the waypoints"),
+    Parameter("is_reversed", "bool", "one", "", "Whether the car drives against the direction of the track"),
     Parameter("is_crashed", "bool", "one", "", "Whether the car has hit an object"),
     Parameter("is_offtrack", "bool", "one", "", "Whether no wheel is on the road"),
     Parameter("progress", "float", "one", "%", "Share of the lap that is done", (-100.0, 100.0)),

@@ -135,9 +135,7 @@ def sample(
             for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
         ],
         "objects_distance": [each.way % line.length for each in objects],
-        "objects_heading": [
-            _degrees(angle + math.radians(each.turned)) for each, (*_, angle) in zip(objects, poses, strict=True)
-        ],
+        "objects_heading": [0.0] * len(objects),
         "objects_left_of_center": [each.offset > 0.0 for each in objects],
         "objects_speed": [each.speed for each in objects],
         "objects_distance_from_center": [abs(each.offset) for each in objects],
@@ -190,4 +188,5 @@ def random_sample(line: Line, chance: random.Random) -> dict[str, Any]:
         steering_angle=chance.choice((-30.0, -15.0, 0.0, 15.0, 30.0, chance.uniform(-30.0, 30.0))),
         progress=chance.choice((chance.uniform(0.0, 100.0), 100.0)),
         is_crashed=chance.random() < 0.1,
+        objects_heading=[chance.uniform(-180.0, 180.0) for _ in objects],
     )
