@@ -20,7 +20,8 @@ class KeptFile:
 
     Attributes:
         form: ``text``: a mapping of ``file``, its name, and ``text``; ``json``: the value in the file.
-        check: A module; ``python -m MODULE FILE`` exits with 0 for a valid file; otherwise its last line names the error.
+        check: A module; ``python -m MODULE FILE`` exits with 0 for a valid file, and its standard error has notes for the user;
+            otherwise its last line names the error.
             Empty: the configuration's class checks enough.
         needs: Packages without which the check would refuse valid files: if the command lacks one, the node checks.
     """

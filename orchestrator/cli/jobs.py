@@ -114,7 +114,12 @@ def submit(
 def tell(spec: Spec) -> None:
     """Print a spec's warnings on standard error."""
     for note in spec.notes:
-        echo(f"note: {one_line(note)}", err=True)
+        tell_note(note)
+
+
+def tell_note(note: str) -> None:
+    """Print a warning on standard error."""
+    echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:

@@ -192,8 +192,8 @@ def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
 def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     """The spec of a text, or its problem.
 
-    A learner's code runs here only for keys with all queues, since its guard is no sandbox: for other keys the text of a reward
-    function is checked here, and the job's ranks try it.
+    A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys the text of a reward function
+    is checked here, and the job's ranks try it.
     """
     tries = whole and permissions.current_identity.get().queues is None
     try:
@@ -207,7 +207,9 @@ def _text(request: Request, form: Form) -> tuple[str, str]:
     """The YAML of a form, and the wizard's task; that is empty where the form has the YAML itself."""
     if not (task := form.one("task")):
         return _lines(form.one("yaml")), ""
-    return written(document(task, filled(form, _groups(request, task)))), task
+    found = filled(form, _groups(request, task))
+    with _checks.turn():
+        return written(document(task, found)), task
 
 
 def _lines(text: str) -> str:

@@ -22,6 +22,8 @@ from shared_store.settings import setting_at
 MOST = 20 << 10
 """Bytes that a file may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
 _SECTIONS = ("train", "evaluate", "race")
+Note = Callable[[str], object]
+"""Is called with a line for the user."""
 
 
 def with_files(
@@ -30,6 +32,7 @@ def with_files(
     lines: Mapping[tuple[str | int, ...], int] | None = None,
     *,
     task: str | None = None,
+    note: Note | None = None,
 ) -> dict[str, Any]:
     """A job's document with the content of the files that its task's configuration names in the place of their paths.
 
@@ -40,6 +43,7 @@ def with_files(
         source: Its name in errors.
         lines: Line of each key path in the file, for errors.
         task: Name of the task, where the document does not say it.
+        note: Called with each line that a check has for the user.
 
     Raises:
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
@@ -48,7 +52,7 @@ def with_files(
     for section, field, value, how in _fields(document, task):
         if isinstance(value, str):
             try:
-                content = _content(value, how)
+                content = _content(value, how, note)
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
             values = result[section]
@@ -80,7 +84,12 @@ def check_sizes(document: Mapping[str, Any], source: str, lines: Mapping[tuple[s
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
 
-def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
+def check_texts(
+    document: Mapping[str, Any],
+    source: str,
+    lines: Mapping[tuple[str | int, ...], int],
+    note: Note | None = None,
+) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     for section, field, value, how in _fields(document):
         text = value.get("text") if isinstance(value, Mapping) else None
@@ -91,7 +100,7 @@ def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[s
             with TemporaryDirectory() as folder:
                 path = Path(folder) / "text"
                 path.write_text(text, encoding="utf-8")
-                _check(str(path), how, name)
+                _check(str(path), how, note, name)
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
@@ -110,10 +119,12 @@ def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tu
                 yield section, field, config[field], how
 
 
-def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], changes: Sequence[str] | None) -> list[str]:
+def changes_with_files(
+    spec_of_run: Callable[[], Mapping[str, Any] | None], changes: Sequence[str] | None, note: Note | None = None
+) -> list[str]:
     """``--set`` assignments for a run that is resumed or cloned, with the content of files as :func:`with_files`.
 
-    ``spec_of_run`` is called where its task has to be known.
+    ``spec_of_run`` is called where its task has to be known. ``note`` as of :func:`with_files`.
 
     Raises:
         SpecError: As :func:`with_files`.
@@ -123,13 +134,13 @@ def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], chan
         return given
     trained = (spec_of_run() or {}).get("train") or {}
     task = setting_at(override({"train": {"task": trained.get("task")}}, given), "train.task")
-    return [_embedded(each, task) for each in given]
+    return [_embedded(each, task, note) for each in given]
 
 
-def _embedded(assignment: str, task: Any) -> str:
+def _embedded(assignment: str, task: Any, note: Note | None) -> str:
     key = assignment.partition("=")[0]
     change = override({}, [assignment])
-    whole = with_files(change, "", {tuple(key.split(".")): 0}, task=task)
+    whole = with_files(change, "", {tuple(key.split(".")): 0}, task=task, note=note)
     if whole == change:
         return assignment
     # as YAML reads it: what JSON writes in two halves beyond 16 bits is one character there
@@ -141,7 +152,7 @@ def _embedded(assignment: str, task: Any) -> str:
     return f"{key}={text}"
 
 
-def _content(path: str, how: KeptFile) -> Any:
+def _content(path: str, how: KeptFile, note: Note | None) -> Any:
     """The value in the configuration. Raises SpecError."""
     try:
         with Path(path).open("rb") as stream:
@@ -160,7 +171,7 @@ def _content(path: str, how: KeptFile) -> Any:
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
     _check_size(path, value)
-    _check(path, how)
+    _check(path, how, note)
     return value
 
 
@@ -171,12 +182,15 @@ def _check_size(name: str, value: Any) -> None:
         raise SpecError(f"{name}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
 
 
-def _check(path: str, how: KeptFile, name: str = "") -> None:
+def _check(path: str, how: KeptFile, note: Note | None, name: str = "") -> None:
     """Have another process check the file, since the parts of tasks belong to the worker. Raises SpecError, in which ``name`` stands for the path."""
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [line.replace(path, name or path, 1) for line in checked.stderr.strip().splitlines()]
     if checked.returncode:
-        said = checked.stderr.strip().splitlines() or [f"{how.check} ended with exit code {checked.returncode}"]
-        raise SpecError(said[-1].replace(path, name or path, 1))
+        raise SpecError(said[-1] if said else f"{how.check} ended with exit code {checked.returncode}")
+    if note is not None:
+        for line in said:
+            note(line)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -191,6 +191,15 @@ class Render(_OfCheckpoint):
     width: int = Field(default=640, ge=64, le=4096, description="of a frame [px]")
     height: int = Field(default=360, ge=64, le=4096, description="of a frame [px]")
 
+    @model_validator(mode="after")
+    def _has_even_sides(self) -> Render:
+        if self.format == "mp4" and (self.width % 2 or self.height % 2):
+            raise ValueError(
+                f"an .mp4 has even sides: width {self.width // 2 * 2} and height {self.height // 2 * 2}, say, not "
+                f"{self.width} and {self.height}"
+            )
+        return self
+
 
 class Spec(Section):
     """One job."""
@@ -275,6 +284,11 @@ class Spec(Section):
         """Notes for the submitter."""
         return self._notes
 
+    def with_notes(self, notes: Iterable[str]) -> Spec:
+        """This spec, with further notes."""
+        self._notes += tuple(notes)
+        return self
+
     @property
     def kind(self) -> str:
         """Which of :data:`KINDS` this job is."""
@@ -324,8 +338,7 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
-    spec._notes = tuple(notes)
-    return spec
+    return spec.with_notes(notes)
 
 
 def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

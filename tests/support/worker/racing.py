@@ -12,12 +12,14 @@ from worker.tasks.configs.racer import RacerConfig
 from worker.tasks.racer import Racer
 
 OVAL = make_preset("oval")
-ROUND_THE_GUARD = """import random
-real = random.Random.seed.__globals__["__builtins__"]
-open = real["open"]
-os = real["__import__"]("os")
-"""
-"""First lines of a reward function that gets at files and the system, as one does who wants to."""
+
+
+def round_the_guard(source: str, file: str = "r.py") -> str:
+    """A reward function with all built-in functions and modules of Python, as one gets at them who wants to."""
+    return (
+        "import random\n__builtins__ = random.Random.seed.__globals__['__builtins__']\n"
+        f"__builtins__['exec'](__builtins__['compile']({source!r}, {file!r}, 'exec'), (lambda: 0).__globals__)\n"
+    )
 
 
 def racer(worlds: int = 1, **fields: Any) -> Racer:

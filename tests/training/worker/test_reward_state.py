@@ -18,6 +18,7 @@ from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner
 from worker.errors import UserError
 from worker.racer.rewards import guard, workers
+from worker.racer.rewards.parameters import TRACK
 from worker.racer.rewards.problems import RewardFailed
 from worker.tasks.racer import Racer
 
@@ -90,6 +91,7 @@ def trained(source: str, path: Path, iterations: int = 2, **config: Any) -> Race
     loop = runner(env, task=Racer)
     assert loop.train() == 0
     loop.close()
+    assert isinstance(loop.task, Racer)
     return loop.task
 
 
@@ -99,13 +101,12 @@ def test_the_state_of_a_function_is_its_cars_alone(kind: str, tmp_path: Path, ca
     assert task.waits_for_host, "it was compiled: it has no state"
     race = task.sensors["race"].arrays
     lines = [line[:count].tolist() for line, count in zip(race.waypoints.numpy(), race.counts.numpy(), strict=True)]
-    track = workers.NUMBERS - 1
-    cars = [[(n[car].tolist(), [], int(n[car, track])) for n, _, _ in calls] for car in range(WORLDS)]
+    cars = [[(n[car].tolist(), list[Any](), int(n[car, TRACK])) for n, _, _ in calls] for car in range(WORLDS)]
     assert len(calls) >= 32 and len({line for car in cars for _, _, line in car}) == 2
     asked = json.dumps({"source": FUNCTIONS[kind], "cars": cars, "lines": lines})
     said = subprocess.run([sys.executable, "-c", ALONE], input=asked, capture_output=True, text=True, cwd=REPOSITORY)
     assert said.returncode == 0, said.stderr
-    expected = np.float32([json.loads(line) for line in said.stdout.splitlines()])
+    expected = np.array([json.loads(line) for line in said.stdout.splitlines()], np.float32)
     found = np.stack([rewards for _, _, rewards in calls], axis=1)
     np.testing.assert_array_equal(found, expected)
     assert len({tuple(row) for row in found.tolist()}) > 1, "the cars are alike: the test shows nothing"

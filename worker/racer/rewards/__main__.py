@@ -1,4 +1,7 @@
-"""``python -m worker.racer.rewards FILE`` says whether a reward function is valid, and whether it compiles."""
+"""``python -m worker.racer.rewards FILE`` says whether a reward function is valid, and whether it compiles.
+
+Standard error has the fault of a file that is not valid; of a valid one, a note where it was not run.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ def main() -> int:
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     failed = 0
     for path in parser.parse_args().files:
-        problem = check(path)
+        problem = check(path, note=lambda line: print(line, file=sys.stderr))
         if problem is not None:
             failed = 1
             print(problem, file=sys.stderr)

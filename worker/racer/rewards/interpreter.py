@@ -36,7 +36,7 @@ def main() -> None:
         os.dup2(nothing, descriptor)
     file, seconds, worlds = asked["file"], asked["seconds"], asked["worlds"]
     tracks = [[tuple(point) for point in track] for track in asked["tracks"]]
-    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")
+    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")  # its descriptor is closed, and its size sealed
     width, most, of_object = parameters.NUMBERS, parameters.MOST_OBJECTS, parameters.OBJECT_NUMBERS
     numbers, objects = shared[: worlds * width], shared[worlds * width : worlds * (width + most * of_object)]
     rewards = shared[worlds * (width + most * of_object) :]
@@ -86,7 +86,8 @@ def main() -> None:
         return made
 
     alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
-    confined.confine(asked["memory"])
+    # where it does not hold, the guard has told it
+    confined.confine(asked["memory"], keep=(steps.fileno(), out.fileno()))
     cars = range(asked["first"], asked["last"])
     with confined.printing(printed):
         functions = load()

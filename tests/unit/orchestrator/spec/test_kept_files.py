@@ -39,7 +39,7 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are read, and not tried: that takes a process each."""
-    monkeypatch.setattr(kept_files, "_check", lambda path, how: None)
+    monkeypatch.setattr(kept_files, "_check", lambda *_: None)
 
 
 def config(changes: list[str] | None = None) -> dict[str, Any]:

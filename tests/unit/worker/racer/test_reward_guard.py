@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import REPOSITORY
-from tests.support.worker.racing import ROUND_THE_GUARD
+from tests.support.worker.racing import round_the_guard
 from worker.racer.rewards import guard
 from worker.racer.rewards.__main__ import main
 from worker.racer.rewards.guard import check, check_source
@@ -39,6 +39,7 @@ def forbidden(line: int, what: str) -> str:
 MISTYPED = ": TEST_FAILURE: there is no def reward_function(params); did you mean reward?"
 TWICE = ":3: TEST_FAILURE: reward_function is defined 2 times; the first is in line 1"
 LONG = ": SYNTAX_ERROR: 140,045 characters; a reward function has at most 140,000"
+MANY = ": SYNTAX_ERROR: 120,015 words, signs and lines; a reward function has at most 60,000"
 BESIDE = ":1: IMPORT_ERROR: a reward function is one file: it can't import from beside it"
 ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_function(params)"
 
@@ -49,7 +50,8 @@ ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_fu
         ("def reward_function(params:\n    return 1\n", ":1: SYNTAX_ERROR: '(' was never closed"),
         (f"{HEAD}return 1\x00", ": SYNTAX_ERROR: source code string cannot contain null bytes"),
         ("x = " + "(" * 5000 + ")" * 5000, ":1: SYNTAX_ERROR: too many nested parentheses"),
-        (f"{HEAD}return {'1+' * 60_000}1", ": SYNTAX_ERROR: it is nested too deeply"),
+        (f"{HEAD}return {'1+' * 25_000}1", ": SYNTAX_ERROR: it is nested too deeply"),
+        (f"{HEAD}return 1.0\nx = 1{'<1' * 60_000}", MANY),
         (f"{HEAD}return 1.0\n#{'x' * 140_000}", LONG),
         (f"import os\n{HEAD}return 1", imports(1, "os")),
         (f"{HEAD}from subprocess import run\n    return 1", imports(2, "subprocess")),
@@ -81,7 +83,7 @@ ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_fu
 def test_a_text_that_cannot_be_used_is_refused_without_running_it(
     source: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guard, "try_out", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr(guard, "try_out", lambda *_, **__: pytest.fail("it was run"))
     assert told(source) == f"r.py{message}"
 
 
@@ -208,9 +210,10 @@ def test_a_tried_function_writes_no_file_and_sees_no_secret(tmp_path: Path, monk
     monkeypatch.setenv("MUSTER_TOKEN", "secret")
     kept = tmp_path / "kept.npy"
     monkeypatch.setattr(guard, "read", lambda *_: None)  # as one who gets round it would
-    source = f"{ROUND_THE_GUARD}{HEAD}assert 'MUSTER_TOKEN' not in os.environ\n    open({str(kept)!r}, 'w').write('x' * 9999)\n    return 1"
-    assert told(source) == "r.py:7: TEST_FAILURE: the sample 'start': OSError: [Errno 27] File too large"
-    assert not kept.exists() or kept.stat().st_size == 0
+    source = f"import os\n{HEAD}assert 'MUSTER_TOKEN' not in os.environ\n    open({str(kept)!r}, 'w').write('x' * 9999)\n    return 1"
+    denied = f"PermissionError: [Errno 1] Operation not permitted: {str(kept)!r}"
+    assert told(round_the_guard(source)) == f"r.py:4: TEST_FAILURE: the sample 'start': {denied}"
+    assert not kept.exists()
 
 
 def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
