@@ -60,7 +60,12 @@ def clone(
             "checkpoint": checkpoint,
             "nodes": nodes,
             "set": [
-                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, tell_note),
+                *changes_with_files(
+                    lambda: client.get(f"/api/runs/{named(run)}")["spec"],
+                    set_,
+                    (lambda text: None) if dry_run else client.keep_text,
+                    tell_note,
+                ),
                 *on_queue(set_, elsewhere),
             ],
             "directory": os.getcwd(),

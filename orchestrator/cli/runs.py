@@ -44,7 +44,9 @@ def resume(
             "checkpoint": checkpoint,
             "nodes": nodes,
             "set": [
-                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, tell_note),
+                *changes_with_files(
+                    lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, client.keep_text, tell_note
+                ),
                 *elsewhere,
                 *accepted,
             ],

@@ -1,4 +1,7 @@
-"""Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted."""
+"""Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted.
+
+A text that is too long for the job's definition is kept beside it (:mod:`shared_store.texts`).
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,8 @@ from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import place_of
 from shared_store.file_fields import KeptFile, kept_files
 from shared_store.settings import setting_at
+from shared_store.texts import IN_DEFINITION, LARGEST, beside, size_in_definition
 
-MOST = 20 << 10
-"""Bytes that a file may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
 _SECTIONS = ("train", "evaluate", "race")
 Note = Callable[[str], object]
 """Is called with a line for the user."""
@@ -77,9 +79,9 @@ def refuse_paths(document: Mapping[str, Any], source: str, lines: Mapping[tuple[
 
 def check_sizes(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
     """Refuse a file's content that is too large, before anything else is done with it. Arguments as :func:`with_files`. Raises SpecError."""
-    for section, field, value, _ in _fields(document):
+    for section, field, value, how in _fields(document):
         try:
-            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value)
+            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value, how)
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
@@ -120,11 +122,15 @@ def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tu
 
 
 def changes_with_files(
-    spec_of_run: Callable[[], Mapping[str, Any] | None], changes: Sequence[str] | None, note: Note | None = None
+    spec_of_run: Callable[[], Mapping[str, Any] | None],
+    changes: Sequence[str] | None,
+    keep: Callable[[str], object],
+    note: Note | None = None,
 ) -> list[str]:
     """``--set`` assignments for a run that is resumed or cloned, with the content of files as :func:`with_files`.
 
-    ``spec_of_run`` is called where its task has to be known. ``note`` as of :func:`with_files`.
+    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``note`` as of
+    :func:`with_files`.
 
     Raises:
         SpecError: As :func:`with_files`.
@@ -134,15 +140,17 @@ def changes_with_files(
         return given
     trained = (spec_of_run() or {}).get("train") or {}
     task = setting_at(override({"train": {"task": trained.get("task")}}, given), "train.task")
-    return [_embedded(each, task, note) for each in given]
+    return [_embedded(each, task, keep, note) for each in given]
 
 
-def _embedded(assignment: str, task: Any, note: Note | None) -> str:
+def _embedded(assignment: str, task: Any, keep: Callable[[str], object], note: Note | None) -> str:
     key = assignment.partition("=")[0]
     change = override({}, [assignment])
-    whole = with_files(change, "", {tuple(key.split(".")): 0}, task=task, note=note)
+    whole, texts = beside(with_files(change, "", {tuple(key.split(".")): 0}, task=task, note=note))
     if whole == change:
         return assignment
+    for text in texts.values():
+        keep(text)
     # as YAML reads it: what JSON writes in two halves beyond 16 bits is one character there
     text = re.sub(
         r"\\u(d[89ab]..)\\u(d[c-f]..)",
@@ -156,7 +164,9 @@ def _content(path: str, how: KeptFile, note: Note | None) -> Any:
     """The value in the configuration. Raises SpecError."""
     try:
         with Path(path).open("rb") as stream:
-            data = stream.read((1 << 20) + 1)
+            data = stream.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise SpecError(f"{path}: it has more than {LARGEST:,} bytes; shorten it")
         text = data.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not a text file (UTF-8)"
@@ -170,16 +180,20 @@ def _content(path: str, how: KeptFile, note: Note | None) -> Any:
             raise SpecError(f"{path}{where}: it is not JSON ({getattr(error, 'msg', 'nested too deeply')})") from None
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
-    _check_size(path, value)
+    _check_size(path, value, how)
     _check(path, how, note)
     return value
 
 
-def _check_size(name: str, value: Any) -> None:
+def _check_size(name: str, value: Any, how: KeptFile) -> None:
     """Raises SpecError."""
-    # the job's spec is JSON in a text of JSON
-    if (size := len(json.dumps(json.dumps(value)))) > MOST:
-        raise SpecError(f"{name}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
+    text = value.get("text") if how.form == "text" and isinstance(value, Mapping) else None
+    if isinstance(text, str):
+        if len(text.encode(errors="replace")) > LARGEST:
+            raise SpecError(f"{name}: it has more than {LARGEST:,} bytes; shorten it")
+    elif (size := size_in_definition(value)) > IN_DEFINITION:
+        words = f"it takes {size:,} bytes of the job's definition, and may take {IN_DEFINITION:,}"
+        raise SpecError(f"{name}: {words}; shorten it")
 
 
 def _check(path: str, how: KeptFile, note: Note | None, name: str = "") -> None:

@@ -9,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from shared_store.texts import IN_DEFINITION, size_in_definition
 from worker.racer.rewards.guard import check, read_file
 from worker.racer.rewards.translation import Outside, translate
 
@@ -28,12 +29,15 @@ def main() -> int:
             failed = 1
             print(problem, file=sys.stderr)
             continue
+        text = read_file(path)
         try:
-            notes = translate(read_file(path)).notes
+            notes = translate(text).notes
         except Outside as outside:
             print(f"{path}: valid; {outside}")
         else:
             print("\n".join([f"{path}: valid, compiled to the device", *(f"  {note}" for note in notes)]))
+        if size_in_definition({"file": str(path), "text": text}) > IN_DEFINITION:
+            print(f"  {len(text.encode()):,} bytes: a job keeps it in the store, not in its definition")
     return failed
 
 

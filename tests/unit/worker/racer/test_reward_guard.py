@@ -230,13 +230,17 @@ def test_the_command_reports_errors_or_the_mode_of_execution(
     good.write_text(f"{HEAD}print(1)\n    return params['speed']\n")
     slow.write_text(f"{HEAD}seen = []\n    seen.append({{}})\n    return 1.0\n")
     bad.write_text(f"{HEAD}return None\n")
-    monkeypatch.setattr(sys, "argv", ["rewards", str(good), str(slow), str(bad)])
+    long = tmp_path / "long.py"
+    long.write_text(f"{HEAD}return params['speed']\n{'#' * 21_000}\n")
+    monkeypatch.setattr(sys, "argv", ["rewards", str(good), str(slow), str(bad), str(long)])
     assert main() == 1
     said, errors = capsys.readouterr()
     assert said.splitlines() == [
         f"{good}: valid, compiled to the device",
         "  line 2: print() is left out",
         f"{slow}: valid; line 3: a list that grows: such functions run in Python workers",
+        f"{long}: valid, compiled to the device",
+        f"  {long.stat().st_size:,} bytes: a job keeps it in the store, not in its definition",
     ]
     assert errors.strip().endswith(NONE)
 
