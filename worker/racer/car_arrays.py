@@ -66,8 +66,8 @@ class CarArrays:
         commands: Steering [rad] and speed [m/s] that reached the car last, shape ``(worlds,)``.
         fronts: x and y of the front [m], shape ``(worlds,)``; what follows is of this point.
         rows: The nearest segment of the centre line, shape ``(worlds,)``.
-        before: The waypoint behind, shape ``(worlds,)``.
-        after: The waypoint ahead, shape ``(worlds,)``; with ``before``, the closest waypoints of reward functions.
+        before: The waypoint behind, counted from the start line in driving direction, shape ``(worlds,)``.
+        after: The waypoint ahead, ``before`` + 1, shape ``(worlds,)``; with ``before``, the closest waypoints of reward functions.
         distances: From the centre line [m], shape ``(worlds,)``.
         left: Whether the front is left of it, in driving direction, shape ``(worlds,)``.
         along: From the start line in driving direction [m], shape ``(worlds,)``.
@@ -354,5 +354,5 @@ def lap_of(world: int, car: CarArrays) -> float:
 
 @wp.func
 def progress_of(world: int, car: CarArrays) -> float:
-    """Share of a lap that the car has driven since the episode began, 0 to 100 [%]."""
-    return 100.0 * wp.clamp(car.travelled[world] / lap_of(world, car), 0.0, 1.0)
+    """Share of a lap that the car has driven since the episode began, at most 100 [%]; below 0 behind the place where it began."""
+    return 100.0 * wp.min(car.travelled[world] / lap_of(world, car), 1.0)

@@ -25,8 +25,9 @@ class Projection:
         point: The nearest point of the centre line, (P, 2) [m].
         distance: How far it is, (P,) [m].
         left: Whether the point lies to the left of the centre line, (P,) bool; on it, it does not.
-        before: The waypoint behind the nearest point, or at it, (P,) int64.
-        after: The waypoint ahead of it, (P,) int64. With ``before``, what reward functions know as ``closest_waypoints``.
+        before: The waypoint behind the nearest point, or at it, (P,) int64, counted from 0 at the start line in driving direction.
+        after: The waypoint ahead of it, ``before`` + 1, (P,) int64: of a loop N is the start line again. Both are what reward functions
+            know as ``closest_waypoints``.
         along: From the start line to the nearest point along the centre line, (P,) [m], from 0 to less than the track's length; at the
             end of an open track that length.
         progress: The same as a share of the track's length, (P,) [%].
@@ -78,8 +79,8 @@ def project(track: Track, points: Any, backwards: Any = False) -> Projection:
         point=point,
         distance=norm(points - point),
         left=sign * cross(segment, points - start) > 0,
-        before=np.where(backwards, following, row),
-        after=np.where(backwards, row, following),
+        before=np.where(backwards, segments - 1 - row, row),
+        after=np.where(backwards, segments - row, row + 1),
         along=along,
         progress=along / track.length * 100,
         heading=np.arctan2(sign * segment[:, 1], sign * segment[:, 0]),

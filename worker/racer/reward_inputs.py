@@ -139,7 +139,10 @@ def _tell(
     numbers[TIME] = float(car.steps[world]) * seconds
     count = car.obstacle_poses.shape[1]
     numbers[OBJECT_COUNT] = float(count)
-    numbers[TRACK] = float(track)
+    line = track
+    if backwards:  # behind the tracks' lines stand the same ones turned round
+        line += car.road.first.shape[0]
+    numbers[TRACK] = float(line)
     seen = bool(False)
     for number in range(count):
         box = car.obstacle_poses[track, number]
@@ -153,11 +156,11 @@ def _tell(
         row[O_PLACE] = box[0]
         row[O_PLACE + 1] = box[1]
         row[O_ALONG] = along
-        row[O_HEADING] = wp.degrees(box[2])
+        row[O_HEADING] = 0.0
         row[O_LEFT] = told(side > 0.0)
         row[O_DISTANCE] = wp.abs(side)
-        if sees_box(view, pose, box, car.obstacle_half):
-            seen = True
+        if number == car.next_obstacle[world]:
+            seen = sees_box(view, pose, box, car.obstacle_half)
     numbers[SEEN] = told(seen)
 
 
@@ -206,7 +209,8 @@ class RewardInputs:
 
 
 class Racing:
-    """:class:`RewardInputs` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`. It has no state: all follows from the cars.
+    """:class:`RewardInputs` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`. It has no state: all follows from the cars,
+    but for what a function in Python workers remembers, which no checkpoint has.
 
     Args:
         declared: As a task declares it.
@@ -215,6 +219,7 @@ class Racing:
     Attributes:
         arrays: What the cars' functions are told.
         reward: The function.
+        called: Whether it is called: a trial step, before the worlds begin, is no step of a car.
     """
 
     needs_bodies = False
@@ -225,6 +230,7 @@ class Racing:
         self._worlds, self._seconds = context.worlds.world_count, 1.0 / context.control_hz
         circuit, front = declared.circuit, declared.front
         lines = [track.line().tolist() for track in circuit.tracks]
+        lines += [line[::-1] for line in lines]
         reward, compiled = declared.reward, declared.function is not None
         # each rank has its own share of the processors, which torch knows
         processes = max(1, min(torch.get_num_threads(), -(-self._worlds // 16)))
@@ -250,6 +256,12 @@ class Racing:
             row[:] = np.where(found.left, found.distance, -found.distance)
         self._sides = wp.array(sides, dtype=wp.float32, device=self._device)
         self._cars: Any = None
+        self.called = False
+
+    def begin_anew(self) -> None:
+        """Begin as if no car had driven: what the function remembers, and its failures, are forgotten."""
+        self.called = True
+        self.reward.begin_anew()
 
     def follow(self, cars: Any) -> None:
         """Tell of these cars (``CarArrays``) from now on."""

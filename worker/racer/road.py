@@ -73,8 +73,8 @@ class Place:
         point: The nearest point of the centre line [m].
         distance: How far it is [m].
         left: Whether the point lies to the left of the centre line, in driving direction.
-        before: The waypoint behind the nearest point, or at it.
-        after: The waypoint ahead of it.
+        before: The waypoint behind the nearest point, or at it, counted in driving direction.
+        after: The waypoint ahead of it, ``before`` + 1.
         along: From the start line to the nearest point, in driving direction [m].
         heading: Of the centre line there, in driving direction [rad], from -pi to pi.
         width: Of the road there [m].
@@ -174,15 +174,14 @@ def project(road: RoadArrays, track: int, point: wp.vec2, backwards: bool, begin
         forth = road.length[track]
     side = cross(segment, point - start)
     place.before = row
-    place.after = following
     place.along = forth
     ahead = segment
     if backwards:
-        place.before = following
-        place.after = row
+        place.before = road.segments[track] - 1 - row
         place.along = road.length[track] - forth
         side = -side
         ahead = -segment
+    place.after = place.before + 1
     if place.along >= road.length[track] and not is_open(road, track):
         place.along = 0.0
     place.left = side > 0.0

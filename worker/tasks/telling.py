@@ -32,6 +32,14 @@ class Telling:
         """
         return {}
 
+    def is_users_fault(self, mishap: str) -> bool:
+        """Whether a function of the user is to blame for a mishap (:meth:`worker.tasks.task.Task.read_mishap`), which another attempt repeats."""
+        return False
+
+    def begins_anew(self) -> str:
+        """What a training that is resumed does not find again, one line; empty: nothing."""
+        return ""
+
     def own_counts(self) -> Mapping[str, torch.Tensor]:
         """Counts of this rank's worlds that decide together with those of other ranks, by name; integers on the device."""
         return {}

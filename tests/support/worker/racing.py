@@ -15,6 +15,14 @@ from worker.tasks.racer import Racer
 OVAL = make_preset("oval")
 
 
+def round_the_guard(source: str, file: str = "r.py") -> str:
+    """A reward function with all built-in functions and modules of Python, as one gets at them who wants to."""
+    return (
+        "import random\n__builtins__ = random.Random.seed.__globals__['__builtins__']\n"
+        f"__builtins__['exec'](__builtins__['compile']({source!r}, {file!r}, 'exec'), (lambda: 0).__globals__)\n"
+    )
+
+
 def racer(worlds: int = 1, **fields: Any) -> Racer:
     return Racer(RacerConfig(start=fields.pop("start", "line"), **fields), worlds, seed=3)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
+import dis
 import functools
 import io
 import json
@@ -21,9 +22,11 @@ import tokenize
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 from shared_store.wording import nearest
+from worker.racer.rewards.namespaces import FILES, MODULES, NAMES, SUBMODULES
 from worker.racer.rewards.problems import KINDS, Problem, RewardRefused
 from worker.racer.rewards.samples import OVAL, Course
 
@@ -31,39 +34,19 @@ LARGEST = 140_000
 """Characters of a file."""
 MOST_TOKENS = 60_000
 """Words, signs and lines of a file: what its parser takes time and memory for. The longest of 299 real files has 45,000."""
-MODULES = ("math", "random", "numpy", "scipy", "shapely")
-"""Packages that may be imported."""
 SECONDS = 5.0
-"""For a call on one sample, and for the file's own statements with their imports [s]."""
+"""For a call on one sample; the file's own statements, with their imports, have four times as long [s]."""
+_LOOKS_UP = ("LOAD_NAME", "LOAD_GLOBAL", "LOAD_FROM_DICT_OR_GLOBALS")
+"""Instructions that look a name up among the built-in functions, too."""
+_MOST_COUNTED = 100_000_000
+"""Characters of a file that is too long; then the count ends."""
 _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
 _MOST_SAID = 64 << 10
 """Bytes that the process may answer."""
 Note = Callable[[str], object]
 """Is called with a line for the user."""
-NAMES = frozenset(
-    (  # noqa: SIM905
-        "open exec eval compile input breakpoint exit quit help globals locals vars dir getattr setattr delattr"
-    ).split()
-)
-"""Built-in functions that may not be named."""
 _SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())  # noqa: SIM905
-_FILES = frozenset(
-    (  # noqa: SIM905
-        "load save savez savez_compressed savetxt loadtxt fromfile tofile genfromtxt fromregex memmap "
-        "open_memmap DataSource dump dumps ctypeslib f2py distutils testing lib datasets system popen"
-    ).split()
-)
-"""Attributes of modules, and methods of arrays, that read or write files or start programs."""
-_SUBMODULES = {
-    "scipy.io",
-    "scipy.datasets",
-    "scipy.weave",
-    "numpy.ctypeslib",
-    "numpy.f2py",
-    "numpy.lib",
-    "numpy.testing",
-}
 _OWN = {"self", "cls"}
 
 
@@ -88,17 +71,22 @@ def read_file(path: Path) -> str:
         RewardRefused: It can't be read, or is no text.
     """
     try:
-        with open(path, "rb") as opened:
-            data = opened.read(4 * LARGEST + 4)
+        with io.BufferedReader(io.FileIO(path), 1 << 20) as opened:
+            encoding, _ = tokenize.detect_encoding(io.BytesIO(opened.peek()).readline)
+            lines = io.TextIOWrapper(opened, encoding)
+            text = lines.read(LARGEST + 1)
+            if len(text) <= LARGEST:
+                return text
+            count = len(text)
+            while count <= _MOST_COUNTED and (part := lines.read(1 << 20)):
+                count += len(part)
     except OSError as error:
         told = f"the file can't be read: {error.strerror}"
         raise RewardRefused(Problem("TEST_FAILURE", told, str(path))) from error
-    try:
-        encoding, _ = tokenize.detect_encoding(io.BytesIO(data).readline)
-        return io.TextIOWrapper(io.BytesIO(data), encoding).read()
     except (SyntaxError, UnicodeDecodeError, LookupError) as error:
         told = f"the file is no text: {str(error).splitlines()[0]}"
         raise RewardRefused(Problem("SYNTAX_ERROR", told, str(path))) from error
+    raise RewardRefused(_too_long(count, str(path)))
 
 
 def check_source(
@@ -154,7 +142,7 @@ def _fault_on(course: Course, source: str, file: str, anyway: bool, notes: list[
 def read(source: str, file: str) -> Problem | None:
     """Faults of the text itself, which is not run."""
     if len(source) > LARGEST:
-        return Problem("SYNTAX_ERROR", f"{len(source):,} characters; a reward function has at most {LARGEST:,}", file)
+        return _too_long(len(source), file)
     if (tokens := len(re.findall(r"\w+|[^\w \t]", source))) > MOST_TOKENS:
         told = f"{tokens:,} words, signs and lines; a reward function has at most {MOST_TOKENS:,}"
         return Problem("SYNTAX_ERROR", told, file)
@@ -162,15 +150,21 @@ def read(source: str, file: str) -> Problem | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = ast.parse(source, file)
+            code = compile(tree, file, "exec", dont_inherit=True)
     except SyntaxError as error:
         return Problem("SYNTAX_ERROR", error.msg, file, error.lineno or 0)
     except (ValueError, RecursionError, MemoryError) as error:
         told = str(error) if isinstance(error, ValueError) else "it is nested too deeply"
         return Problem("SYNTAX_ERROR", told, file)
-    return next((Problem(kind, told, file, line) for kind, told, line in _findings(tree)), None)
+    return next((Problem(kind, told, file, line) for kind, told, line in _findings(tree, code)), None)
 
 
-def _findings(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
+def _too_long(count: int, file: str) -> Problem:
+    told = f"{count:,}" if count <= _MOST_COUNTED else f"more than {_MOST_COUNTED:,}"
+    return Problem("SYNTAX_ERROR", f"{told} characters; a reward function has at most {LARGEST:,}", file)
+
+
+def _findings(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]]:
     """Kind, message and line of all that is wrong, imports and names before the function itself."""
     nodes = sorted(ast.walk(tree), key=lambda node: getattr(node, "lineno", 0))
     imported: dict[str, str] = {}
@@ -178,12 +172,16 @@ def _findings(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
         if isinstance(node, ast.Import):
             imported |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
         yield from _import(node)
+    starred = any(isinstance(node, ast.ImportFrom) and node.names[0].name == "*" for node in nodes)
+    used = [*_unbound(code, NAMES | FILES if starred else NAMES, _bound(code))]
+    used += [(node.id, node.lineno) for node in nodes if isinstance(node, ast.Name) and node.id[:2] == "__"]
+    for name, line in sorted(used, key=lambda item: item[1]):
+        if name != "__name__":
+            yield "FORBIDDEN", f"{name} can't be used in a reward function", line
     for node in nodes:
-        if isinstance(node, ast.Name):
-            yield from _name(node)
-        elif isinstance(node, ast.Attribute):
+        if isinstance(node, ast.Attribute):
             yield from _attribute(node, imported)
-    yield from _function(tree)
+    yield from _function(tree, code)
 
 
 def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
@@ -205,18 +203,33 @@ def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
                 f"{name} can't be imported; a reward function may import {', '.join(MODULES)}",
                 node.lineno,
             )
-        elif any(name == each or name.startswith(f"{each}.") for each in _SUBMODULES) or "._" in name:
+        elif any(name == each or name.startswith(f"{each}.") for each in SUBMODULES) or "._" in name:
             yield "FORBIDDEN", f"{name} can't be used in a reward function", node.lineno
         for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-            if alias.name in _FILES | _SYSTEM or alias.name.startswith("_"):
+            if alias.name in FILES | _SYSTEM or alias.name.startswith("_"):
                 yield "FORBIDDEN", f"{name}.{alias.name} can't be used in a reward function", node.lineno
-            if alias.name == "*":
-                yield "IMPORT_ERROR", f"from {name} import *: name what you use", node.lineno
 
 
-def _name(node: ast.Name) -> Iterator[tuple[str, str, int]]:
-    if node.id in NAMES or (node.id.startswith("__") and node.id != "__name__"):
-        yield "FORBIDDEN", f"{node.id} can't be used in a reward function", node.lineno
+def _bound(code: CodeType, stores: tuple[str, ...] = ("STORE_NAME", "STORE_GLOBAL")) -> set[str]:
+    """The global names to which a file gives values, also in its functions."""
+    found = {each.argval for each in dis.get_instructions(code) if each.opname in stores}
+    return found.union(*(_bound(part, ("STORE_GLOBAL",)) for part in _parts(code)))
+
+
+def _unbound(code: CodeType, names: frozenset[str], bound: set[str]) -> Iterator[tuple[str, int]]:
+    """Uses of those of ``names`` that stand for built-in functions, with their lines: the compiler knows what is a variable."""
+    instructions = list(dis.get_instructions(code))
+    own = bound | {each.argval for each in instructions if each.opname == "STORE_NAME"}  # of a class
+    for each in instructions:
+        if each.opname in _LOOKS_UP and each.argval in names - own and each.positions:
+            yield each.argval, each.positions.lineno or 0
+    for part in _parts(code):
+        yield from _unbound(part, names, bound)
+
+
+def _parts(code: CodeType) -> list[CodeType]:
+    """The functions and classes right inside some code."""
+    return [each for each in code.co_consts if isinstance(each, CodeType)]
 
 
 def _attribute(node: ast.Attribute, imported: dict[str, str]) -> Iterator[tuple[str, str, int]]:
@@ -227,31 +240,30 @@ def _attribute(node: ast.Attribute, imported: dict[str, str]) -> Iterator[tuple[
     own = isinstance(node.value, ast.Name) and node.value.id in _OWN
     dunder = name.startswith("__") and name != "__init__"
     hidden = name.startswith("_") and not name.startswith("__") and not own
-    if dunder or hidden or name in _SYSTEM or name == "tofile" or (of_module and name in _FILES):
+    if dunder or hidden or name in _SYSTEM or name == "tofile" or (of_module and name in FILES):
         yield "FORBIDDEN", f"the attribute {name} can't be used in a reward function", node.lineno
 
 
-def _function(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
+def _function(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]]:
     found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "reward_function"]
-    if not found:
-        other = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
-        near = (
-            nearest("reward_function", other, "define it at the top level of the file")
-            if other
-            else "the file defines none"
-        )
-        yield "TEST_FAILURE", f"there is no def reward_function(params); {near}", 0
-        return
     if len(found) > 1:
-        yield (
-            "TEST_FAILURE",
-            f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}",
-            found[1].lineno,
-        )
-    arguments = found[0].args
-    given = [*arguments.posonlyargs, *arguments.args]
-    if len(given) != 1 or arguments.vararg or arguments.kwarg or arguments.kwonlyargs:
-        yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", found[0].lineno
+        told = f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}"
+        yield "TEST_FAILURE", told, found[1].lineno
+    for node in found:
+        if not _takes_one(node.args) and not node.decorator_list:
+            yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", node.lineno
+    if "reward_function" not in _bound(code):
+        near = "the file defines none"
+        if other := [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]:
+            near = nearest("reward_function", other, "define it at the top level of the file")
+        yield "TEST_FAILURE", f"there is no def reward_function(params); {near}", 0
+
+
+def _takes_one(arguments: ast.arguments) -> bool:
+    """Whether a function can be called with one argument."""
+    names = len(arguments.posonlyargs) + len(arguments.args)
+    needed = names - len(arguments.defaults)
+    return needed <= 1 and (names > 0 or arguments.vararg is not None) and None not in arguments.kw_defaults
 
 
 def try_out(

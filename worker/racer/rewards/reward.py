@@ -9,12 +9,13 @@ from typing import Any
 
 import warp as wp
 
-from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
+from worker.racer.rewards.compiled import failures_of, kernels, race_arrays, warp_function
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
-from worker.racer.rewards.problems import Failure, Problem, RewardRefused, one_line
+from worker.racer.rewards.problems import Failure, Problem, RewardFailed, RewardRefused, one_line
 from worker.racer.rewards.samples import OVAL, Course
 from worker.racer.rewards.translation import Outside, translate
+from worker.racer.rewards.translation.prelude import ERRORS, LOOP
 from worker.racer.rewards.workers import Workers
 
 
@@ -23,7 +24,7 @@ class RewardFunction:
 
     Args:
         source: Text of its file.
-        tracks: Waypoints of each track [m].
+        tracks: Waypoints of each track, or of each track and direction [m]; the cars' rows say which line is theirs.
         worlds: How many cars there are.
         device: Where the arrays are, such as ``cuda:0``.
         file: Name of the file, in messages.
@@ -62,6 +63,7 @@ class RewardFunction:
         self.reason = "" if compiled else "Python workers were asked for"
         self.notes: tuple[str, ...] = ()
         self._kernel: Any = None
+        self._told: dict[int, str] = {}
         if compiled:
             self.function, self._kernel, self.reason, self.notes = compiled_function(source, file, device)
         self.race = race_arrays(worlds, tracks, device)
@@ -102,19 +104,30 @@ class RewardFunction:
         """The calls that gave no reward so far, by their message, the most frequent first. Waits for the device.
 
         A compiled function keeps of each car its last error and the number of all: they count under the last one.
+
+        Raises:
+            RewardFailed: A call of the compiled function would not have returned.
         """
         if self._workers is not None:
             found = self._workers.failures
         else:
-            errors = told_errors(self.race.errors.numpy())
-            found = {f"{self.file}: {told}": failure for told, failure in errors.items()}
+            found = {}
+            for code, (told, failure) in failures_of(self.race).items():
+                if code % 16 == LOOP:
+                    raise RewardFailed(f"{self.file}:{code // 16}: car {failure.car}: {ERRORS[LOOP]}")
+                found[f"{self.file}: {self._told.setdefault(code, told)}"] = failure
         return dict(sorted(found.items(), key=lambda item: -item[1].count))
 
-    def forget_failures(self) -> None:
-        """Begin to count failures anew."""
+    def begin_anew(self) -> None:
+        """Forget all failures, and all that the cars' functions remember.
+
+        Raises:
+            RewardFailed: The Python workers can't load the file again.
+        """
         self.race.errors.zero_()
+        self._told.clear()
         if self._workers is not None:
-            self._workers.failures.clear()
+            self._workers.begin_anew()
 
     def close(self) -> None:
         """End the Python workers."""

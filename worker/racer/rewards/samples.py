@@ -117,10 +117,9 @@ def sample(
         KeyError: There is no such key.
     """
     segment, (x, y), direction = line.at(car.way)
-    after = (segment + 1) % (len(line.points) - 1) if line.closed else segment + 1
-    width = line.width(car.way)
+    points, width = line.points, line.width(car.way)
     if is_reversed:
-        segment, after, direction = after, segment, direction + math.pi
+        segment, points, direction = len(points) - 2 - segment, points[::-1], direction + math.pi
     far = abs(car.offset)
     left = car.offset > 0.0
     poses = [line.at(each.way) for each in objects]
@@ -141,20 +140,18 @@ def sample(
         "steering_angle": 0.0,
         "track_length": line.length,
         "track_width": width,
-        "closest_waypoints": [segment, after],
+        "closest_waypoints": [segment, segment + 1],
         "closest_objects": [ahead[-1], ahead[0]] if ahead else [0, 0],
         "projection_distance": line.on(car.way),
         "sim_time": 0.0,
         "object_in_camera": any((each.way - car.way) % line.period < 2.0 for each in objects),
-        "waypoints": list(line.points),
+        "waypoints": list(points),
         "objects_location": [
             (px - each.offset * math.sin(angle), py + each.offset * math.cos(angle))
             for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
         ],
         "objects_distance": [line.on(each.way) for each in objects],
-        "objects_heading": [
-            _degrees(angle + math.radians(each.turned)) for each, (*_, angle) in zip(objects, poses, strict=True)
-        ],
+        "objects_heading": [0.0] * len(objects),
         "objects_left_of_center": [each.offset > 0.0 for each in objects],
         "objects_speed": [each.speed for each in objects],
         "objects_distance_from_center": [abs(each.offset) for each in objects],
@@ -265,4 +262,5 @@ def random_sample(line: Line, chance: random.Random) -> dict[str, Any]:
         steering_angle=chance.choice((-30.0, -15.0, 0.0, 15.0, 30.0, chance.uniform(-30.0, 30.0))),
         progress=chance.choice((chance.uniform(0.0, 100.0), 100.0)),
         is_crashed=chance.random() < 0.1,
+        objects_heading=[chance.uniform(-180.0, 180.0) for _ in objects],
     )

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import REPOSITORY
+from tests.support.worker.racing import round_the_guard
 from worker.racer.rewards import confined, guard, parameters, sandbox
 from worker.racer.rewards.guard import check_source, try_out
 from worker.racer.rewards.problems import RewardFailed
@@ -44,15 +45,15 @@ HEAD = "import ctypes, io, os, random\nimport numpy as np\n"
 def tried(body: str, head: str = HEAD, **options: bool) -> str:
     """The guard's answer about a function whose text it does not look at, as about one that gets round it."""
     lines = "".join(f"    {line}\n" for line in body.strip().split("\n"))
-    return str(try_out(f"{head}def reward_function(params):\n{lines}    return 1.0\n", "r.py", **options) or "")
+    source = round_the_guard(f"{head}def reward_function(params):\n{lines}    return 1.0\n")
+    return str(try_out(source, "r.py", **options) or "")
 
 
 def called(body: str, head: str = HEAD) -> str:
     """The failure of such a function in a Python worker; empty: none."""
     lines = "".join(f"    {line}\n" for line in body.strip().split("\n"))
-    with Workers(
-        f"{head}def reward_function(params):\n{lines}    return 1.0\n", "r.py", [oval()], 1, 1, 60.0
-    ) as workers:
+    source = round_the_guard(f"{head}def reward_function(params):\n{lines}    return 1.0\n")
+    with Workers(source, "r.py", [oval()], 1, 1, 60.0) as workers:
         workers.rewards()
         return "".join(workers.failures)
 
@@ -138,17 +139,15 @@ assert open(np.__file__).read() and open(os.__file__).read()"""
 
 
 def test_a_function_that_a_learner_may_write_reads_and_wipes_nothing(secret: Path) -> None:
-    """They pass the guard's look at the text."""
+    """They pass the guard's look at the text; the car's view of NumPy refuses them, before the sandbox does."""
     function = "def reward_function(params):\n    m = box[0]\n    "
     wiping = f"import numpy as np\nbox = [np]\n{function}m.savetxt({str(secret)!r}, [])\n    return 1.0\n"
-    refused = "r.py:5: TEST_FAILURE: the sample 'start': PermissionError: [Errno 1] Operation not permitted: "
-    assert str(check_source(wiping, "r.py")) == f"{refused}{str(secret)!r}"
+    refused = "r.py:5: FORBIDDEN: the sample 'start': {} can't be used in a reward function".format
+    assert str(check_source(wiping, "r.py")) == refused("numpy.savetxt")
     told = f"raise ValueError(str(m.fromfile({str(secret)!r}, dtype='S19')))\n"
-    assert "Permission denied" in str(check_source(f"import numpy as np\nbox = [np]\n{function}{told}", "r.py"))
+    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{told}", "r.py")) == refused("numpy.fromfile")
     told = f"raise ValueError('|'.join(m.ma.core.inspect.linecache.getlines({str(secret)!r})) or 'nothing')\n"
-    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{told}", "r.py")).endswith(
-        "ValueError: nothing"
-    )
+    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{told}", "r.py")) == refused("inspect")
     assert secret.read_text() == SECRET
 
 
