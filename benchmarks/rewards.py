@@ -2,7 +2,8 @@
 
     python -m benchmarks.rewards [--cars 256 4096] [--out DIRECTORY]
 
-The Python workers' time includes the copies from and to the device. Writes ``rewards.md``.
+The Python workers' time includes the copies from and to the device. Each car has a copy of the function; the memory is that of one process with
+all cars. Writes ``rewards.md``.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from benchmarks.training import CUDA, device_name
 from worker.racer.rewards.parameters import row_of
 from worker.racer.rewards.reward import RewardFunction
 from worker.racer.rewards.samples import Line, oval, random_sample
+from worker.racer.rewards.workers import Workers
 
 FUNCTIONS = {
     "heading and speed": """import math
@@ -42,6 +44,26 @@ def reward_function(params):
     return 1.0 / (0.1 + best)
 """,
 }
+ROWS = ", ".join(
+    f"[{3.0 + 0.01 * row:.5f}, {0.02 * row:.5f}, {1.5 + row % 9 / 10:.5f}, {0.05 + row % 5 / 1000:.5f}]"
+    for row in range(300)
+)
+CLASS = f"""import math
+class Reward:
+    def __init__(self):
+        self.line = [{ROWS}]
+        self.last = 0
+    def away(self, x, y):
+        return [math.hypot(row[0] - x, row[1] - y) for row in self.line]
+    def reward(self, params):
+        away = self.away(params["x"], params["y"])
+        gained, self.last = away.index(min(away)) - self.last, away.index(min(away))
+        return float(gained)
+reward = Reward()
+def reward_function(params):
+    return reward.reward(params)
+"""
+"""A class with a racing line of 300 rows, as people paste it."""
 ROUNDS, SECONDS = 5, 1.0
 
 
@@ -50,7 +72,8 @@ def filled(reward: RewardFunction, cars: int) -> None:
     chance, line = random.Random(1), Line(oval())
     numbers, objects = reward.race.numbers.numpy().copy(), reward.race.objects.numpy().copy()
     for car in range(cars):
-        numbers[car], rows = row_of(random_sample(line, chance))
+        params = random_sample(line, chance)
+        numbers[car], rows = row_of(params, track=int(params["is_reversed"]))
         objects[car, : len(rows)] = rows if rows else 0.0
     reward.race.numbers.assign(numbers)
     reward.race.objects.assign(objects)
@@ -77,12 +100,36 @@ def measure(name: str, cars: int) -> dict[str, Any]:
     row: dict[str, Any] = {"name": name, "cars": cars}
     for form, compiled in (("compiled", True), ("workers", False)):
         device = f"cuda:{torch.cuda.current_device()}" if CUDA else "cpu"
-        reward = RewardFunction(FUNCTIONS[name], [oval()], cars, device, compiled=compiled)
+        reward = RewardFunction(FUNCTIONS[name], [oval(), oval()[::-1]], cars, device, compiled=compiled)
         assert (reward.function is not None) == compiled, reward.reason
         filled(reward, cars)
         row[form] = rate(reward, cars)
         reward.close()
     return row
+
+
+def memory(cars: int) -> str:
+    """A row: resident memory of a process that has a copy of the class for each car, and how long it took to make them."""
+    started = time.perf_counter()
+    with Workers(CLASS, "class.py", [oval()], cars, 1) as workers:
+        took = time.perf_counter() - started
+        status = Path(f"/proc/{workers.processes[0].pid}/status").read_text()
+    used = int(status.partition("VmRSS:")[2].split()[0]) / 1024
+    return f"| {cars:,} | {used:,.0f} | {took:.2f} |"
+
+
+def memory_table() -> str:
+    """Markdown: the memory of copies."""
+    lines = [
+        "## Memory",
+        "",
+        f"One process with a copy for each car of a class of {len(CLASS) / 1000:.0f} KB that holds a racing line of 300 rows.",
+        "",
+        "| cars | resident [MiB] | to start [s] |",
+        "|--:|--:|--:|",
+        *map(memory, (1, 256, 4096)),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -114,7 +161,9 @@ def main() -> None:
         for cars in options.cars:
             rows.append(measure(name, cars) | watch.check(f"while {name} was measured"))
             (options.out / "rewards.md").write_text(table(rows))
-    print(table(rows))
+    text = f"{table(rows)}\n{memory_table()}"
+    (options.out / "rewards.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

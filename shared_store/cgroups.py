@@ -1,7 +1,7 @@
 """Control groups (version 2) around nodes: no process of a node can leave its group, whatever sessions and forks it uses.
 
 They are used if this process may create groups below its own: as root, or with delegation (``systemd-run --user --scope -p
-Delegate=yes``). A trial decides. No controller is enabled in them. Linux only.
+Delegate=yes``). A trial decides. Of the controllers only that of memory is used: :mod:`shared_store.memory_groups`. Linux only.
 """
 
 from __future__ import annotations
@@ -13,19 +13,51 @@ import time
 
 from shared_store.processes import Process, find_process
 
+CONTROLLER = "muster"
+"""Name of the group of the controller inside a delegated one: its own, or that of systemd's ``DelegateSubgroup=``."""
 _TRIES = 25
 _NEW = 60.0
 """Seconds after its creation within which a group may still be waiting for its process."""
 
 
 def own_group() -> str:
-    """Directory of this process's control group; empty if it can't create groups below it."""
+    """Directory of version 2 below which this process can create control groups; empty if it can't.
+
+    It is this process's own, or the one above where that was made for the controller in a group that was delegated to it.
+    """
+    directory = find_group("")
+    above, name = os.path.split(directory)
+    return above if name == CONTROLLER and is_delegated(above) else directory
+
+
+def is_delegated(group: str) -> bool:
+    """Whether systemd leaves the group to its processes."""
+    for name in ("user.delegate", "trusted.delegate"):
+        with contextlib.suppress(OSError):
+            if os.getxattr(group, name) == b"1":
+                return True
+    return False
+
+
+def find_group(controller: str) -> str:
+    """Directory of this process's control group; empty if it can't create groups below it.
+
+    Args:
+        controller: A controller of version 1; empty for version 2, which has one group for all.
+    """
     try:
         with open("/proc/self/cgroup") as file:
-            path = next(line[3:].rstrip("\n") for line in file if line.startswith("0::"))
+            lines = [line.rstrip("\n").split(":", 2) for line in file]
+        path = next(path for _, names, path in lines if controller in names.split(","))
         with open("/proc/self/mountinfo") as file:
             mounts = [line.partition(" - ") for line in file]
-        root, point = next(head.split()[3:5] for head, _, tail in mounts if tail.startswith("cgroup2 "))
+        wanted = [(head, tail.split()) for head, _, tail in mounts]
+        root, point = next(
+            head.split()[3:5]
+            for head, (kind, _, options, *_) in wanted
+            if (controller in options.split(",") if controller else True)
+            and kind == ("cgroup" if controller else "cgroup2")
+        )
         directory = os.path.normpath(os.path.join(point, os.path.relpath(path, root)))
         trial = os.path.join(directory, f"muster-trial-{os.getpid()}-{time.monotonic_ns()}")
         os.mkdir(trial)
@@ -63,8 +95,8 @@ def kill_group(group: str) -> None:
 
 
 def remove_group(group: str) -> None:
-    """Remove the group and those below it; leave groups alone that have processes or do not exist."""
-    for _ in range(_TRIES):
+    """Remove the group and those below it; leave groups alone that have processes or do not exist, and do nothing for an empty text."""
+    for _ in range(_TRIES if group else 0):
         for directory, _, _ in os.walk(group, topdown=False):
             with contextlib.suppress(OSError):
                 os.rmdir(directory)
@@ -78,4 +110,5 @@ def remove_abandoned_groups(directory: str) -> None:
     for entry in os.scandir(directory) if directory else ():
         with contextlib.suppress(OSError):  # the kernel refuses if a process is in it
             if entry.name.startswith("muster-") and time.time() - entry.stat().st_mtime > _NEW:
-                os.rmdir(entry.path)
+                for below, _, _ in os.walk(entry.path, topdown=False):
+                    os.rmdir(below)

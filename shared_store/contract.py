@@ -13,6 +13,8 @@ from shared_store.log_files import LIMIT
 
 BUS_VARIABLES = ("MUSTER_BUS", "MUSTER_BUS_TOKEN")
 """For the node's supervisor only: the job's own program does not get them."""
+OWN_VARIABLES = (*BUS_VARIABLES, "MUSTER_MEMORY_GROUP", "MUSTER_MEMORY_LIMIT", "MUSTER_NOTE")
+"""The same, with those for a node that has a supervisor in any case."""
 _FOR_RANKS = "MUSTER_RANK_ENV_"
 """Prefix of the job's own variables on their way through the supervisor."""
 
@@ -85,6 +87,12 @@ class NodeContract:
     standard PATH. ``muster``: the same with Muster's own environment on PATH, as in Muster's own image. Empty: neither."""
     user: str | None = None
     """``UID:GID`` of the program, if it differs from the supervisor's."""
+    memory_group: str = ""
+    """Directory of the control group that limits the memory of the job's processes to ``memory_limit``; empty for no limit."""
+    memory_limit: int = 0
+    """MiB."""
+    note: str = ""
+    """A line for the beginning of the node's log; empty for none."""
     address: str | None = None
     """The node's own address, if the engine sets one."""
     bus: str | None = None
@@ -136,6 +144,9 @@ class NodeContract:
             "MUSTER_STALL_TIMEOUT": stall,
             "MUSTER_ISOLATION": self.isolation,
             "MUSTER_USER": self.user,
+            "MUSTER_MEMORY_GROUP": self.memory_group,
+            "MUSTER_MEMORY_LIMIT": str(self.memory_limit or ""),
+            "MUSTER_NOTE": self.note,
             "MUSTER_ADDRESS": self.address,
             "MUSTER_BUS": self.bus,
             "MUSTER_BUS_TOKEN": self.bus_token,
@@ -207,6 +218,9 @@ class NodeContract:
             array=array if "AWS_BATCH_JOB_ARRAY_INDEX" in env else None,
             isolation=env.get("MUSTER_ISOLATION", ""),
             user=env.get("MUSTER_USER"),
+            memory_group=env.get("MUSTER_MEMORY_GROUP", ""),
+            memory_limit=integer("MUSTER_MEMORY_LIMIT", 0),
+            note=env.get("MUSTER_NOTE", ""),
             address=env.get("MUSTER_ADDRESS"),
             bus=env.get("MUSTER_BUS"),
             bus_token=env.get("MUSTER_BUS_TOKEN"),

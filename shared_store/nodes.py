@@ -74,6 +74,8 @@ class NodeProcesses:
     """The shim's start time in clock ticks since boot; with the pid it identifies it."""
     group: str
     """Directory of its control group; empty for none."""
+    memory: str = ""
+    """Directory of the group that limits its memory; empty for none."""
 
     @property
     def shim(self) -> Process | None:
@@ -117,5 +119,6 @@ def end_nodes(nodes: Sequence[NodeProcesses], marks: Collection[str]) -> Sequenc
 
     remaining = end_all(left, strike=strike)
     for node in nodes if not remaining else ():
+        remove_group(node.memory)
         remove_group(node.group)
     return remaining

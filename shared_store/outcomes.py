@@ -21,6 +21,8 @@ _LATEST = 2.0**40
 _NUMBER = int | float
 _LEVELS = 4
 """Directories from that of an outcome up to its run: ``<run>/outcomes/<job>/<attempt>``."""
+OUT_OF_MEMORY = "OutOfMemoryError: Container killed due to memory usage"
+"""AWS's reason for a container that exceeded its memory limit."""
 EX_TEMPFAIL = 75
 """Exit code for "checkpointed and exited on request: start again, and don't count it as a failure" (sysexits.h)."""
 

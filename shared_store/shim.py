@@ -88,6 +88,11 @@ def main(parent: str, group: str, files: str, exit_file: str, *command: str) -> 
     code = _wait(supervisor, watched)
     if _has_children() or not _removed(group):
         _end_the_rest(group, lambda: libc.prctl(_PR_SET_NAME, STUCK.encode(), 0, 0, 0))
+    memory = os.environ.get("MUSTER_MEMORY_GROUP", "")
+    if os.path.isdir(memory):
+        from shared_store.cgroups import remove_group
+
+        remove_group(memory)
     if code > 128:  # the supervisor did not get to remove it
         _remove_scratch(supervisor)
     if exit_file:

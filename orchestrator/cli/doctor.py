@@ -29,7 +29,9 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.home import local_url, muster_home
 from shared_store import __version__
+from shared_store.cgroups import own_group
 from shared_store.files import write_json
+from shared_store.memory_groups import limits_memory
 from shared_store.wording import counted
 
 _WORKER = ("torch", "warp-lang", "newton", "rsl-rl-lib", "gymnasium")
@@ -82,6 +84,7 @@ def _examine(engines: Sequence[str], store: Path, worker: bool) -> Iterator[Find
     yield _checked("home", lambda: _directory(muster_home()))
     yield _checked("store", lambda: _store(store))
     yield _shared_memory()
+    yield _memory_limit()
     yield _controller()
     for name in engines:
         yield _checked(f"engine {name}", partial(_engine, name))
@@ -136,6 +139,15 @@ def _shared_memory() -> Finding:
     if size < _LEAST_SHARED_MEMORY:
         return Finding("/dev/shm", "absent", f"{size:.0f} MiB; several GPUs on a node need more: --shm-size 2g")
     return Finding("/dev/shm", "ok", f"{size:.0f} MiB")
+
+
+def _memory_limit() -> Finding:
+    if limits_memory(own_group()):
+        return Finding(
+            "memory limit", "ok", "a controller started like this limits jobs of the Batch API on engine local"
+        )
+    said = "engine local can't limit memory here: no control group; systemd-run --user --scope -p Delegate=yes muster serve"
+    return Finding("memory limit", "absent", said)
 
 
 def _controller() -> Finding:

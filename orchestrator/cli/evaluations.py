@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec
+from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec, tell_note
 from orchestrator.cli.progress import summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
@@ -159,7 +159,15 @@ def _spec(
     worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
     source = f"{'race' if kind == 'race' else 'evaluation'} of {run}"
     changed = override(document, [*worlds, *elsewhere])
-    return validate(with_files(changed, source, task=(trained.get("train") or {}).get("task")), source)
+    train = trained.get("train") or {}
+    task, base = train.get("task"), train.get("config") or {}
+
+    def store() -> str | None:
+        place = str(client.get("/api/capacity")["store"])
+        return place if Path(place).is_dir() else None
+
+    whole = with_files(changed, source, task=task, base=base, store=store, note=tell_note)
+    return validate(whole, source)
 
 
 def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,11 +15,12 @@ from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client, named
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ApiError, ServerError, SpecError, Unavailable, Unreachable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
+from orchestrator.home import local_url, muster_home
 from orchestrator.spec import file as specfile
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
 from shared_store.wording import counted, nearest
@@ -72,6 +74,8 @@ def submit_spec(
         if spec.train and spec.resources.gpus:
             lower += "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly"
         raise SpecError(f"{source}: resources: {problem}; {lower}")
+    for text in long_texts(spec):
+        client.keep_text(text)
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
 
@@ -92,7 +96,7 @@ def submit(
     as_json: JsonOption = False,
 ) -> None:
     """Submit a job to a running controller."""
-    loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)])
+    loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)], store_here)
     tell(loaded)
     with Client.connect() as client:
         if engine is not None:
@@ -111,10 +115,27 @@ def submit(
             raise typer.Exit(follow(client, submitted["jobId"]))
 
 
+def store_here(named: str | None = None) -> str | None:
+    """The path of the controller's store, or else of ``named`` or this home directory's; None where it is not on this machine."""
+    place = Path(named).expanduser() if named else muster_home() / "store"
+    if os.environ.get("MUSTER_URL") or local_url():
+        try:
+            with Client.connect() as client:
+                place = Path(client.get("/api/capacity")["store"])
+        except (ApiError, ServerError, Unavailable, Unreachable):
+            return None
+    return str(place) if place.is_dir() else None
+
+
 def tell(spec: Spec) -> None:
     """Print a spec's warnings on standard error."""
     for note in spec.notes:
-        echo(f"note: {one_line(note)}", err=True)
+        tell_note(note)
+
+
+def tell_note(note: str) -> None:
+    """Print a warning on standard error."""
+    echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:

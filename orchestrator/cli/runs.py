@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue
+from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, store_here, tell_note
 from orchestrator.cli.progress import follow
 from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
@@ -44,7 +44,9 @@ def resume(
             "checkpoint": checkpoint,
             "nodes": nodes,
             "set": [
-                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_),
+                *changes_with_files(
+                    lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, client.keep_text, store_here, tell_note
+                ),
                 *elsewhere,
                 *accepted,
             ],

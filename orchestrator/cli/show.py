@@ -79,6 +79,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         _OF_RUN.get(detail["kind"], ""): _source(detail),
         "started from": started_from((detail["results"] or {}).get("parent")),
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
+        "no effect": ", ".join(detail.get("withoutEffect") or []),
     }
     results = detail["results"] or {}
     array = detail["job"].get("arrayProperties", {})

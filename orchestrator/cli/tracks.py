@@ -150,7 +150,8 @@ def _tell(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:
         return
     echo(f"{track['name']}: {track['length']:.2f} m long, {_width(track)} wide, {track['direction']}")
     echo(f"  tightest:   a radius of {track['least_radius']:.2f} m")
-    echo(f"  waypoints:  {track['waypoints']}, {track['length'] / track['waypoints']:.3f} m apart")
+    steps = track["waypoints"] - (not track["closed"])
+    echo(f"  waypoints:  {track['waypoints']}, {track['length'] / steps:.3f} m apart")
     if origin := track.get("origin"):
         echo(f"  from:       {_origin(origin)}")
         for note in origin.get("notes") or ():

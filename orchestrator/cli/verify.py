@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
+from orchestrator.cli.jobs import SetOption, SpecArgument, store_here, submit_spec
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
@@ -46,7 +46,7 @@ def verify_resume(
     index, and every metric except times is compared bit by bit: exit 0 if all are equal, 1 at the first difference. On CPUs they must be
     equal; GPUs add in no fixed order. Both runs stay in the store.
     """
-    loaded = specfile.load(spec, set_)
+    loaded = specfile.load(spec, set_, lambda: store_here(store))
     straight, killed = _pair(loaded, spec, at, iterations)
     for note in _notes(loaded, at):
         echo(note)

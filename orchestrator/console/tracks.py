@@ -66,7 +66,7 @@ def outline(request: Request, name: str) -> Response:
     found = _one(request, name)
     if "rings" not in found:
         raise ClientError(f"track {name[:130]} can't be drawn", 404)
-    return _picture(drawn(found["rings"]).encode(), "image/svg+xml")
+    return _picture(drawn(found["rings"], found["closed"]).encode(), "image/svg+xml")
 
 
 @router.get("/tracks/{name}/picture.png")
@@ -135,7 +135,7 @@ def facts(track: Mapping[str, Any]) -> dict[str, Any]:
         "Width": f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m",
         "Tightest radius": f"{track['least_radius']:.2f} m",
         "Direction": track["direction"],
-        "Waypoints": f"{track['waypoints']}, {track['length'] / track['waypoints']:.3f} m apart",
+        "Waypoints": f"{track['waypoints']}, {track['length'] / (track['waypoints'] - (not track['closed'])):.3f} m apart",
         "From": ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in origin.items() if key != "notes"),
         "Mended": "; ".join(map(str, origin.get("notes") or ())),
         "Digest": track["digest"],
@@ -143,8 +143,8 @@ def facts(track: Mapping[str, Any]) -> dict[str, Any]:
     return {**shown, "about": track.get("about", ""), "facts": list(told.items())}
 
 
-def drawn(rings: Mapping[str, Sequence[Sequence[float]]]) -> str:
-    """The road between two borders as SVG, with its start line. Numbers alone are written."""
+def drawn(rings: Mapping[str, Sequence[Sequence[float]]], closed: bool = True) -> str:
+    """The road between two borders as SVG, with its start line; an open road ends where they do. Numbers alone are written."""
     inner, outer = rings["inner"], rings["outer"]
     points = [*inner, *outer]
     low = [min(float(point[axis]) for point in points) for axis in (0, 1)]
@@ -156,8 +156,9 @@ def drawn(rings: Mapping[str, Sequence[Sequence[float]]]) -> str:
         x, y = ((float(point[axis]) - low[axis]) * scale + edge[axis] for axis in (0, 1))
         return f"{x:.1f} {_SIZE[1] - y:.1f}"
 
-    road = " ".join(f"M{'L'.join(place(point) for point in ring)}Z" for ring in (outer, inner))
-    start = f"M{place(inner[0])}L{place(outer[0])}"
+    outlines = (outer, inner) if closed else ([*outer, *reversed(inner)],)
+    road = " ".join(f"M{'L'.join(place(point) for point in ring)}Z" for ring in outlines)
+    start = "M" + "L".join(place(point) for point in rings["start"])
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_SIZE[0]:g} {_SIZE[1]:g}">'
         f'<path d="{road}" fill="{_GREY}" fill-rule="evenodd"/>'

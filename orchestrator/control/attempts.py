@@ -20,13 +20,14 @@ from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
+from orchestrator.control.kept_texts import KeptTexts, references_of
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import CHECK_INTERVAL, Observer
 from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
-from orchestrator.domain.attempt import FINISHING, Phase, State, Terms, step
+from orchestrator.domain.attempt import FINISHING, NOT_STARTED, Phase, State, Terms, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -62,6 +63,7 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status, Verdict
 from orchestrator.engines.api import CannotStart, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.log_groups import record_logs
 from orchestrator.persistence.models import Attempt, Job, JobQueue, SchedulingPolicy, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
@@ -104,12 +106,14 @@ class Attempts:
         monitoring: Monitoring,
         changed: Callable[[str], None],
         withdrawn: Callable[[str, str], None],
+        texts: KeptTexts,
     ) -> None:
         """``changed``: called, from any thread, with a job whose attempt should be looked at; ``withdrawn``: with one that can't start
-        now, and why.
+        now, and why. ``texts``: of which each run gets those that its job names.
         """
         self.engine, self.runs, self.bus = engine, runs, bus
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
+        self.texts = texts
         self._memories: dict[tuple[str, int], _Memory] = {}
         self._errands = Errands(machine.pool("store", _READERS), str(runs.store.path), changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
@@ -132,6 +136,7 @@ class Attempts:
             created_at=now(),
         )
         attempt.held_since = self.clock.now()
+        record_logs(session, job, nodes)
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {self._state(job, attempt).terms.size}")
         session.commit()
@@ -241,8 +246,8 @@ class Attempts:
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
-                if attempt.ending == Ending.FAILED:  # as AWS shows why a container did not start
-                    attempt.nodes[job.gang.main].reason = attempt.status_reason
+                if attempt.ending in (Ending.FAILED, Ending.FATAL):  # as AWS shows why a container did not start
+                    attempt.nodes[job.gang.main].reason = (attempt.status_reason or "").removeprefix(NOT_STARTED)
                 return Gone(self.clock.now(), [], "")
             case Close():
                 self._close(session, job, attempt, instruction)
@@ -268,7 +273,8 @@ class Attempts:
             record = record_owner(session, run, job)
             description = first_description(run, job, record.owner, record.queue)
             claim = Claim(self.runs.peers.id, job.id, attempt.number)
-            taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim)
+            texts = [(each, self.texts.source(session, each)) for each in references_of(job.gang)]
+            taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim, texts)
             epoch = self._errands.result(key, "claim", taking, again=False)
         except StoreUnavailable as error:
             return PrepareDelayed(str(error))

@@ -58,6 +58,7 @@ def ensure_compute_environments(session: Session, engines: Sequence[str]) -> Non
             session.add(JobQueue(name=queue, compute_environments=[name]))
     default = session.get(JobQueue, "default")
     if default is not None and len(default.compute_environments) == 1 and default.compute_environments[0] in ENGINES:
+        default.sent_order = default.sent_order if default.compute_environments == [engines[0]] else None
         default.compute_environments = [engines[0]]
 
 
@@ -74,10 +75,14 @@ def own_queues(engines: Sequence[str]) -> dict[str, str]:
 def queue_engines(session: Session, queue: str, first: str) -> list[str]:
     """The engines of a queue's compute environments, in their order; none for a queue that does not exist."""
     found = session.get(JobQueue, queue)
-    compute_environments = [
-        session.get(ComputeEnvironment, name) for name in (found.compute_environments if found else [])
-    ]
-    return list(dict.fromkeys(engine_named_by(each.tags, first) for each in compute_environments if each is not None))
+    rows = environments_of(session, found) if found else []
+    return list(dict.fromkeys(engine_named_by(each.tags, first) for each in rows))
+
+
+def environments_of(session: Session, queue: JobQueue) -> list[ComputeEnvironment]:
+    """The compute environments of a queue, in their order."""
+    found = (session.get(ComputeEnvironment, name) for name in queue.compute_environments)
+    return [each for each in found if each is not None]
 
 
 def engine_named_by(tags: dict[str, str], first: str) -> str:

@@ -9,7 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.control.clock import Clock
-from orchestrator.control.compute_environments import engine_named_by
+from orchestrator.control.compute_environments import engine_named_by, environments_of
 from orchestrator.control.usage import placements_of, usage_at
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Capacity, Host, Placement, Queued, engine_of
@@ -100,9 +100,7 @@ def holding_of(jobs: Iterable[Job]) -> list[tuple[Job, Attempt]]:
 def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape) -> Fit:
     """The hosts for a gang in the queue if nothing else ran, or why it could never start."""
     first = engine.names[0]
-    rows = [
-        row for name in queue.compute_environments if (row := session.get(models.ComputeEnvironment, name)) is not None
-    ]
+    rows = environments_of(session, queue)
     engines = dict.fromkeys(engine_named_by(row.tags, first) for row in rows)
     before = engine.unknown()
     capacities = engine.capacity(engines)

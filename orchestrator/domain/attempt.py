@@ -45,7 +45,7 @@ from orchestrator.domain.attempt_instructions import (
     Withdraw,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws, lost_host
+from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, container_reason, judge, judge_as_aws, lost_host
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.domain.retry import retries
 from shared_store.wording import counted
@@ -63,6 +63,8 @@ _FAILED_GRACE = 5.0
 """Seconds from SIGTERM to SIGKILL for a gang whose collectives are broken: there is nothing left to save."""
 _MARGIN = 5.0
 """Seconds that an engine waits beyond the grace time: supervisors count it too, and record what did not leave in time."""
+NOT_STARTED = "can't start the gang: "
+"""Before the reason for which an engine refuses a gang for good."""
 _DONE = "done before it was {}"
 _REPEATED = "{} ended the attempt before, too: not tried again after {} of {} attempts; correct it before you resume or submit again"
 
@@ -180,7 +182,7 @@ def step(state: State, event: Event) -> Instructions:
         case Phase.LAUNCHING, LaunchRefused() if state.verdict is not None:
             return (WindUp(),)
         case Phase.LAUNCHING, LaunchRefused(reason, True):
-            return Decide(Verdict(Ending.FATAL, f"can't start the gang: {reason}")), WindUp()
+            return Decide(Verdict(Ending.FATAL, f"{NOT_STARTED}{reason}")), WindUp()
         case Phase.LAUNCHING, LaunchRefused(reason):
             return Decide(Verdict(Ending.FAILED, reason)), WindUp()
         case _, Preempted(reason) if state.verdict is None:
@@ -343,7 +345,10 @@ def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
 
 def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
     """The reason of a gang that was never launched is its container's, as of AWS's CannotStartContainerError."""
-    return retries(terms.conditions, verdict.exit_code, head.reason if head else verdict.reason, verdict.reason)
+    reason = head.reason if head else verdict.reason
+    if not terms.options.is_native:
+        reason = container_reason(reason, verdict.reason) or ""
+    return retries(terms.conditions, verdict.exit_code, reason, verdict.reason)
 
 
 def after(state: State, instruction: Instruction) -> State:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -31,6 +32,9 @@ class Status(StrEnum):
 
 TERMINAL = (Status.SUCCEEDED, Status.FAILED)
 """States of a job that has ended."""
+
+EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
+"""States of a job that has not begun to start: CancelJob ends no other."""
 
 TRANSITIONS = {
     Status.SUBMITTED: {Status.PENDING, Status.RUNNABLE, Status.FAILED},
@@ -104,13 +108,30 @@ class Verdict:
     """As :attr:`NodeEnd.fault`, of the node that was the cause; native jobs only."""
 
 
+_LOST_HOST = "Host EC2"
 AWS_EXITED = "Essential container in task exited"
 """AWS Batch's reason for an attempt whose main container ended, successfully or not; clients match it."""
 
 
+_OF_AWS = re.compile(r"[A-Z][A-Za-z]*Error: ")
+"""Beginning of a reason for which AWS ended a container, or could not start it: OutOfMemoryError, CannotPullContainerError, …"""
+
+
+def container_reason(reason: str | None, status_reason: str | None) -> str | None:
+    """``container.reason`` as AWS gives it: an ordinary exit has none.
+
+    Args:
+        reason: The node's own, in Muster's words.
+        status_reason: The attempt's on this node.
+    """
+    if status_reason and status_reason.startswith(_LOST_HOST):
+        return status_reason
+    return reason if reason and _OF_AWS.match(reason) else None
+
+
 def lost_host(host: str) -> str:
     """AWS Batch's reason for an attempt that has lost the host of its main node."""
-    return f"Host EC2 (instance {host}) terminated."
+    return f"{_LOST_HOST} (instance {host}) terminated."
 
 
 def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdict | None:

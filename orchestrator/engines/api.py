@@ -79,6 +79,8 @@ class Gang:
     """Its nodes start as containers would, also where they are plain processes: it came through the Batch API."""
     containers: Sequence[Mapping[str, Any]] = ()
     """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
+    notes: Sequence[str] = ()
+    """Lines for the beginning of the nodes' logs, by node index; empty texts for none."""
     bus: str | None = None
     bus_token: str | None = None
     """Address of the controller's bus router, and the attempt's credential for it."""
@@ -152,9 +154,15 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
             address=addresses[index],
             bus=gang.bus,
             bus_token=gang.bus_token,
+            note=gang.notes[index] if gang.notes else "",
         )
         plans.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
     return plans
+
+
+def unused_user(user: str, why: str) -> str:
+    """The note in the log of a node without an image, on which ``user`` of the definition is not taken on."""
+    return f"muster: user {user} is not used: nodes run without the image, and {why}"
 
 
 def _isolation(gang: Gang, index: int) -> str:
@@ -320,7 +328,7 @@ class Traits:
     images: bool = False
     """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
     users: bool = False
-    """A node can run as the user that the job names. True of every engine with images."""
+    """A node can run as the user that the job names; else that is passed over with a note. True of every engine with images."""
     as_owner: bool = False
     """Nodes run as the owner of the store's directory, whoever the controller is."""
     secrets: SecretValues = SecretValues.NONE

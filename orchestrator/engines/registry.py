@@ -22,6 +22,7 @@ from orchestrator.engines.api import (
     SecretValues,
     Traits,
     read_handle,
+    unused_user,
 )
 from orchestrator.engines.installed import traits_of
 from orchestrator.engines.runner import Health, Runner
@@ -102,6 +103,10 @@ class EngineSet:
         runner = self._runner(engine_of(gang.placements[0].host))
         engine = runner.engine
         traits = engine.traits
+        if not traits.images and not all(gang.commands):
+            raise EngineError(
+                f"the job has no command, and the {engine.name} engine runs no image that could have one; give it one"
+            )
         named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
         if named and not traits.images and gang.options.get("images") == "refuse":
             raise EngineError(
@@ -112,10 +117,10 @@ class EngineSet:
             raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
         if traits.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
-        elif not traits.users and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
-            raise EngineError(
-                f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out"
-            )
+        elif not traits.users:
+            why = f"the {engine.name} engine runs jobs as the user of its nodes"
+            users = [container.get("user") for container in gang.containers]
+            gang = replace(gang, notes=[unused_user(user, why) if user else "" for user in users])
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)
@@ -140,6 +145,10 @@ class EngineSet:
         """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
         if any(self._traits(name).secrets is not SecretValues.REFERENCES for name in names):
             self.secrets.check(containers, queue)
+
+    def without_images(self, names: Iterable[str]) -> Sequence[str]:
+        """Those of these engines that do not run a job's image."""
+        return [name for name in names if not self._traits(name).images]
 
     def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]], again: bool = True) -> str:
         """The handle of a gang, as text, once it is started; does not wait. Raises NotYet until then, and EngineError.

@@ -64,6 +64,8 @@ class JobQueue(Base):
     """The highest is served first."""
     compute_environments: Mapped[list[str]]
     """Their names, in the order in which they are tried."""
+    sent_order: Mapped[list[dict[str, Any]] | None] = mapped_column(_JSON_OR_NULL, default=None)
+    """``computeEnvironmentOrder`` as it was sent, with names; None: 1, 2, … in the order above."""
     policy: Mapped[str | None] = mapped_column(default=None)
     """Name of its scheduling policy; None: first in, first out."""
     limits: Mapped[list[dict[str, Any]]] = mapped_column(default=list)
@@ -373,6 +375,10 @@ class Node(Base):
     """AWS's status reason for a node that ended by itself."""
     met: Mapped[bool] = mapped_column(default=False)
     """Whether it has connected to the bus."""
+    log_group: Mapped[str | None] = mapped_column(default=None, index=True)
+    """Of its log stream; None: ``/aws/batch/job``; empty: the group was deleted."""
+    log_prefix: Mapped[str | None] = mapped_column(default=None)
+    """The stream's name begins with it; None: with the name of the job."""
 
     @validates("reason", "error", "status_reason")
     def _storable(self, _key: str, text: str | None) -> str | None:
@@ -421,6 +427,53 @@ class KnownStore(Base):
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     identity: Mapped[str]
     """As its ``store.json`` has it."""
+
+
+class KeptText(Base):
+    """A long text of jobs, which lies in the store (:mod:`orchestrator.control.kept_texts`)."""
+
+    __tablename__ = "kept_texts"
+    sha256: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str]
+    """The one who has uploaded it last."""
+    folder: Mapped[str]
+    """That of the controller which keeps it."""
+    size: Mapped[int]
+    """Bytes."""
+    uploaded_at: Mapped[int]
+    used_at: Mapped[int]
+    """When it was uploaded, or a definition or a job that names it was registered, last."""
+
+
+class KnownAccount(Base):
+    """The one row of the account in the ARNs (:mod:`orchestrator.control.account`)."""
+
+    __tablename__ = "account"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    account: Mapped[str]
+    region: Mapped[str]
+
+
+class LogGroup(Base):
+    """A log group of a user's own; ``/aws/batch/job``, which always exists, has a row once it has a setting or a tag."""
+
+    __tablename__ = "log_groups"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Whose key created it, or submitted the first job that logs there."""
+    retention: Mapped[int | None] = mapped_column(default=None)
+    """``retentionInDays``, which is shown and deletes nothing."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class LogStream(Base):
+    """An empty stream that a client created; the streams of jobs are known by their nodes."""
+
+    __tablename__ = "log_streams"
+    log_group: Mapped[str] = mapped_column(ForeignKey("log_groups.name", ondelete="CASCADE"), primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    created_at: Mapped[int] = mapped_column(default=now)
 
 
 class ShareUsage(Base):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
-from sqlalchemy import ColumnElement, and_, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy import ColumnElement, and_, or_, select, update
+from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.errors import RequestError
-from orchestrator.domain.job import TERMINAL
+from orchestrator.domain.job import EARLY, TERMINAL
 from orchestrator.persistence.models import Job
 
 _NAMED = 5
@@ -20,12 +20,31 @@ def note_changed(session: Session, ids: Iterable[str]) -> None:
     session.info.setdefault("ids", {}).update(dict.fromkeys(ids))
 
 
-def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, cancelled: bool = False) -> None:
-    """Ask the jobs ``which`` that are not over to end, in one statement; one that was asked already keeps its reason."""
-    asked = and_(which, Job.status.not_in(TERMINAL), Job.stop_reason.is_(None))
-    note_changed(session, session.scalars(select(Job.id).where(asked)))
-    changes = {"stop_reason": reason, **({"cancelled": True} if cancelled else {})}
-    session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
+def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, cancel: bool = False) -> None:
+    """Ask the jobs ``which`` that are not over to end, all at once; one that was asked already keeps its reason.
+
+    An array is asked if one of its children is, and by the same request: a cancellation that finds all of them running leaves it
+    alone, and a termination takes the place of an earlier cancellation.
+
+    Args:
+        session: Of the database.
+        which: The jobs, an array with its children.
+        reason: Why.
+        cancel: Only those that have not begun to start, as CancelJob does; else as TerminateJob.
+    """
+
+    def free(job: type[Job]) -> ColumnElement[bool]:
+        state = job.status.in_(EARLY) if cancel else job.status.not_in(TERMINAL)
+        return and_(state, job.kind != "array", job.stop_reason.is_(None))
+
+    child = aliased(Job)
+    unasked = Job.stop_reason.is_(None) if cancel else or_(Job.stop_reason.is_(None), Job.cancelled)
+    has_free_child = select(child.id).where(child.parent == Job.id, free(child)).exists()
+    array = and_(which, Job.kind == "array", Job.status.not_in(TERMINAL), unasked, has_free_child)
+    for asked in (array, and_(which, free(Job))):  # an array first, while its children show whether they can be asked
+        note_changed(session, session.scalars(select(Job.id).where(asked)))
+        changes = {"stop_reason": reason, "cancelled": cancel}
+        session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
 
 
 def short_id(job: str) -> str:
@@ -39,12 +58,12 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
 
     ``REFERENCE:3`` is the child with index 3 of the array that REFERENCE names.
 
-    ``queues``: only jobs of these are looked for by name or by the start of an id; None: all jobs.
+    ``queues``: only jobs of these are found; None: all jobs.
     Raises RequestError where several ids start so.
     """
     job = session.get(Job, reference)
     if job:
-        return job
+        return job if queues is None or job.queue in queues else None
     array, colon, index = reference.rpartition(":")
     if colon:
         parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None

@@ -9,13 +9,15 @@ from typing import Any
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec import strict_yaml
 from orchestrator.spec.changes import override
-from orchestrator.spec.kept_files import check_sizes, check_texts, refuse_paths, with_files
+from orchestrator.spec.kept_files import Place, check_sizes, check_texts, refuse_paths, with_files
 from orchestrator.spec.model import Spec, validate
 from shared_store.files import DamagedFile, read_json
 
 
-def load(path: str, assignments: list[str] | None = None) -> Spec:
+def load(path: str, assignments: list[str] | None = None, store: Place = lambda: None) -> Spec:
     """The spec in the file ``path`` with ``--set`` assignments applied, and the files that its task's configuration names read.
+
+    ``store``: as of :func:`~orchestrator.spec.kept_files.with_files`.
 
     Raises:
         SpecError: A file can't be read, is not YAML, or is not a valid spec; one line with file, line and key.
@@ -27,18 +29,20 @@ def load(path: str, assignments: list[str] | None = None) -> Spec:
         # what --set changed stands on no line of the file
         lines = {key: line for key, line in lines.items() if not any(key[: len(each)] == each for each in changed)}
         lines |= dict.fromkeys(changed, 0)
+    notes: list[str] = []
     if isinstance(document, dict):
-        document = with_files(document, path, lines)
-    return validate(_with_hyperparameters(document, path, lines), path, lines)
+        document = with_files(document, path, lines, store=store, note=notes.append)
+    return validate(_with_hyperparameters(document, path, lines), path, lines).with_notes(notes)
 
 
-def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
+def from_text(text: str, source: str, *, whole: bool = True, store: Place = lambda: None) -> Spec:
     """The spec in a YAML text that a request brought: without aliases, and without paths of files that belong into the job.
 
     Args:
         text: The YAML.
         source: Its name in errors.
         whole: Also have a process try the texts that stand in the place of files, which takes a second or more.
+        store: As of :func:`~orchestrator.spec.kept_files.with_files`.
 
     Raises:
         SpecError: As :func:`load`.
@@ -47,10 +51,10 @@ def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
     if isinstance(document, dict):
         refuse_paths(document, source, lines)
         check_sizes(document, source, lines)
-    spec = validate(document, source, lines)
+    spec, notes = validate(document, source, lines), list[str]()
     if whole:
-        check_texts(document, source, lines)
-    return spec
+        check_texts(document, source, lines, store, notes.append)
+    return spec.with_notes(notes)
 
 
 def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.Path, int]) -> Any:

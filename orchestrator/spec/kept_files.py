@@ -1,4 +1,7 @@
-"""Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted."""
+"""Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted.
+
+A text that is too long for the job's definition is kept beside it (:mod:`shared_store.texts`).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,10 +22,13 @@ from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import place_of
 from shared_store.file_fields import KeptFile, kept_files
 from shared_store.settings import setting_at
+from shared_store.texts import IN_DEFINITION, LARGEST, beside, size_in_definition
 
-MOST = 20 << 10
-"""Bytes that a file may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
 _SECTIONS = ("train", "evaluate", "race")
+Note = Callable[[str], object]
+"""Is called with a line for the user."""
+Place = Callable[[], str | None]
+"""The path of the store in which a job finds what its configuration names, asked where a check needs it; None: not on this machine."""
 
 
 def with_files(
@@ -30,6 +37,9 @@ def with_files(
     lines: Mapping[tuple[str | int, ...], int] | None = None,
     *,
     task: str | None = None,
+    base: Mapping[str, Any] | None = None,
+    store: Place = lambda: None,
+    note: Note | None = None,
 ) -> dict[str, Any]:
     """A job's document with the content of the files that its task's configuration names in the place of their paths.
 
@@ -40,6 +50,10 @@ def with_files(
         source: Its name in errors.
         lines: Line of each key path in the file, for errors.
         task: Name of the task, where the document does not say it.
+        base: The configuration that the document's changes. A file's content in it is checked anew where the document changes what the
+            check depends on.
+        store: Where checks find what the configuration names.
+        note: Called with each line that a check has for the user.
 
     Raises:
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
@@ -48,11 +62,12 @@ def with_files(
     for section, field, value, how in _fields(document, task):
         if isinstance(value, str):
             try:
-                content = _content(value, how)
+                content = _content(value, how, _Checked(how, _whole(document[section], base), store, note))
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
             values = result[section]
             result[section] = {**values, "config": {**values["config"], field: content}}
+    _check_again(document, source, lines or {}, task, base or {}, store, note)
     return result
 
 
@@ -73,27 +88,70 @@ def refuse_paths(document: Mapping[str, Any], source: str, lines: Mapping[tuple[
 
 def check_sizes(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
     """Refuse a file's content that is too large, before anything else is done with it. Arguments as :func:`with_files`. Raises SpecError."""
-    for section, field, value, _ in _fields(document):
+    for section, field, value, how in _fields(document):
         try:
-            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value)
+            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value, how)
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
 
-def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
+def check_texts(
+    document: Mapping[str, Any],
+    source: str,
+    lines: Mapping[tuple[str | int, ...], int],
+    store: Place = lambda: None,
+    note: Note | None = None,
+) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     for section, field, value, how in _fields(document):
-        text = value.get("text") if isinstance(value, Mapping) else None
-        if how.form != "text" or not isinstance(text, str):
-            continue
-        name = str(value.get("file") or field)
         try:
-            with TemporaryDirectory() as folder:
-                path = Path(folder) / "text"
-                path.write_text(text, encoding="utf-8")
-                _check(str(path), how, name)
+            _check_text(value, field, _Checked(how, _whole(document[section], None), store, note))
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+
+
+def _check_again(
+    document: Mapping[str, Any],
+    source: str,
+    lines: Mapping[tuple[str | int, ...], int],
+    task: str | None,
+    base: Mapping[str, Any],
+    store: Place,
+    note: Note | None,
+) -> None:
+    """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
+    for section in _SECTIONS:
+        values = document.get(section)
+        if not isinstance(values, Mapping):
+            continue
+        config, name = values.get("config") or {}, values.get("task", task)
+        if not isinstance(config, Mapping):
+            continue
+        whole = _whole(values, base)
+        for field, how in kept_files(task_config(name) if isinstance(name, str) else None).items():
+            changed = [key for key in how.given if whole.get(key) != base.get(key)]
+            if field in config or not changed:
+                continue
+            try:
+                _check_text(base.get(field), field, _Checked(how, whole, store, note))
+            except SpecError as error:
+                raise SpecError(f"{place_of((section, 'config', changed[0]), source, lines)}{error}") from None
+
+
+def _whole(values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The configuration of a section, as far as it is known; a race names its track beside it."""
+    track = {"track": values["track"]} if values.get("track") else {}
+    return {**(base or {}), **(values.get("config") or {}), **track}
+
+
+def _check_text(value: Any, field: str, checked: _Checked) -> None:
+    """Raises SpecError."""
+    text = value.get("text") if isinstance(value, Mapping) else None
+    if checked.how.form == "text" and isinstance(text, str):
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "text"
+            path.write_text(text, encoding="utf-8")
+            _check(str(path), checked, str(value.get("file") or field))
 
 
 def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tuple[str, str, Any, KeptFile]]:
@@ -110,10 +168,17 @@ def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tu
                 yield section, field, config[field], how
 
 
-def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], changes: Sequence[str] | None) -> list[str]:
+def changes_with_files(
+    spec_of_run: Callable[[], Mapping[str, Any] | None],
+    changes: Sequence[str] | None,
+    keep: Callable[[str], object],
+    store: Place = lambda: None,
+    note: Note | None = None,
+) -> list[str]:
     """``--set`` assignments for a run that is resumed or cloned, with the content of files as :func:`with_files`.
 
-    ``spec_of_run`` is called where its task has to be known.
+    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``store`` and
+    ``note`` as of :func:`with_files`.
 
     Raises:
         SpecError: As :func:`with_files`.
@@ -122,16 +187,28 @@ def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], chan
     if not any(each.startswith(("train.config", "train=")) for each in given):
         return given
     trained = (spec_of_run() or {}).get("train") or {}
-    task = setting_at(override({"train": {"task": trained.get("task")}}, given), "train.task")
-    return [_embedded(each, task) for each in given]
+    before = trained.get("config") or {}
+    changed = override({"train": {"task": trained.get("task"), "config": before}}, given)
+    task, config = (setting_at(changed, key) for key in ("train.task", "train.config"))
+    if isinstance(config, Mapping) and isinstance(task, str):
+        new = {field: value for field, value in config.items() if value != before.get(field)}
+        _check_again({"train": {"config": new}}, "--set", {}, task, before, store, note)
+    return [_embedded(each, task, config, keep, store, note) for each in given]
 
 
-def _embedded(assignment: str, task: Any) -> str:
+def _embedded(
+    assignment: str, task: Any, config: Any, keep: Callable[[str], object], store: Place, note: Note | None
+) -> str:
     key = assignment.partition("=")[0]
     change = override({}, [assignment])
-    whole = with_files(change, "", {tuple(key.split(".")): 0}, task=task)
+    base = config if isinstance(config, Mapping) else {}
+    whole, texts = beside(
+        with_files(change, "", {tuple(key.split(".")): 0}, task=task, base=base, store=store, note=note)
+    )
     if whole == change:
         return assignment
+    for text in texts.values():
+        keep(text)
     # as YAML reads it: what JSON writes in two halves beyond 16 bits is one character there
     text = re.sub(
         r"\\u(d[89ab]..)\\u(d[c-f]..)",
@@ -141,11 +218,23 @@ def _embedded(assignment: str, task: Any) -> str:
     return f"{key}={text}"
 
 
-def _content(path: str, how: KeptFile) -> Any:
+@dataclass(frozen=True)
+class _Checked:
+    """How a file is checked, with the configuration in which it stands; the other attributes as of :func:`with_files`."""
+
+    how: KeptFile
+    config: Mapping[str, Any]
+    store: Place
+    note: Note | None
+
+
+def _content(path: str, how: KeptFile, checked: _Checked) -> Any:
     """The value in the configuration. Raises SpecError."""
     try:
         with Path(path).open("rb") as stream:
-            data = stream.read((1 << 20) + 1)
+            data = stream.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise SpecError(f"{path}: it has more than {LARGEST:,} bytes; shorten it")
         text = data.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not a text file (UTF-8)"
@@ -159,24 +248,36 @@ def _content(path: str, how: KeptFile) -> Any:
             raise SpecError(f"{path}{where}: it is not JSON ({getattr(error, 'msg', 'nested too deeply')})") from None
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
-    _check_size(path, value)
-    _check(path, how)
+    _check_size(path, value, how)
+    _check(path, checked)
     return value
 
 
-def _check_size(name: str, value: Any) -> None:
+def _check_size(name: str, value: Any, how: KeptFile) -> None:
     """Raises SpecError."""
-    # the job's spec is JSON in a text of JSON
-    if (size := len(json.dumps(json.dumps(value)))) > MOST:
-        raise SpecError(f"{name}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
+    text = value.get("text") if how.form == "text" and isinstance(value, Mapping) else None
+    if isinstance(text, str):
+        if len(text.encode(errors="replace")) > LARGEST:
+            raise SpecError(f"{name}: it has more than {LARGEST:,} bytes; shorten it")
+    elif (size := size_in_definition(value)) > IN_DEFINITION:
+        words = f"it takes {size:,} bytes of the job's definition, and may take {IN_DEFINITION:,}"
+        raise SpecError(f"{name}: {words}; shorten it")
 
 
-def _check(path: str, how: KeptFile, name: str = "") -> None:
+def _check(path: str, checked: _Checked, name: str = "") -> None:
     """Have another process check the file, since the parts of tasks belong to the worker. Raises SpecError, in which ``name`` stands for the path."""
+    how, note = checked.how, checked.note
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False)
-    if checked.returncode:
-        said = checked.stderr.strip().splitlines() or [f"{how.check} ended with exit code {checked.returncode}"]
-        raise SpecError(said[-1].replace(path, name or path, 1))
+    if how.given:
+        given = {field: checked.config[field] for field in how.given if field in checked.config}
+        command += ["--config", json.dumps(given)]
+        command += ["--store", store] if (store := checked.store()) is not None else []
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [line.replace(path, name or path, 1) for line in answer.stderr.strip().splitlines()]
+    if answer.returncode:
+        raise SpecError(said[-1] if said else f"{how.check} ended with exit code {answer.returncode}")
+    if note is not None:
+        for line in said:
+            note(line)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -40,6 +41,7 @@ from orchestrator.spec.values import (
     place_of,
 )
 from shared_store.races import DEFAULTS, TRIALS
+from shared_store.texts import beside
 from shared_store.wording import Refused, explain, kind_of, nearest, path_of, shown
 
 KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
@@ -191,6 +193,15 @@ class Render(_OfCheckpoint):
     width: int = Field(default=640, ge=64, le=4096, description="of a frame [px]")
     height: int = Field(default=360, ge=64, le=4096, description="of a frame [px]")
 
+    @model_validator(mode="after")
+    def _has_even_sides(self) -> Render:
+        if self.format == "mp4" and (self.width % 2 or self.height % 2):
+            raise ValueError(
+                f"an .mp4 has even sides: width {self.width // 2 * 2} and height {self.height // 2 * 2}, say, not "
+                f"{self.width} and {self.height}"
+            )
+        return self
+
 
 class Spec(Section):
     """One job."""
@@ -273,7 +284,21 @@ class Spec(Section):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the submitter."""
-        return self._notes
+        _, texts = beside(self.document())
+        kept = (
+            f"{each.key}: {each.file}: {len(text.encode()):,} bytes: kept beside the job"
+            for each, text in texts.items()
+        )
+        return (*self._notes, *kept)
+
+    def document(self) -> dict[str, Any]:
+        """It as JSON."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def with_notes(self, notes: Iterable[str]) -> Spec:
+        """This spec, with further notes."""
+        self._notes += tuple(notes)
+        return self
 
     @property
     def kind(self) -> str:
@@ -324,10 +349,7 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
-    if spec.train and merged:
-        notes = [*notes, *_notes_of(spec.train)]
-    spec._notes = tuple(notes)
-    return spec
+    return spec.with_notes([*notes, *(_notes_of(spec.train) if spec.train and merged else ())])
 
 
 def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -399,13 +421,9 @@ def _problem_of(train: _Train) -> _Problem | None:
 
 def _notes_of(train: _Train) -> list[str]:
     """Notes on values of the task's configuration, which is valid as far as it is known here."""
-    kind = task_config(train.task)
-    if kind is None or not train.config:
-        return []
-    try:
-        found: list[str] = kind.configured(train.config).notes(train.algorithm)
-    except Exception:  # a defect of somebody's class: its rank shows the traceback
-        return []
+    kind, found = task_config(train.task), list[str]()
+    with suppress(Exception):  # a defect of somebody's class: its rank shows the traceback
+        found += kind.configured(train.config).notes(train.algorithm) if kind and train.config else ()
     return found
 
 

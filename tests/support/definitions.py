@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-NEEDS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+NEEDS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "64"}]
 
 
 def container(

@@ -221,10 +221,11 @@ class Loop:
             return f"starting from the weights of {of}: {there}"
         if self.resumed is None:
             return f"starting from new weights: {there}"
-        return (
+        found = (
             f"resumed from checkpoint {self.resumed.name}: {there} ({self.resumed.size / 1e6:.2f} MB in {self.state.load_seconds:.3f} s)"
             + "".join(f"; {line}" for line in self.state.set_anew)
         )
+        return "\n".join(filter(None, [found, self.task.begins_anew()]))
 
     def tell_saved(self, lines: list[str]) -> None:
         """Log the results of saves."""
@@ -281,7 +282,8 @@ class Loop:
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}", cause)
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
-        """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError if they are too many."""
+        """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError if they are too many,
+        and UserError where another attempt would not do better."""
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
@@ -304,11 +306,12 @@ class Loop:
                 problem = f" (it could not be written: {error.strerror})"
         self.gang.greatest(0)  # no rank ends the gang before every rank has written
         where = "" if self.gang.device == "cpu" else " --device cuda:0"
-        raise self._failure(
+        failure = self._failure(
             f"{said}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
             f"See it happen again: python -m worker.repeat_incident {files[rank]}{where}{problem}",
             cause,
         )
+        raise UserError(str(failure)) if self.task.is_users_fault(cause) else failure
 
     def _begin_iteration(self, iteration: int) -> None:
         """Tell the task which iteration begins, since its curriculum may depend on it, and what the other ranks have counted."""

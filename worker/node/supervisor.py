@@ -20,17 +20,18 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
+from shared_store.contract import OWN_VARIABLES, ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch, read_epoch
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store, StoreError
 from shared_store.log_files import LogWriter, left_out
 from shared_store.logs import END_LINE, format_line, format_lines
 from shared_store.nodes import end_descendants
-from shared_store.outcomes import EX_TEMPFAIL, Outcome, first_cause, write_outcome
+from shared_store.outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
 from shared_store.processes import PATIENCE, find_process, unkillable
 from shared_store.shim import SCRATCH
 from worker.node.bus import Command, NodeBus
+from worker.node.memory import MemoryLimit
 from worker.node.network import interface_of
 from worker.node.processes import adopt_orphans, kill_group
 from worker.node.rank import Rank
@@ -158,19 +159,32 @@ class Supervisor:
         }
         if interface := interface_of(contract.address, contract.master_address):
             shared |= {"NCCL_SOCKET_IFNAME": interface, "GLOO_SOCKET_IFNAME": interface}
+        self._memory = MemoryLimit(contract)
+        for note in filter(None, (contract.note, self._memory.problem)):
+            self.write(None, "e", note)
         for local in range(contract.ranks_per_node):
             rank = Rank(contract, local, scratch / f"error-{local}.json")
-            # what the user set in the job's environment stands; the bus is the supervisor's alone
-            given = {name: value for name, value in found.environment.items() if name not in BUS_VARIABLES}
+            # what the user set in the job's environment stands; some variables are the supervisor's alone
+            given = {name: value for name, value in found.environment.items() if name not in OWN_VARIABLES}
             env = {**shared, **given, **rank.environment()}
-            rank.start(self.command, env, directory=found.directory, prefix=found.prefix)
+            rank.start(self.command, env, directory=found.directory, prefix=[*self._memory.prefix, *found.prefix])
             self.ranks.append(rank)
             for stream in ("o", "e"):
                 self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))
             self.selector.register(rank.beacon, selectors.EVENT_READ, (rank, "beacon"))
 
+    def _check_memory(self) -> bool:
+        """Whether the node's memory is used up. Then all of its ranks are ended: the kernel has chosen one process, anywhere in the job."""
+        if self._memory.is_used_up():
+            for rank in self.ranks:
+                if rank.running:
+                    kill_group(rank.pid, signal.SIGKILL)
+            return True
+        return False
+
     def _watch(self) -> None:
         """Notice ends; a failure of one rank ends the others, a passed deadline kills."""
+        self._check_memory()
         for rank in self.ranks:
             if rank.poll() and rank.exit_code not in (0, EX_TEMPFAIL):
                 self.stop(f"rank {rank.number} failed", _PEER_GRACE)
@@ -331,6 +345,9 @@ class Supervisor:
     # -- end ----------------------------------------------------------------------------------------------------------
 
     def _outcome(self, started: float) -> Outcome:
+        node, epoch = self.contract.node_index, self.contract.epoch
+        if self._check_memory():
+            return Outcome(node, epoch, 128 + signal.SIGKILL, "SIGKILL", OUT_OF_MEMORY, None, started, time.time())
         failed = [rank for rank in self.ranks if rank.exit_code not in (0, EX_TEMPFAIL)]
         ends = [(self._was_asked(rank), rank.ended) for rank in failed]
         first = failed[first_cause(ends)] if failed else None
@@ -342,7 +359,6 @@ class Supervisor:
             code, reason, error = 0, "done", None
         name = first.signal_name if first else None
         asked = self._was_asked(first) if first else any(rank.asked for rank in self.ranks)
-        node, epoch = self.contract.node_index, self.contract.epoch
         return Outcome(node, epoch, code, name, reason, error, started, time.time(), asked)
 
     def _was_asked(self, rank: Rank) -> bool:

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shared_store import tracks as stored
 from shared_store.files import write_atomic
 from shared_store.layout import Store
@@ -32,20 +34,22 @@ def list_tracks(order: Order) -> list[Order]:
         found.append({**_told(order, track), "origin": {"preset": name}, "about": PRESETS[name].about})
     for name in stored.names(store):
         try:
-            rings = _rings(resolve(name, store)) if order.get("rings") else {}
-            found.append({**stored.StoredTrack(store.tracks / name).facts(), **rings})
+            track = resolve(name, store)
+            found.append({**stored.StoredTrack(store.tracks / name).facts(), **_told(order, track)})
         except (stored.TrackError, UserError) as error:
             found.append({"name": name, "problem": str(error)})
     return found
 
 
 def _told(order: Order, track: Track) -> Order:
+    """Measures of a track; they come from its points, also where another version kept others beside them."""
     return {**track.facts(), **(_rings(track) if order.get("rings") else {})}
 
 
 def _rings(track: Track) -> Order:
-    """The borders in driving order, as pairs [m] rounded to centimetres; for drawings."""
-    return {"rings": {"inner": track.inner.round(2).tolist(), "outer": track.outer.round(2).tolist()}}
+    """The borders in driving order and the ends of the start line, as pairs [m] rounded to centimetres; for drawings."""
+    lines = {"inner": track.inner, "outer": track.outer, "start": np.stack([border[0] for border in track.beside])}
+    return {"rings": {name: line.round(2).tolist() for name, line in lines.items()}}
 
 
 def show(order: Order) -> Order:
@@ -56,7 +60,7 @@ def show(order: Order) -> Order:
     if track.name not in stored.names(store):
         return _told(order, track)
     kept = stored.find(store, track.name)
-    return {**_told(order, track), **kept.facts(), "path": str(kept.path)}
+    return {**kept.facts(), **_told(order, track), "path": str(kept.path)}
 
 
 def make(order: Order) -> Order:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +51,8 @@ class ActionSpace:
     speed: tuple[float, float]
     choices: tuple[tuple[float, float], ...] = ()
     lidar: str | None = None
-    algorithm: str | None = None
-    notes: tuple[str, ...] = ()
+    algorithm: str | None = field(default=None, compare=False)
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
     def metadata(self, sensors: Sequence[str], algorithm: str) -> dict[str, Any]:
         """The content of ``model_metadata.json`` for a policy with these actions.

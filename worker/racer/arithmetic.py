@@ -54,6 +54,42 @@ def cross(first: Floats, second: Floats) -> Floats:
     return product
 
 
+def segments_of(line: Floats, closed: bool = True) -> tuple[Floats, Floats]:
+    """Where the segments of a line (N, 2) begin and end, two of (S, 2): S is N, or N - 1 where its last point does not lead to the first."""
+    return (line, np.roll(line, -1, axis=0)) if closed else (line[:-1], line[1:])
+
+
+def nearest(line: Floats, points: Floats, closed: bool = True) -> tuple[NDArray[np.int64], Floats]:
+    """The place on a line that is nearest to each of ``points`` (P, 2); of several the first one.
+
+    Returns:
+        The segment, (P,), and where on it the place lies, (P,) from 0 to 1.
+    """
+    start, end = segments_of(line, closed)
+    segment, steps = end - start, norm(end - start)
+    squared = np.maximum(steps * steps, 1e-12)  # a border may stand still
+    rows, shares = np.empty(len(points), np.int64), np.empty(len(points))
+    size = max(1, BLOCK // len(start))
+    for begin in range(0, len(points), size):
+        here = slice(begin, begin + size)
+        x = points[here, None, 0] - start[:, 0]
+        y = points[here, None, 1] - start[:, 1]
+        share = np.clip((x * segment[:, 0] + y * segment[:, 1]) / squared, 0.0, 1.0)
+        x, y = x - share * segment[:, 0], y - share * segment[:, 1]
+        row = (x * x + y * y).argmin(axis=1)
+        rows[here] = row
+        shares[here] = np.take_along_axis(share, row[:, None], 1)[:, 0]
+    return rows, shares
+
+
+def nearest_points(line: Floats, points: Floats, closed: bool = True) -> Floats:
+    """The points of a line (N, 2) that are nearest to ``points``, (P, 2)."""
+    row, share = nearest(line, points, closed)
+    start, end = segments_of(line, closed)
+    found: Floats = start[row] + share[:, None] * (end[row] - start[row])
+    return found
+
+
 def meetings(start: Floats, end: Floats, points: Floats) -> NDArray[np.int64]:
     """Number of segments from ``start`` (N, 2) to ``end`` that a ray to the right from each of ``points`` (P, 2) meets, as (P,).
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from worker.racer.bicycle import WHEELBASE, Motion, drive
-from worker.racer.road import RoadArrays, advance, around, on_road, project
+from worker.racer.road import RoadArrays, advance, around, is_open, on_road, project
 from worker.simulation.kinematics import wrapped_angle
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
@@ -66,8 +66,8 @@ class CarArrays:
         commands: Steering [rad] and speed [m/s] that reached the car last, shape ``(worlds,)``.
         fronts: x and y of the front [m], shape ``(worlds,)``; what follows is of this point.
         rows: The nearest segment of the centre line, shape ``(worlds,)``.
-        before: The waypoint behind, shape ``(worlds,)``.
-        after: The waypoint ahead, shape ``(worlds,)``; with ``before``, the closest waypoints of reward functions.
+        before: The waypoint behind, counted from the start line in driving direction, shape ``(worlds,)``.
+        after: The waypoint ahead, ``before`` + 1, shape ``(worlds,)``; with ``before``, the closest waypoints of reward functions.
         distances: From the centre line [m], shape ``(worlds,)``.
         left: Whether the front is left of it, in driving direction, shape ``(worlds,)``.
         along: From the start line in driving direction [m], shape ``(worlds,)``.
@@ -263,8 +263,9 @@ def look_round(world: int, car: CarArrays, begin: int, many: int):
     car.headings[world] = place.heading
     car.widths[world] = place.width
     wheels = int(4)  # noqa: RUF046 (a variable for Warp, not a constant)
-    # no wheel is farther from the front than the rear ones
-    if place.distance + wp.length(wp.vec2(FRONT + 0.5 * WHEELBASE, 0.5 * GAUGE)) >= road.clear[track]:
+    # no wheel is farther from the front than the rear ones; behind the end of an open track nothing is off the road
+    at_end = is_open(road, track) and place.along >= road.length[track]
+    if not at_end and place.distance + wp.length(wp.vec2(FRONT + 0.5 * WHEELBASE, 0.5 * GAUGE)) >= road.clear[track]:
         wheels = wheels_on_road(car, track, pose)
     car.wheels[world] = wheels
     look_at_obstacles(world, car)
@@ -274,7 +275,6 @@ def look_round(world: int, car: CarArrays, begin: int, many: int):
 def look_at_obstacles(world: int, car: CarArrays):
     """Find the obstacles before and behind the car, and whether it touches one."""
     track = car.tracks[world]
-    length = car.road.length[track]
     least, greatest = float(wp.inf), float(-1.0)
     car.next_obstacle[world] = -1
     car.last_obstacle[world] = -1
@@ -284,7 +284,7 @@ def look_at_obstacles(world: int, car: CarArrays):
             car.poses[world], wp.vec2(HALF_LENGTH, HALF_WIDTH), car.obstacle_poses[track, number], car.obstacle_half
         ):
             hit = True
-        gap = gap_to(world, car, number, length)
+        gap = gap_to(world, car, number)
         if gap < least:
             least = gap
             car.next_obstacle[world] = number
@@ -295,12 +295,16 @@ def look_at_obstacles(world: int, car: CarArrays):
 
 
 @wp.func
-def gap_to(world: int, car: CarArrays, number: int, length: float) -> float:
-    """Distance to an obstacle ahead along the centre line, at most once round the track [m]."""
-    there = car.obstacle_along[car.tracks[world], number]
+def gap_to(world: int, car: CarArrays, number: int) -> float:
+    """Distance to an obstacle ahead along the centre line, at most once round the track [m].
+
+    On an open track that to an obstacle behind is more than the track's length, so that all that are ahead come first.
+    """
+    track = car.tracks[world]
+    there = car.obstacle_along[track, number]
     if car.backwards[world]:
-        there = length - there
-    return around(there - car.along[world], length)
+        there = car.road.length[track] - there
+    return around(there - car.along[world], car.road.period[track])
 
 
 @wp.func
@@ -338,6 +342,17 @@ def begin_car(world: int, car: CarArrays):
 
 
 @wp.func
+def lap_of(world: int, car: CarArrays) -> float:
+    """Way that makes a lap [m]: the track's length; on an open one, from where the episode began to the end."""
+    track = car.tracks[world]
+    lap = car.road.length[track]
+    if is_open(car.road, track):
+        # what is left is exactly 0 at the end, where the lap is what was travelled
+        lap = wp.max(car.travelled[world] + (lap - car.along[world]), 1.0e-3)
+    return lap
+
+
+@wp.func
 def progress_of(world: int, car: CarArrays) -> float:
-    """Share of a lap that the car has driven since the episode began, 0 to 100 [%]."""
-    return 100.0 * wp.clamp(car.travelled[world] / car.road.length[car.tracks[world]], 0.0, 1.0)
+    """Share of a lap that the car has driven since the episode began, at most 100 [%]; below 0 behind the place where it began."""
+    return 100.0 * wp.min(car.travelled[world] / lap_of(world, car), 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.errors import UserError
-from worker.racer.arithmetic import Floats, cross, meetings, norm
+from worker.racer.arithmetic import Floats, cross, meetings, nearest_points, norm, segments_of
 
 WAYPOINTS = (20, 5000)
 """Greatest number; the car looks at all of them in every step."""
@@ -24,6 +24,8 @@ LEAST_RADIUS = 0.25
 """Of the centre line's curves [m]; with its wheels turned by 30° a car turns with a radius of 0.28 m."""
 CURVE = 0.3
 """Over this distance ahead and behind a curve is measured [m]: digitised tracks are not smooth from point to point."""
+LEVEL = 0.005
+"""By this share the borders may be nearer to a waypoint than their own rows: a file has corners where the road has curves."""
 RINGS = ("centre line", "inner border", "outer border")
 
 _BLOCK = 512
@@ -36,13 +38,14 @@ class BadTrack(UserError):
     """This can't be a track; the message is one line that says what is wrong, where, and what to do."""
 
 
-def check(center: Floats, inner: Floats, outer: Floats) -> None:
-    """Raise BadTrack for rings that are no track.
+def check(center: Floats, inner: Floats, outer: Floats, closed: bool = True) -> None:
+    """Raise BadTrack for lines that are no track.
 
     Args:
         center: Waypoints of the centre line (N, 2) [m] in driving order, the first one not repeated.
-        inner: The inner border beside each of them.
-        outer: The outer border.
+        inner: The inner border, (N, 2) [m].
+        outer: The outer border, (N, 2) [m].
+        closed: Whether the last waypoint leads to the first.
     """
     rings = (center, inner, outer)
     if len(center) < WAYPOINTS[0]:
@@ -51,16 +54,21 @@ def check(center: Floats, inner: Floats, outer: Floats) -> None:
         raise BadTrack(f"{len(center)} waypoints are too many: a track has at most {WAYPOINTS[1]}; space them wider")
     for ring, name in zip(rings, RINGS, strict=True):
         check_numbers(ring, name)
-    _check_steps(center)
-    _check_width(inner, outer)
-    _check_curves(center)
-    if crossing := first_crossing(rings):
+    _check_steps(center, closed)
+    _check_curves(center, closed)
+    if crossing := first_crossing(rings, closed):
         raise BadTrack(_crossing_told(rings, *crossing))
-    if not inside(center, inner[:1])[0]:
-        turned = " (the borders seem to be swapped)" if inside(center, outer[:1])[0] else ""
-        raise BadTrack(f"the inner border lies outside the centre line: {at(inner, 0)}{turned}")
-    if not inside(outer, center[:1])[0]:
-        raise BadTrack(f"the outer border does not enclose the centre line: {at(outer, 0)}")
+    if closed:
+        if not inside(center, inner[:1])[0]:
+            turned = " (the borders seem to be swapped)" if inside(center, outer[:1])[0] else ""
+            raise BadTrack(f"the inner border lies outside the centre line: {at(inner, 0)}{turned}")
+        if not inside(outer, center[:1])[0]:
+            raise BadTrack(f"the outer border does not enclose the centre line: {at(outer, 0)}")
+    elif not (left_of_line(center, inner).all() and not left_of_line(center, outer).any()):
+        raise BadTrack(
+            "an open track has its inner border on the left of the centre line, and its outer one on the right"
+        )
+    _check_width(*beside(center, inner, outer, closed))
 
 
 def check_numbers(ring: Floats, name: str) -> None:
@@ -76,17 +84,19 @@ def at(ring: Floats, row: int) -> str:
     return f"row {row} (x {ring[row, 0]:.3f}, y {ring[row, 1]:.3f})"
 
 
-def steps_of(ring: Floats) -> Floats:
-    """Lengths (N,) of the segments from each point of a ring (N, 2) to the next [m]."""
-    return norm(np.roll(ring, -1, axis=0) - ring)
+def steps_of(line: Floats, closed: bool = True) -> Floats:
+    """Lengths of the segments from each point of a line (N, 2) to the next, (N,) [m]; (N - 1,) of an open one."""
+    start, end = segments_of(line, closed)
+    return norm(end - start)
 
 
-def radii_of(center: Floats) -> Floats:
+def radii_of(center: Floats, closed: bool = True) -> Floats:
     """Radius (N,) of the curve at each waypoint [m]; infinite on a straight.
 
-    It is that of the circle through the waypoint and the two that lie about :data:`CURVE` before and behind it.
+    It is that of the circle through the waypoint and the two that lie about :data:`CURVE` before and behind it; at the ends of an open
+    line, where one of them is missing, there is no curve.
     """
-    spacing = float(np.cumsum(steps_of(center))[-1]) / len(center)
+    spacing = float(np.cumsum(steps_of(center, closed))[-1]) / len(center)
     reach = max(1, round(CURVE / spacing))
     behind, ahead = center - np.roll(center, reach, axis=0), np.roll(center, -reach, axis=0) - center
     twice_area = np.abs(cross(behind, ahead))
@@ -96,7 +106,22 @@ def radii_of(center: Floats) -> Floats:
     # three points on a line: they go on along it, or they turn back on it
     backwards = behind[:, 0] * ahead[:, 0] + behind[:, 1] * ahead[:, 1] < 0
     found: Floats = np.where(twice_area == 0, np.where(backwards, 0.0, np.inf), radii)
+    if not closed:
+        found[:reach] = found[-reach:] = np.inf
     return found
+
+
+def beside(center: Floats, inner: Floats, outer: Floats, closed: bool = True) -> tuple[Floats, Floats]:
+    """The points of both borders across the road from each waypoint, two of (N, 2) [m].
+
+    In many files the border rows are not level with those of the centre line. These points are the nearest ones of the borders, from
+    which AWS's simulator takes ``track_width``; a row that is level (to :data:`LEVEL`) stays as it is.
+    """
+    points = [nearest_points(border, center, closed) for border in (inner, outer)]
+    rows = norm(inner - center) + norm(outer - center)
+    level = rows <= (1 + LEVEL) * sum(norm(each - center) for each in points)
+    found = (np.where(level[:, None], border, each) for border, each in zip((inner, outer), points, strict=True))
+    return next(found), next(found)
 
 
 def area_of(ring: Floats) -> float:
@@ -110,15 +135,24 @@ def inside(ring: Floats, points: Floats) -> NDArray[np.bool_]:
     return found
 
 
-def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | None:
+def left_of_line(center: Floats, border: Floats) -> NDArray[np.bool_]:
+    """Whether the points of a border (N, 2) that are nearest to each waypoint of an open line lie to the left of it, (N,)."""
+    away = nearest_points(border, center, closed=False) - center
+    ahead = np.diff(center, axis=0)
+    left: NDArray[np.bool_] = cross(np.concatenate((ahead, ahead[-1:])), away) > 0
+    return left
+
+
+def first_crossing(rings: tuple[Floats, ...], closed: bool = True) -> tuple[int, int, int, int] | None:
     """The first place where rings touch or cross: ring, row, other ring, other row; None without one.
 
     A ring that crosses itself comes first. A row stands for the segment from it to the next. Neighbours in a ring meet where they
     should; points of a border that stand there several times (a hairpin turns about one point) count once.
     """
     kept = [np.flatnonzero(steps_of(ring) > SHORTEST_STEP) for ring in rings]
-    start = np.concatenate([ring[rows] for ring, rows in zip(rings, kept, strict=True)])
-    end = np.concatenate([np.roll(ring[rows], -1, axis=0) for ring, rows in zip(rings, kept, strict=True)])
+    ends = [segments_of(ring[rows], closed) for ring, rows in zip(rings, kept, strict=True)]
+    kept = [rows[: len(each[0])] for rows, each in zip(kept, ends, strict=True)]
+    start, end = (np.concatenate(each) for each in zip(*ends, strict=True))
     which = np.repeat(np.arange(len(rings)), [len(rows) for rows in kept])
     place = np.concatenate([np.arange(len(rows)) for rows in kept])
     size = np.array([len(rows) for rows in kept])[which]
@@ -131,7 +165,8 @@ def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | Non
         i, j = np.nonzero(near)
         i += begin
         apart = np.abs(place[i] - place[j])
-        other = (i < j) & ((which[i] != which[j]) | ((apart > 1) & (apart < size[i] - 1)))
+        neighbours = (apart <= 1) | (closed & (apart >= size[i] - 1))
+        other = (i < j) & ((which[i] != which[j]) | ~neighbours)
         i, j = i[other], j[other]
         meet = _straddles(start[i], end[i], start[j], end[j]) & _straddles(start[j], end[j], start[i], end[i])
         for k, m in zip(i[meet][:_TOLD], j[meet][:_TOLD], strict=True):
@@ -154,8 +189,8 @@ def _crossing_told(rings: tuple[Floats, ...], ring: int, row: int, other: int, o
     return f"the {RINGS[ring]} and the {RINGS[other]} cross or touch: {where} and {at(rings[other], other_row)}"
 
 
-def _check_steps(center: Floats) -> None:
-    steps = steps_of(center)
+def _check_steps(center: Floats, closed: bool) -> None:
+    steps = steps_of(center, closed)
     if steps.max() > LONGEST_STEP:
         row = int(steps.argmax())
         raise BadTrack(
@@ -179,8 +214,8 @@ def _check_width(inner: Floats, outer: Floats) -> None:
             )
 
 
-def _check_curves(center: Floats) -> None:
-    radii = radii_of(center)
+def _check_curves(center: Floats, closed: bool) -> None:
+    radii = radii_of(center, closed)
     row = int(radii.argmin())
     if radii[row] < LEAST_RADIUS:
         raise BadTrack(

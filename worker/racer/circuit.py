@@ -68,10 +68,10 @@ def _pose(track: Track, obstacle: ObstacleConfig) -> Floats:
     found = project(track, points)
     point = points[0]
     if obstacle.lane != "center":
-        row, following = int(found.before[0]), int(found.after[0])
-        ring = track.inner if obstacle.lane == "inner" else track.outer
+        row, following = int(found.before[0]), int(found.after[0]) % len(track.center)
+        border = track.beside[0 if obstacle.lane == "inner" else 1]
         share = (obstacle.distance - track.along[row]) / track.steps[row]
-        point = 0.5 * (point + ring[row] + share * (ring[following] - ring[row]))
+        point = 0.5 * (point + border[row] + share * (border[following] - border[row]))
     return np.array([*point, headings[0]])
 
 

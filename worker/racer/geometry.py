@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.racer.arithmetic import BLOCK, Floats, cross, meetings, norm
+from worker.racer.arithmetic import Floats, cross, meetings, nearest, norm, segments_of
 from worker.racer.track import Track
 
 
@@ -25,10 +25,12 @@ class Projection:
         point: The nearest point of the centre line, (P, 2) [m].
         distance: How far it is, (P,) [m].
         left: Whether the point lies to the left of the centre line, (P,) bool; on it, it does not.
-        before: The waypoint behind the nearest point, or at it, (P,) int64.
-        after: The waypoint ahead of it, (P,) int64. With ``before``, what reward functions know as ``closest_waypoints``.
-        along: From the start line to the nearest point along the centre line, (P,) [m], from 0 to less than the track's length.
-        progress: The same as a share of the track's length, (P,) [%], from 0 to less than 100.
+        before: The waypoint behind the nearest point, or at it, (P,) int64, counted from 0 at the start line in driving direction.
+        after: The waypoint ahead of it, ``before`` + 1, (P,) int64: of a loop N is the start line again. Both are what reward functions
+            know as ``closest_waypoints``.
+        along: From the start line to the nearest point along the centre line, (P,) [m], from 0 to less than the track's length; at the
+            end of an open track that length.
+        progress: The same as a share of the track's length, (P,) [%].
         heading: Of the centre line there, (P,) [rad], from -π to π; 0 is the x axis, counter-clockwise is positive.
         width: Of the road there, (P,) [m].
     """
@@ -54,11 +56,14 @@ def project(track: Track, points: Any, backwards: Any = False) -> Projection:
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     backwards = np.broadcast_to(np.asarray(backwards, bool), len(points))
-    count = len(track.center)
-    row, share = _nearest(track, points)
+    count, segments = len(track.center), len(track.steps)
+    row, share = nearest(track.center, points, track.closed)
     # a segment has the waypoint at which its driver enters it, and not the one at which it leaves
     step_on = ~backwards & (share >= 1)
     step_back = backwards & (share <= 0)
+    if not track.closed:  # but for the ends of the line
+        step_on &= row < segments - 1
+        step_back &= row > 0
     share = np.where(step_on, 0.0, np.where(step_back, 1.0, share))
     row = (row + step_on - step_back) % count
     following = (row + 1) % count
@@ -68,13 +73,14 @@ def project(track: Track, points: Any, backwards: Any = False) -> Projection:
     sign = np.where(backwards, -1.0, 1.0)
     forth = track.along[row] + share * track.steps[row]
     along = np.where(backwards, track.length - forth, forth)
-    along = np.where(along >= track.length, 0.0, along)
+    if track.closed:
+        along = np.where(along >= track.length, 0.0, along)
     return Projection(
         point=point,
         distance=norm(points - point),
         left=sign * cross(segment, points - start) > 0,
-        before=np.where(backwards, following, row),
-        after=np.where(backwards, row, following),
+        before=np.where(backwards, segments - 1 - row, row),
+        after=np.where(backwards, segments - row, row + 1),
         along=along,
         progress=along / track.length * 100,
         heading=np.arctan2(sign * segment[:, 1], sign * segment[:, 0]),
@@ -85,11 +91,13 @@ def project(track: Track, points: Any, backwards: Any = False) -> Projection:
 def on_road(track: Track, points: Any) -> NDArray[np.bool_]:
     """Which of ``points`` (P, 2) [m] lie between the borders, (P,) bool.
 
-    A ray from a point on the road meets the two borders an odd number of times in all.
+    A ray from a point on the road meets the two borders, and the ends of an open road, an odd number of times in all.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
-    start = np.concatenate((track.inner, track.outer))
-    end = np.concatenate((np.roll(track.inner, -1, axis=0), np.roll(track.outer, -1, axis=0)))
+    borders = [segments_of(border, track.closed) for border in (track.inner, track.outer)]
+    if not track.closed:
+        borders.append((track.inner[[0, -1]], track.outer[[0, -1]]))
+    start, end = (np.concatenate(each) for each in zip(*borders, strict=True))
     found: NDArray[np.bool_] = meetings(start, end, points) % 2 == 1
     return found
 
@@ -99,15 +107,20 @@ def place_at(track: Track, along: Any, backwards: Any = False) -> tuple[Floats, 
 
     Args:
         track: The track.
-        along: Distances from the start line in driving direction, (S,) [m]; they go round as often as they like.
+        along: Distances from the start line in driving direction, (S,) [m]; they go round as often as they like, and end at the ends of an
+            open track.
         backwards: Whether the waypoints are driven against their order: (S,) bool, or one for all.
     """
-    along = np.mod(np.atleast_1d(np.asarray(along, np.float64)), track.length)
-    along = np.where(along >= track.length, 0.0, along)  # what is a hair behind the start line is rounded up to it
+    along = np.atleast_1d(np.asarray(along, np.float64))
+    if track.closed:
+        along = np.mod(along, track.length)
+        along = np.where(along >= track.length, 0.0, along)  # what is a hair behind the start line is rounded up to it
+    else:
+        along = np.clip(along, 0.0, track.length)
     backwards = np.broadcast_to(np.asarray(backwards, bool), len(along))
     forth = np.where(backwards, track.length - along, along)
     entered = np.where(backwards, *(np.searchsorted(track.along, forth, side=side) for side in ("left", "right")))
-    row = entered - 1
+    row = entered - 1 if track.closed else np.clip(entered - 1, 0, len(track.steps) - 1)
     segment = track.center[(row + 1) % len(track.center)] - track.center[row]
     share = (forth - track.along[row]) / track.steps[row]
     sign = np.where(backwards, -1.0, 1.0)
@@ -119,29 +132,13 @@ def advance(track: Track, before: Any, after: Any) -> Floats:
 
     A car goes less than half of the track in one step.
     """
-    half = track.length / 2
-    moved: Floats = np.mod(np.asarray(after, np.float64) - np.asarray(before, np.float64) + half, track.length) - half
+    moved: Floats = np.asarray(after, np.float64) - np.asarray(before, np.float64)
+    if track.closed:
+        half = track.length / 2
+        moved = np.mod(moved + half, track.length) - half
     return moved
 
 
 def degrees(angles: Any) -> Floats:
     """Angles [rad] in degrees from -180 to 180, as reward functions see them."""
     return np.asarray(angles, np.float64) * (180 / math.pi)
-
-
-def _nearest(track: Track, points: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """For each point the segment with the nearest point of the centre line, (P,) int64, and where on it that lies, (P,) from 0 to 1."""
-    start, segment = track.center, np.roll(track.center, -1, axis=0) - track.center
-    squared = track.steps * track.steps
-    rows, shares = np.empty(len(points), np.int64), np.empty(len(points))
-    size = max(1, BLOCK // len(start))
-    for begin in range(0, len(points), size):
-        here = slice(begin, begin + size)
-        x = points[here, None, 0] - start[:, 0]
-        y = points[here, None, 1] - start[:, 1]
-        share = np.clip((x * segment[:, 0] + y * segment[:, 1]) / squared, 0.0, 1.0)
-        x, y = x - share * segment[:, 0], y - share * segment[:, 1]
-        row = (x * x + y * y).argmin(axis=1)
-        rows[here] = row
-        shares[here] = np.take_along_axis(share, row[:, None], 1)[:, 0]
-    return rows, shares

@@ -33,10 +33,11 @@ def picture_of(track: Track) -> bytes:
     size = (span + 2 * margin) * _SIDE / (span.max() + 2 * margin)
     figure = Figure(figsize=(max(size[0], 4.5) + 0.6, max(size[1], 2.0) + 1.1), dpi=100, layout="constrained")
     axes = figure.subplots()
-    rings = [np.vstack((ring, ring[:1])) for ring in (track.outer, track.inner[::-1])]
+    borders = track.outer, track.inner[::-1]
+    rings = [np.vstack((ring, ring[:1])) for ring in (borders if track.closed else [np.vstack(borders)])]
     codes = [[Path.MOVETO, *[Path.LINETO] * (len(ring) - 2), Path.CLOSEPOLY] for ring in rings]
     axes.add_patch(PathPatch(Path(np.vstack(rings), np.concatenate(codes)), facecolor=_ASPHALT, edgecolor="none"))
-    for ring in rings:
+    for ring in rings if track.closed else borders:
         axes.plot(*ring.T, color=_BORDER, linewidth=1.4)
     axes.plot(*track.center.T, ".", color=_CENTER, markersize=2.6)
     _number(axes, track)
@@ -71,15 +72,16 @@ def _number(axes: Any, track: Track) -> None:
     count = len(track.center)
     every = next(step for step in (5, 10, 20, 25, 50, 100, 250, 500) if count / step <= 1.5 * _NUMBERS)
     for row in range(every, count - every // 2, every):
-        place = track.center[row] + 0.6 * (track.inner[row] - track.center[row])
+        place = track.center[row] + 0.6 * (track.beside[0][row] - track.center[row])
         axes.text(*place, str(row), fontsize=7, color="#555555", ha="center", va="center")
 
 
 def _start(axes: Any, track: Track) -> None:
     """Draw the start line across the road, and an arrow in driving direction."""
-    axes.plot(*np.vstack((track.inner[0], track.outer[0])).T, color=_START, linewidth=3, solid_capstyle="butt")
+    inner, outer = (border[0] for border in track.beside)
+    axes.plot(*np.vstack((inner, outer)).T, color=_START, linewidth=3, solid_capstyle="butt")
     width = float(track.width[0])
     (tail, tip), _ = place_at(track, [0.25 * width, 1.25 * width])
-    beside = 0.25 * (track.outer[0] - track.center[0])
+    beside = 0.25 * (outer - track.center[0])
     arrow = {"arrowstyle": "-|>", "color": _START, "linewidth": 1.8, "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", xy=tip + beside, xytext=tail + beside, arrowprops=arrow)

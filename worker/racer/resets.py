@@ -21,7 +21,7 @@ from worker.racer.car_arrays import (
     put_car,
 )
 from worker.racer.car_arrays import HEADING as HEADING_JOINT
-from worker.racer.road import advance, place_at, project, width_at
+from worker.racer.road import FIRST_PLACE, advance, is_open, place_at, project, width_at
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
 
@@ -73,6 +73,8 @@ def find_place(world: int, car: CarArrays):
     track = car.tracks[world]
     backwards = car.backwards[world]
     behind = car.along[world] - car.rules.put_back - FRONT
+    if is_open(car.road, track):
+        behind = wp.max(behind, FIRST_PLACE)
     place = place_at(car.road, track, behind, backwards)
     beside = 0.25 * width_at(car.road, track, behind, backwards)
     if not car.left[world]:

@@ -16,11 +16,13 @@ from worker.racer.car_arrays import CarArrays, ahead_of, progress_of
 from worker.racer.circuit import BOX, Circuit
 from worker.racer.geometry import project
 from worker.racer.rewards.compiled import RaceArrays
+from worker.racer.rewards.courses import courses_of
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import NUMBER_COLUMNS, OBJECT_COLUMNS
 from worker.racer.rewards.parameters import OBJECT_COUNT as COUNT
 from worker.racer.rewards.parameters import TRACK as TRACK_ROW
 from worker.racer.rewards.reward import RewardFunction, checked, compiled_function
+from worker.racer.road import is_open
 from worker.simulation.sensors.sensor import SensorContext
 from worker.tasks.configs.racer import FrontCameraConfig
 
@@ -137,7 +139,10 @@ def _tell(
     numbers[TIME] = float(car.steps[world]) * seconds
     count = car.obstacle_poses.shape[1]
     numbers[OBJECT_COUNT] = float(count)
-    numbers[TRACK] = float(track)
+    line = track
+    if backwards:  # behind the tracks' lines stand the same ones turned round
+        line += car.road.first.shape[0]
+    numbers[TRACK] = float(line)
     seen = bool(False)
     for number in range(count):
         box = car.obstacle_poses[track, number]
@@ -146,16 +151,16 @@ def _tell(
         side = sides[track, number]
         if backwards:
             side = -side
-            if along > 0.0:
+            if along > 0.0 or is_open(car.road, track):
                 along = length - along
         row[O_PLACE] = box[0]
         row[O_PLACE + 1] = box[1]
         row[O_ALONG] = along
-        row[O_HEADING] = wp.degrees(box[2])
+        row[O_HEADING] = 0.0
         row[O_LEFT] = told(side > 0.0)
         row[O_DISTANCE] = wp.abs(side)
-        if sees_box(view, pose, box, car.obstacle_half):
-            seen = True
+        if number == car.next_obstacle[world]:
+            seen = sees_box(view, pose, box, car.obstacle_half)
     numbers[SEEN] = told(seen)
 
 
@@ -178,6 +183,7 @@ class RewardInputs:
     function: Any
     reason: str
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
     arrays_type: ClassVar[Any] = RaceArrays
 
     @classmethod
@@ -187,10 +193,11 @@ class RewardInputs:
         Raises:
             ValueError: The guard refuses it.
         """
-        if device and (problem := checked(reward.text, reward.file)):
+        problem, warnings = checked(reward.text, reward.file, courses_of(circuit)) if device else (None, ())
+        if problem:
             raise ValueError(f"config.reward_function: {problem}")
         function, _, reason, notes = compiled_function(reward.text, reward.file, device)
-        return cls(circuit, reward, front, function, reason, notes)
+        return cls(circuit, reward, front, function, reason, notes, warnings)
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """None: a term that reads it is called once."""
@@ -202,7 +209,8 @@ class RewardInputs:
 
 
 class Racing:
-    """:class:`RewardInputs` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`. It has no state: all follows from the cars.
+    """:class:`RewardInputs` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`. It has no state: all follows from the cars,
+    but for what a function in Python workers remembers, which no checkpoint has.
 
     Args:
         declared: As a task declares it.
@@ -211,6 +219,7 @@ class Racing:
     Attributes:
         arrays: What the cars' functions are told.
         reward: The function.
+        called: Whether it is called: a trial step, before the worlds begin, is no step of a car.
     """
 
     needs_bodies = False
@@ -220,13 +229,20 @@ class Racing:
         self._device = context.device
         self._worlds, self._seconds = context.worlds.world_count, 1.0 / context.control_hz
         circuit, front = declared.circuit, declared.front
-        # as in files, the first waypoint stands at the end once more
-        lines = [np.vstack((track.center, track.center[:1])).tolist() for track in circuit.tracks]
+        lines = [track.line().tolist() for track in circuit.tracks]
+        lines += [line[::-1] for line in lines]
         reward, compiled = declared.reward, declared.function is not None
         # each rank has its own share of the processors, which torch knows
         processes = max(1, min(torch.get_num_threads(), -(-self._worlds // 16)))
         self.reward = RewardFunction(
-            reward.text, lines, self._worlds, self._device, reward.file, compiled=compiled, processes=processes
+            reward.text,
+            lines,
+            self._worlds,
+            self._device,
+            reward.file,
+            compiled=compiled,
+            processes=processes,
+            courses=courses_of(circuit),
         )
         weakref.finalize(self, self.reward.close)
         self.arrays = self.reward.race
@@ -240,6 +256,12 @@ class Racing:
             row[:] = np.where(found.left, found.distance, -found.distance)
         self._sides = wp.array(sides, dtype=wp.float32, device=self._device)
         self._cars: Any = None
+        self.called = False
+
+    def begin_anew(self) -> None:
+        """Begin as if no car had driven: what the function remembers, and its failures, are forgotten."""
+        self.called = True
+        self.reward.begin_anew()
 
     def follow(self, cars: Any) -> None:
         """Tell of these cars (``CarArrays``) from now on."""

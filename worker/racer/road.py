@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from worker.racer.arithmetic import norm
+from worker.racer.arithmetic import nearest_points, norm
 from worker.racer.geometry import project as project_all
 from worker.racer.track import Track
 
@@ -20,6 +20,10 @@ wp.set_module_options({"enable_backward": False})
 REACH = 1.0
 """How far along the centre line the nearest segment is looked for, before and behind that of the step before [m]. In a control step of
 1/15 s a car drives 0.27 m at most."""
+FIRST_PLACE = wp.constant(0.15)
+"""On an open track a car's middle is put at least so far behind the start line, so that all of its wheels are on the road [m]."""
+LAST_PLACE = wp.constant(1.0)
+"""An episode on an open track begins at least so far before its end [m]."""
 
 
 @wp.struct
@@ -31,13 +35,16 @@ class RoadArrays:
         inner: The border inside the loop beside each waypoint [m], shape ``(waypoints,)``.
         outer: The border outside [m], shape ``(waypoints,)``.
         along: From the start line to each waypoint [m], shape ``(waypoints,)``.
-        steps: From each waypoint to the next [m], shape ``(waypoints,)``.
+        steps: From each waypoint to the next [m], shape ``(waypoints,)``; the last one of an open track means nothing.
         width: Of the road at each waypoint [m], shape ``(waypoints,)``.
         first: First row of each track, shape ``(tracks,)``.
         count: Waypoints of each track, shape ``(tracks,)``.
+        segments: Of each track's centre line, shape ``(tracks,)``: ``count``, or one less where it is open.
         length: Of each track's centre line [m], shape ``(tracks,)``.
+        period: After which a distance along the track means the same place [m], shape ``(tracks,)``: the length of a loop. On an open
+            track no distance comes back; it is twice the length there, more than any two places are apart.
         window: Segments that together are at least :data:`REACH` long, wherever on the track, shape ``(tracks,)``.
-        clear: Whatever is closer to the centre line than this is on the road [m], shape ``(tracks,)``.
+        clear: Whatever is closer to the centre line than this is on the road [m], shape ``(tracks,)``; 0 of an open one, for its ends.
         corner: Where the track's own origin is in a world [m], shape ``(tracks,)``: tracks lie side by side.
     """
 
@@ -49,7 +56,9 @@ class RoadArrays:
     width: wp.array[wp.float32]
     first: wp.array[wp.int32]
     count: wp.array[wp.int32]
+    segments: wp.array[wp.int32]
     length: wp.array[wp.float32]
+    period: wp.array[wp.float32]
     window: wp.array[wp.int32]
     clear: wp.array[wp.float32]
     corner: wp.array[wp.vec2]
@@ -64,8 +73,8 @@ class Place:
         point: The nearest point of the centre line [m].
         distance: How far it is [m].
         left: Whether the point lies to the left of the centre line, in driving direction.
-        before: The waypoint behind the nearest point, or at it.
-        after: The waypoint ahead of it.
+        before: The waypoint behind the nearest point, or at it, counted in driving direction.
+        after: The waypoint ahead of it, ``before`` + 1.
         along: From the start line to the nearest point, in driving direction [m].
         heading: Of the centre line there, in driving direction [rad], from -pi to pi.
         width: Of the road there [m].
@@ -89,6 +98,12 @@ def cross(first: wp.vec2, second: wp.vec2) -> float:
 
 
 @wp.func
+def is_open(road: RoadArrays, track: int) -> bool:
+    """Whether the track is no loop."""
+    return road.segments[track] < road.count[track]
+
+
+@wp.func
 def next_row(road: RoadArrays, track: int, row: int) -> int:
     """The waypoint that follows, in the order of the waypoints."""
     return (row + 1) % road.count[track]
@@ -102,12 +117,16 @@ def nearest(road: RoadArrays, track: int, point: wp.vec2, begin: int, many: int)
         road: The tracks.
         track: Which of them.
         point: In the track's own frame [m].
-        begin: A row, of any size: rows go round.
+        begin: A row, of any size: the rows of a loop go round.
         many: At most as many as the track has are looked at.
     """
     count = road.count[track]
     first = road.first[track]
     best, best_row, best_share = float(wp.inf), int(0), float(0.0)  # noqa: RUF046 (variables for Warp, not constants)
+    if is_open(road, track):  # those of the range that there are, and at least one
+        begin = wp.min(begin, road.segments[track] - 1)
+        many = wp.clamp(begin + many, 1, road.segments[track]) - wp.max(begin, 0)
+        begin = wp.max(begin, 0)
     for number in range(wp.min(many, count)):
         row = (begin + number) % count
         if row < 0:
@@ -134,11 +153,13 @@ def project(road: RoadArrays, track: int, point: wp.vec2, backwards: bool, begin
     count = road.count[track]
     first = road.first[track]
     row, share = nearest(road, track, point, begin, many)
+    at_start = is_open(road, track) and row == 0 and share <= 0.0
+    at_end = is_open(road, track) and row == road.segments[track] - 1 and share >= 1.0
     # a segment has the waypoint at which its driver enters it, and not the one at which it leaves
-    if not backwards and share >= 1.0:
+    if not backwards and share >= 1.0 and not at_end:
         row = next_row(road, track, row)
         share = float(0.0)
-    elif backwards and share <= 0.0:
+    elif backwards and share <= 0.0 and not at_start:
         row = (row + count - 1) % count
         share = float(1.0)
     following = next_row(road, track, row)
@@ -149,18 +170,19 @@ def project(road: RoadArrays, track: int, point: wp.vec2, backwards: bool, begin
     place.point = start + share * segment
     place.distance = wp.length(point - place.point)
     forth = road.along[first + row] + share * road.steps[first + row]
+    if at_end:
+        forth = road.length[track]
     side = cross(segment, point - start)
     place.before = row
-    place.after = following
     place.along = forth
     ahead = segment
     if backwards:
-        place.before = following
-        place.after = row
+        place.before = road.segments[track] - 1 - row
         place.along = road.length[track] - forth
         side = -side
         ahead = -segment
-    if place.along >= road.length[track]:
+    place.after = place.before + 1
+    if place.along >= road.length[track] and not is_open(road, track):
         place.along = 0.0
     place.left = side > 0.0
     place.heading = wp.atan2(ahead[1], ahead[0])
@@ -178,10 +200,16 @@ def is_met(start: wp.vec2, end: wp.vec2, point: wp.vec2) -> bool:
 
 @wp.func
 def on_road(road: RoadArrays, track: int, point: wp.vec2) -> bool:
-    """Whether a point lies between the borders: a ray from it meets the two an odd number of times in all."""
+    """Whether a point lies between the borders: a ray from it meets the two, and an open road's ends, an odd number of times in all."""
     first = road.first[track]
     odd = bool(False)
-    for row in range(road.count[track]):
+    if is_open(road, track):
+        last = first + road.segments[track]
+        if is_met(road.inner[first], road.outer[first], point):
+            odd = not odd
+        if is_met(road.inner[last], road.outer[last], point):
+            odd = not odd
+    for row in range(road.segments[track]):
         following = next_row(road, track, row)
         if is_met(road.inner[first + row], road.inner[first + following], point):
             odd = not odd
@@ -192,10 +220,10 @@ def on_road(road: RoadArrays, track: int, point: wp.vec2) -> bool:
 
 @wp.func
 def row_at(road: RoadArrays, track: int, forth: float) -> int:
-    """The segment that has the point ``forth`` [m] from the start line, in the order of the waypoints; 0 <= forth < length."""
+    """The segment that has the point ``forth`` [m] from the start line, in the order of the waypoints; 0 <= forth <= length."""
     first = road.first[track]
     low = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
-    high = int(road.count[track])
+    high = int(road.segments[track])
     while high - low > 1:
         middle = (low + high) / 2
         if road.along[first + middle] <= forth:
@@ -215,16 +243,30 @@ def around(value: float, length: float) -> float:
 
 
 @wp.func
+def forth_of(road: RoadArrays, track: int, along: float, backwards: bool) -> float:
+    """The distance [m] in the order of the waypoints of what is ``along`` [m] from the start line in driving direction.
+
+    It goes round a loop, and ends at the ends of an open track.
+    """
+    length = road.length[track]
+    forth = wp.clamp(along, 0.0, length)
+    if backwards:
+        forth = length - forth
+    if not is_open(road, track):
+        forth = around(along, length)
+        if backwards:
+            forth = around(length - forth, length)
+    return forth
+
+
+@wp.func
 def place_at(road: RoadArrays, track: int, along: float, backwards: bool) -> wp.vec3:
     """The point of the centre line ``along`` [m] from the start line in driving direction, x and y [m], and its heading there [rad]."""
     first = road.first[track]
-    length = road.length[track]
-    forth = around(along, length)
-    if backwards:
-        forth = around(length - forth, length)
+    forth = forth_of(road, track, along, backwards)
     row = row_at(road, track, forth)
     share = (forth - road.along[first + row]) / road.steps[first + row]
-    if backwards and share <= 0.0:
+    if backwards and share <= 0.0 and (row > 0 or not is_open(road, track)):
         row = (row + road.count[track] - 1) % road.count[track]
         share = float(1.0)
     start = road.center[first + row]
@@ -237,13 +279,19 @@ def place_at(road: RoadArrays, track: int, along: float, backwards: bool) -> wp.
 
 
 @wp.func
+def start_at(road: RoadArrays, track: int, share: float) -> float:
+    """Where an episode begins that begins after ``share`` of the track, 0 to 1: distance from the start line in driving direction [m]."""
+    along = share * road.length[track]
+    if is_open(road, track):
+        along = FIRST_PLACE + share * (road.length[track] - FIRST_PLACE - LAST_PLACE)
+    return along
+
+
+@wp.func
 def width_at(road: RoadArrays, track: int, along: float, backwards: bool) -> float:
     """Width of the road ``along`` [m] from the start line in driving direction [m]."""
     first = road.first[track]
-    length = road.length[track]
-    forth = around(along, length)
-    if backwards:
-        forth = around(length - forth, length)
+    forth = forth_of(road, track, along, backwards)
     row = row_at(road, track, forth)
     share = (forth - road.along[first + row]) / road.steps[first + row]
     here = road.width[first + row]
@@ -253,8 +301,8 @@ def width_at(road: RoadArrays, track: int, along: float, backwards: bool) -> flo
 @wp.func
 def advance(road: RoadArrays, track: int, before: float, after: float) -> float:
     """By how far a car has come on between two ``along`` [m], over the start line too; less than 0 where it went back."""
-    half = road.length[track] / 2.0
-    return around(after - before + half, road.length[track]) - half
+    half = road.period[track] / 2.0
+    return around(after - before + half, road.period[track]) - half
 
 
 def road_arrays(tracks: Sequence[Track], corners: np.ndarray, device: str) -> RoadArrays:
@@ -276,11 +324,14 @@ def road_arrays(tracks: Sequence[Track], corners: np.ndarray, device: str) -> Ro
     arrays = RoadArrays()
     for name in ("center", "inner", "outer"):
         setattr(arrays, name, joined(name, wp.vec2))
-    for name in ("along", "steps", "width"):
+    for name in ("along", "width"):
         setattr(arrays, name, joined(name))
+    arrays.steps = floats(np.concatenate([np.resize(track.steps, len(track.center)) for track in tracks]))
     arrays.first = wp.array(np.concatenate(([0], np.cumsum(counts)[:-1])), dtype=wp.int32, device=device)
     arrays.count = wp.array(counts, dtype=wp.int32, device=device)
+    arrays.segments = wp.array([len(track.steps) for track in tracks], dtype=wp.int32, device=device)
     arrays.length = floats([track.length for track in tracks])
+    arrays.period = floats([track.length if track.closed else 2 * track.length for track in tracks])
     arrays.window = wp.array([window_of(track) for track in tracks], dtype=wp.int32, device=device)
     arrays.clear = floats([clear_of(track) for track in tracks])
     arrays.corner = floats(corners, wp.vec2)
@@ -296,22 +347,12 @@ def window_of(track: Track) -> int:
 
 
 def clear_of(track: Track) -> float:
-    """The least distance between a border and the centre line, less a rounding error [m].
+    """The least distance between a border and the centre line, less a rounding error [m]; 0 of an open track.
 
     The nearest point of a border is at one of its waypoints, or where it passes one of the centre line.
     """
+    if not track.closed:
+        return 0.0
     borders = project_all(track, np.concatenate((track.inner, track.outer))).distance.min()
-    passed = min(_distance(track.center, ring).min() for ring in (track.inner, track.outer))
+    passed = min(norm(nearest_points(ring, track.center) - track.center).min() for ring in (track.inner, track.outer))
     return float(min(borders, passed)) - 1e-4
-
-
-def _distance(points: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """From each point (P, 2) to the nearest one of a closed ring (N, 2), (P,) [m]."""
-    segment = np.roll(ring, -1, axis=0) - ring
-    squared = np.maximum((segment * segment).sum(axis=1), 1e-12)
-    found = []
-    for point in points:
-        away = point - ring
-        share = np.clip((away * segment).sum(axis=1) / squared, 0.0, 1.0)
-        found.append(norm(away - share[:, None] * segment).min())
-    return np.array(found)

@@ -16,7 +16,7 @@ from shared_store.files import DamagedFile, open_regular
 from shared_store.tracks import LARGEST
 from shared_store.wording import counted
 from worker.racer.arithmetic import Floats, norm
-from worker.racer.checks import RINGS, SHORTEST_STEP, WAYPOINTS, BadTrack, at, check_numbers, inside
+from worker.racer.checks import RINGS, SHORTEST_STEP, WAYPOINTS, BadTrack, at, check_numbers, inside, left_of_line
 from worker.racer.track import Track
 
 _MAGIC = b"\x93NUMPY"
@@ -106,41 +106,60 @@ def _array(data: bytes) -> Floats:
 
 def _track(rows: Floats, name: str) -> Imported:
     """Raises BadTrack."""
-    if len(rows) < WAYPOINTS[0] + 1:
+    if len(rows) < WAYPOINTS[0]:
         raise BadTrack(
             f"{counted(len(rows), 'row')} are too few; a track has {WAYPOINTS[0] + 1} or more, the last one is the first"
         )
     for column, ring in enumerate(RINGS):
         check_numbers(rows[:, 2 * column : 2 * column + 2], ring)
-    for column, ring in enumerate(RINGS):
-        points = rows[:, 2 * column : 2 * column + 2]
-        if (gap := float(norm(points[-1] - points[0]))) > _CLOSED:
-            raise BadTrack(
-                f"the {ring} is open: {gap:.3f} m lie between {at(points, 0)} and {at(points, len(rows) - 1)}; "
-                "the last row has to be the first one once more"
-            )
+    closed = _is_closed(rows)
     notes = []
-    rows = rows[:-1]
-    kept = _different(rows[:, :2])
+    if closed:
+        rows = rows[:-1]
+    kept = _different(rows[:, :2], closed)
     if left_out := len(rows) - len(kept):
         notes.append(
             f"left out {counted(left_out, 'row')} whose waypoint stands there twice, the first one row {_first_missing(kept)}"
         )
         rows = rows[kept]
     center, inner, outer = rows[:, 0:2], rows[:, 2:4], rows[:, 4:6]
-    if not inside(center, inner).any() and inside(center, outer).all():
+    if closed and not inside(center, inner).any() and inside(center, outer).all():
         inner, outer = outer, inner
         notes.append("the borders were swapped (columns 2 and 3 lie outside the centre line): taken the right way")
-    return Imported(Track(name, center, inner, outer), tuple(notes))
+    if not closed and not left_of_line(center, inner).any() and left_of_line(center, outer).all():
+        inner, outer = outer, inner
+        notes.append("the borders were swapped (columns 2 and 3 lie right of the centre line): taken the right way")
+    track = Track(name, center, inner, outer, closed)
+    if track.slanted:
+        notes.append(track.slant)
+    return Imported(track, tuple(notes))
 
 
-def _different(center: Floats) -> NDArray[np.int64]:
-    """Rows whose waypoint is not that of the kept row before, nor, at the end, that of the first."""
+def _is_closed(rows: Floats) -> bool:
+    """Whether the last row is the first one once more. Raises BadTrack for a loop of which rows are missing.
+
+    The ends of an open track are farther from each other than its road is wide.
+    """
+    lines = [rows[:, 2 * column : 2 * column + 2] for column in range(3)]
+    gaps = [float(norm(line[-1] - line[0])) for line in lines]
+    if max(gaps) <= _CLOSED:
+        return True
+    if min(gaps) > _CLOSED and gaps[0] > norm(lines[1][0] - lines[2][0]):
+        return False
+    name, line, gap = next(each for each in zip(RINGS, lines, gaps, strict=True) if each[2] > _CLOSED)
+    raise BadTrack(
+        f"the {name} is open: {gap:.3f} m lie between {at(line, 0)} and {at(line, len(rows) - 1)}; the last row of a loop has to be the "
+        "first one once more, and the ends of an open track are farther apart than its road is wide"
+    )
+
+
+def _different(center: Floats, closed: bool) -> NDArray[np.int64]:
+    """Rows whose waypoint is not that of the kept row before, nor, at the end of a loop, that of the first."""
     kept = [0]
     for row in range(1, len(center)):
         if norm(center[row] - center[kept[-1]]) >= SHORTEST_STEP:
             kept.append(row)
-    while len(kept) > 1 and norm(center[kept[-1]] - center[0]) < SHORTEST_STEP:
+    while closed and len(kept) > 1 and norm(center[kept[-1]] - center[0]) < SHORTEST_STEP:
         kept.pop()
     return np.array(kept)
 

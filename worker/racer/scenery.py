@@ -6,7 +6,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from worker.racer.arithmetic import Floats, norm
+from worker.racer.arithmetic import Floats, nearest_points, norm
 from worker.racer.circuit import BOX, Circuit, bounds
 from worker.racer.geometry import place_at
 from worker.racer.track import Track
@@ -58,11 +58,15 @@ def add_scenery(builder: newton.ModelBuilder, circuit: Circuit) -> None:
     field = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     _add(builder, "grass", field, np.array([[0, 1, 2], [0, 2, 3]]), _BELOW, GRASS)
     for number, (track, corner) in enumerate(zip(tracks, corners, strict=True)):
-        outward = _towards(track.inner, track.outer)
-        _add(builder, f"asphalt_{number}", *_strip(track.inner + corner, track.outer + corner), 0.0, ASPHALT)
-        edges = [(track.inner, track.inner + outward), (track.outer - outward, track.outer)]
+        roads = _roads(track)
+        for part, (inner, outer) in enumerate(roads):
+            name = f"asphalt_{number}" if part == 0 else f"asphalt_{number}_{part}"
+            _add(builder, name, *_strip(inner + corner, outer + corner, track.closed), 0.0, ASPHALT)
+        inward, outward = _towards(*roads[0]), _towards(*roads[-1])
+        edges = [(track.inner, track.inner + inward), (track.outer - outward, track.outer)]
         for side, (inner, outer) in zip(("inner", "outer"), edges, strict=True):
-            _add(builder, f"{side}_border_{number}", *_strip(inner + corner, outer + corner), _ABOVE[0], BORDER)
+            strip = _strip(inner + corner, outer + corner, track.closed)
+            _add(builder, f"{side}_border_{number}", *strip, _ABOVE[0], BORDER)
         _add(builder, f"dashes_{number}", *_dashes(track, corner), _ABOVE[1], DASHES)
         for box, (x, y, heading) in enumerate(circuit.obstacle_poses[number]):
             place = wp.transform(
@@ -78,6 +82,18 @@ def _seen() -> newton.ModelBuilder.ShapeConfig:
     return newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
 
 
+def _roads(track: Track) -> list[tuple[Floats, Floats]]:
+    """Strips that cover the road together: the points of both borders, two of (N, 2) [m].
+
+    Where the rows of the borders are level, it is one strip. Else it would be too narrow and stick out in curves, so one leads from the
+    inner border straight across the road and one from the outer border.
+    """
+    inner, outer, closed = track.inner, track.outer, track.closed
+    if track.slanted == 0:
+        return [(inner, outer)]
+    return [(inner, nearest_points(outer, inner, closed)), (nearest_points(inner, outer, closed), outer)]
+
+
 def _towards(start: Floats, end: Floats) -> Floats:
     """From ``start`` (N, 2) as far as a border is wide, in the direction of ``end``."""
     away = end - start
@@ -85,10 +101,10 @@ def _towards(start: Floats, end: Floats) -> Floats:
     return step
 
 
-def _strip(first: Floats, second: Floats) -> tuple[Floats, np.ndarray]:
-    """Points (2 N, 2) and triangles (2 N, 3) between two closed rings."""
+def _strip(first: Floats, second: Floats, closed: bool = True) -> tuple[Floats, np.ndarray]:
+    """Points (2 N, 2) and triangles (2 N, 3) between two lines of N points, or (2 N - 2, 3) between open ones."""
     count = len(first)
-    row = np.arange(count)
+    row = np.arange(count if closed else count - 1)
     following = (row + 1) % count
     near = np.stack((row, following, following + count), -1)
     far = np.stack((row, following + count, row + count), -1)

@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import warp as wp
 
-from worker.racer.car_arrays import STEERING, WHEELS, CarArrays, ahead_of, from_car, gap_to, progress_of, put_car
-from worker.racer.road import place_at
+from worker.racer.car_arrays import (
+    STEERING,
+    WHEELS,
+    CarArrays,
+    ahead_of,
+    from_car,
+    gap_to,
+    lap_of,
+    progress_of,
+    put_car,
+)
+from worker.racer.road import place_at, start_at
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.kinematics import wrapped_angle
 from worker.simulation.robot_arrays import RobotArrays
@@ -21,6 +31,8 @@ GRAVITY = wp.constant(9.81)
 """[m/s²]"""
 UNSEEN = wp.constant(4.0)
 """An obstacle farther ahead than this is not seen [m]."""
+STARTED = wp.constant(0.5)
+"""The front of a car that begins an open track at its start is behind the line by less than this [m]."""
 
 
 @wp.func
@@ -78,7 +90,7 @@ def obstacle_ahead(world: int, car: CarArrays) -> wp.vec2:
     number = car.next_obstacle[world]
     track = car.tracks[world]
     seen = wp.vec2(UNSEEN, 0.0)
-    if number >= 0 and gap_to(world, car, number, car.road.length[track]) < UNSEEN:
+    if number >= 0 and gap_to(world, car, number) < UNSEEN:
         pose = car.obstacle_poses[track, number]
         seen = from_car(car.poses[world], wp.vec2(pose[0], pose[1]))
     return seen
@@ -116,7 +128,7 @@ def ends_off_track(world: int, car: CarArrays) -> bool:
 
 @wp.func
 def lap_complete(world: int, car: CarArrays) -> bool:
-    """The car has come as far as the track is long since the episode began."""
+    """The car has come as far as the track is long since the episode began, or to the end of an open track."""
     return progress_of(world, car) >= 100.0
 
 
@@ -135,15 +147,15 @@ def reversed_course(world: int, car: CarArrays, steps: int) -> bool:
 @wp.func
 def final_progress(world: int, car: CarArrays) -> float:
     """Share of a lap that the car has driven since the episode began [%], less the losses from being put back."""
-    length = car.road.length[car.tracks[world]]
-    return 100.0 * wp.clamp((car.travelled[world] - car.set_back[world]) / length, 0.0, 1.0)
+    return 100.0 * wp.clamp((car.travelled[world] - car.set_back[world]) / lap_of(world, car), 0.0, 1.0)
 
 
 @wp.func
 def lap_time(world: int, car: CarArrays, seconds: float) -> float:
-    """Duration of a lap [s]; 0 for an incomplete one."""
+    """Duration of a lap [s]; 0 for an incomplete one, and on an open track for one that did not begin at its start."""
     time = float(0.0)
-    if progress_of(world, car) >= 100.0:
+    whole = lap_of(world, car) >= car.road.length[car.tracks[world]] - STARTED
+    if progress_of(world, car) >= 100.0 and whole:
         time = float(car.steps[world]) * seconds
     return time
 
@@ -194,7 +206,7 @@ def place_car(
     if start == RANDOM:
         share = drawn
     share = share - wp.floor(share)
-    place = place_at(car.road, track, share * car.road.length[track], backwards)
+    place = place_at(car.road, track, start_at(car.road, track, share), backwards)
     point = ahead_of(place, 0.0, wp.randf(stream, sideways[0], sideways[1]))
     heading = wrapped_angle(place[2] + wp.randf(stream, turned[0], turned[1]))
     car.tracks[world] = track

@@ -6,6 +6,7 @@ import warp as wp
 
 from worker.racer.car_arrays import CarArrays, progress_of
 from worker.racer.resets import COUNTS
+from worker.racer.road import next_row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,11 +24,12 @@ def trace_car(world: int, car: CarArrays):
     """Note a control step."""
     front = car.fronts[world]
     command = car.commands[world]
-    first = car.road.first[car.tracks[world]]
+    track = car.tracks[world]
+    first = car.road.first[track]
+    behind = wp.length(front - car.road.center[first + car.rows[world]])
+    ahead = wp.length(front - car.road.center[first + next_row(car.road, track, car.rows[world])])
     waypoint = car.before[world]
-    if wp.length(front - car.road.center[first + car.after[world]]) < wp.length(
-        front - car.road.center[first + waypoint]
-    ):
+    if (not car.backwards[world] and ahead < behind) or (car.backwards[world] and behind < ahead):
         waypoint = car.after[world]
     car.trace[world, 0] = front[0]
     car.trace[world, 1] = front[1]

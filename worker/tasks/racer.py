@@ -55,11 +55,12 @@ class Racer(DeclaredTask):
     config_type = RacerConfig
     solver_options = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+    def restart(self, seed: int, first_world: int) -> None:
+        """As :meth:`Task.restart`: what a learner's reward function remembers begins anew, too."""
         if self.race:
             with on_torch_stream(self.device):
-                self.sensors["race"].reward.forget_failures()  # of the trial step
+                self.sensors["race"].begin_anew()
+        super().restart(seed, first_world)
 
     def robot(self, config: RacerConfig) -> Robot:
         """The car."""
@@ -104,14 +105,19 @@ class Racer(DeclaredTask):
             self.sensors["race"].follow(self.sensors["car"].arrays)
 
     def notes(self) -> list[str]:
-        """Notes of the robot, and the place where a learner's reward function runs (device or host) with the reason."""
-        notes = [*super().notes()]
+        """Notes of the robot and the tracks, and the place where a learner's reward function runs (device or host) with the reason."""
+        slants = [f"track {track.name}: {track.slant}" for track in self.circuit.tracks if track.slanted]
+        notes = [*super().notes(), *slants]
         if self.race is None:
             return notes
+        notes += self.race.warnings
         if not self.race.reason:
             return [*notes, f"{self.race.reward.file}: compiled to the device", *self.race.notes]
         graph = "; a step is no part of a CUDA graph" if self.device.startswith("cuda") else ""
-        return [*notes, f"{self.race.reason}{graph}"]
+        return [
+            *notes,
+            f"{self.race.reason}{graph}; each car has its own copy of the function and of what it remembers",
+        ]
 
     def failures(self) -> dict[str, tuple[int, int]]:
         """The calls of a learner's reward function that returned no reward."""
@@ -127,6 +133,18 @@ class Racer(DeclaredTask):
         if found is None or "reward" not in found[1]:
             return found
         return found[0], ": ".join((found[1], *list(self.failures())[:1]))
+
+    def is_users_fault(self, mishap: str) -> bool:
+        """Whether a learner's reward function gave no reward."""
+        return self.race is not None and "reward" in mishap
+
+    def begins_anew(self) -> str:
+        """What a function in Python workers remembers."""
+        if self.race is None or not self.waits_for_host:
+            return ""
+        return (
+            f"{self.race.reward.file}: what the function remembered of each car begins anew, since no checkpoint has it"
+        )
 
     def move(self) -> None:
         """Drive every car for one control step: the bicycle's rule, and no physics."""
@@ -310,8 +328,11 @@ def from_workers(task: Racer) -> torch.Tensor:
     Raises:
         RewardFailed: A call does not return, floods its output or ends its process.
     """
+    race = task.sensors["race"]
+    if not race.called:
+        return torch.zeros(task.world_count, device=task.device)
     with on_torch_stream(task.device):
-        rewards: torch.Tensor = wp.to_torch(task.sensors["race"].reward.rewards())
+        rewards: torch.Tensor = wp.to_torch(race.reward.rewards())
     return rewards
 
 

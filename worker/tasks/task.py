@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import newton
 import torch
@@ -34,10 +34,6 @@ from worker.tasks.ended import Ended
 from worker.tasks.interface import Interface
 from worker.tasks.saved import check_state, completed
 from worker.tasks.telling import Telling
-
-if TYPE_CHECKING:
-    from shared_store.layout import Run
-    from worker.tasks.step_log import StepLog
 
 
 class Task(Telling):
@@ -174,7 +170,7 @@ class Task(Telling):
             self._begin()
             for _, part in self._parts():  # Load every kernel; not every platform can load one during a capture.
                 part()
-        self._looks: dict[str, Callable[[], None]] = {}
+        self._looks: dict[str, Callable[[], None] | None] = {}
         self._steps = [CapturedStep(part, self.device).launch if whole else part for whole, part in self._parts()]
         self.captured = assert_replays(self, self._steps)
         self.restart(seed, first_world)
@@ -241,30 +237,12 @@ class Task(Telling):
             launch()
 
     def watch(self, look: Callable[[], None] | None, by: str = "tap") -> None:
-        """Call ``look`` after every control step, instead of an earlier one of the same name; None: call nothing. Run ``look`` once
-        beforehand.
+        """Call ``look`` after every control step, instead of an earlier one ``by`` the same name; None: call nothing.
 
-        It may only launch kernels, and these may write nothing that the task reads. A caller with a graph of :meth:`step` must
-        capture it again.
+        It launches kernels alone, which it has run once and which write nothing that the task reads. Graphs of :meth:`step` are captured anew.
         """
-        self._looks.pop(by, None)
-        if look is not None:
-            self._looks[by] = CapturedStep(look, self.device).launch
-        self._steps[len(self._parts()) :] = self._looks.values()
-
-    def step_log(self, run: Run, steps: int, iteration: int, facts: Mapping[str, Any]) -> StepLog | None:
-        """A log of the control steps of a training that begins or goes on, on the main rank; None: the task keeps none.
-
-        Args:
-            run: The run.
-            steps: Control steps of an iteration.
-            iteration: Iterations done.
-            facts: The entries of a checkpoint's manifest about the policy.
-
-        Raises:
-            OSError: The store can't be written.
-        """
-        return None
+        self._looks[by] = None if look is None else CapturedStep(look, self.device).launch
+        self._steps[len(self._parts()) :] = filter(None, self._looks.values())
 
     def reset(self) -> None:
         """Begin a new episode with new random numbers in every world."""
@@ -412,10 +390,9 @@ class Task(Telling):
         """Views of all state that persists between control steps."""
         arrays = self.worlds.arrays
         own = {"memory": self._memory, "activations": wp.to_torch(arrays.activations)}
-        images = {"images": self._camera.images} if self._camera else {}
         return {
             **{name: tensor for name, tensor in own.items() if tensor.numel()},
-            **images,
+            **({"images": self._camera.images} if self._camera else {}),
             **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),

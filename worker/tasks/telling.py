@@ -1,16 +1,19 @@
-"""A task's report to the training loop: on its metrics, on functions of the user, such as a learner's reward, and on shared counts."""
+"""A task's report to the training loop: on its metrics, functions of the user, such as a learner's reward, control steps, shared counts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import torch
 
+    from shared_store.layout import Run
+    from worker.tasks.step_log import StepLog
+
 
 class Telling:
-    """A task that shows no metric, has no function of the user and shares no counts; others override this."""
+    """A task that shows no metric, has no function of the user, logs no control steps and shares no counts; others override this."""
 
     final_metrics: tuple[str, ...] = ()
     """Metrics whose value at an episode's last step counts."""
@@ -31,6 +34,28 @@ class Telling:
             By error line: its count, and the first world, counted over all ranks; the most frequent first.
         """
         return {}
+
+    def is_users_fault(self, mishap: str) -> bool:
+        """Whether a function of the user is to blame for a mishap (:meth:`worker.tasks.task.Task.read_mishap`), which another attempt repeats."""
+        return False
+
+    def begins_anew(self) -> str:
+        """What a training that is resumed does not find again, one line; empty: nothing."""
+        return ""
+
+    def step_log(self, run: Run, steps: int, iteration: int, facts: Mapping[str, Any]) -> StepLog | None:
+        """A log of the control steps of a training that begins or goes on, on the main rank; None: the task keeps none.
+
+        Args:
+            run: The run.
+            steps: Control steps of an iteration.
+            iteration: Iterations done.
+            facts: The entries of a checkpoint's manifest about the policy.
+
+        Raises:
+            OSError: The store can't be written.
+        """
+        return None
 
     def own_counts(self) -> Mapping[str, torch.Tensor]:
         """Counts of this rank's worlds that decide together with those of other ranks, by name; integers on the device."""

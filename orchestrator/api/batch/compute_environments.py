@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api import permissions
-from orchestrator.api.arns import ACCOUNT, compute_environment_arn, ecs_arn, plain_name, policy_arn
-from orchestrator.api.batch import rules
+from orchestrator.api.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
+from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
@@ -38,7 +38,7 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
     if request["type"] not in ("MANAGED", "UNMANAGED"):
         raise ClientError(f"type is {request['type'][:50]!r}; it is MANAGED or UNMANAGED")
     if request.get("eksConfiguration"):
-        raise ClientError("eksConfiguration is not supported; leave it out")
+        raise ClientError("eksConfiguration is not supported: no engine is a Kubernetes cluster; leave it out")
     resources = request.get("computeResources")
     if request["type"] == "MANAGED" and not resources:
         raise ClientError("a MANAGED compute environment needs computeResources")
@@ -71,8 +71,8 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
             raise ClientError(
                 f"Compute environment {compute_environment.name} is UNMANAGED and has no computeResources"
             )
-        _check_resources(changes)
         resources = {**(compute_environment.document.get("computeResources") or {}), **changes}
+        _check_resources(resources)
         compute_environment.document = {**compute_environment.document, "computeResources": resources}
     for key in ("serviceRole", "unmanagedvCpus", "context"):
         if key in request:
@@ -187,8 +187,7 @@ def _state(state: str) -> str:
 
 
 def _check_resources(resources: Mapping[str, Any]) -> None:
-    if str(resources.get("type", "EC2")).startswith("FARGATE"):
-        raise ClientError(f"computeResources type {resources['type'][:50]} is not supported; use EC2")
+    fargate.check_resources(resources)
     for key in ("minvCpus", "maxvCpus", "desiredvCpus"):
         if resources.get(key) is not None and not 0 <= resources[key] <= 10_000_000:
             raise ClientError(f"computeResources {key} is {resources[key]}; it must be 0 to 10000000")
@@ -239,7 +238,7 @@ def _describe(context: Context, compute_environment: ComputeEnvironment) -> dict
         "tags": compute_environment.tags,
     }
     if document["type"] == "MANAGED":
-        document.setdefault("serviceRole", f"arn:aws:iam::{ACCOUNT}:role{_SERVICE_ROLE}")
+        document.setdefault("serviceRole", iam_arn(f"role{_SERVICE_ROLE}"))
         document.setdefault("updatePolicy", {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30})
     if is_built_in(compute_environment):
         document["computeResources"] = {
@@ -263,6 +262,6 @@ def _own_resources(context: Context, compute_environment: ComputeEnvironment) ->
         "instanceTypes": ["optimal"],
         "subnets": [],
         "securityGroupIds": [],
-        "instanceRole": f"arn:aws:iam::{ACCOUNT}:instance-profile/muster",
+        "instanceRole": iam_arn("instance-profile/muster"),
         "tags": {},
     }

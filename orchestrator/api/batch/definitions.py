@@ -8,11 +8,12 @@ from sqlalchemy import select
 
 from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, plain_name
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import JobDefinition
@@ -32,16 +33,19 @@ def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any],
     rules.check_tries(request)
     rules.check_tags(request.get("tags") or {})
     rules.check_priority("schedulingPriority", request.get("schedulingPriority"))
-    if others := set(request.get("platformCapabilities") or []) - {"EC2"}:
-        raise ClientError(f"job definition {name}: platformCapabilities {min(others)[:50]} is not supported; use EC2")
     wanted = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
     if wanted is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
-    given = [key for key in (*_PROPERTIES, "eksProperties") if request.get(key)]
+    if request.get("eksProperties"):
+        raise ClientError(f"job definition {name}: eksProperties {rules.NO_KUBERNETES} {' or '.join(wanted)}")
+    given = [key for key in _PROPERTIES if request.get(key)]
     if len(given) != 1 or given[0] not in wanted:
         raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
-    gang = rules.check_nodes(rules.node_properties(request), kind)
+    properties = rules.node_properties(request)
+    gang = rules.check_nodes(properties, kind)
+    fargate.check_platform(request, properties, f"job definition {name}")
     _check_owner(context, name, Operation.REGISTER_JOB_DEFINITION)
+    check_texts(context, gang)
     query = select(JobDefinition.revision, JobDefinition.owner).where(JobDefinition.name == name)
     newest = context.session.execute(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
     revision = newest.revision + 1 if newest else 1
@@ -116,7 +120,7 @@ def _describe(definition: JobDefinition) -> dict[str, Any]:
     if document.get("retryStrategy"):
         shown["retryStrategy"] = retry_strategy(document["retryStrategy"])
     if document.get("containerProperties"):
-        shown["containerProperties"] = with_defaults(document["containerProperties"])
+        shown["containerProperties"] = with_defaults(document["containerProperties"], document)
     if document.get("ecsProperties"):
         shown["ecsProperties"] = ecs_with_defaults(document["ecsProperties"])
     if document.get("nodeProperties"):

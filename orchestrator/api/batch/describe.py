@@ -8,8 +8,9 @@ from typing import Any
 
 from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.api.batch.ecs import to_ecs
+from orchestrator.api.batch.fargate import is_fargate
 from orchestrator.api.damaged import DAMAGED
-from orchestrator.domain.job import Status
+from orchestrator.domain.job import Status, container_reason
 from orchestrator.persistence.models import Attempt, Job, JobDefinition
 
 _LISTS = ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes")
@@ -54,7 +55,10 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
         detail["nodeProperties"] = node_ranges(job.node_properties)  # an echo: range by range, as it was submitted
     else:
         spec = gang.nodes[node or 0]
-        shown = {**with_defaults(spec.container), **(_container(job, last, node or 0) if last else {})}
+        shown = {
+            **with_defaults(spec.container, {} if spec.ecs else document),
+            **(_container(job, last, node or 0) if last else {}),
+        }
         if spec.ecs is not None:
             detail["container"], detail["ecsProperties"] = {}, _in_ecs(shown, spec.ecs)
         else:
@@ -93,9 +97,10 @@ def retry_strategy(given: Mapping[str, Any]) -> dict[str, Any]:
     return {**given, "evaluateOnExit": [{**each, "action": each["action"].upper()} for each in conditions]}
 
 
-def with_defaults(container: Mapping[str, Any]) -> dict[str, Any]:
-    """``containerProperties`` with the empty lists that AWS shows for missing members."""
-    return {**{name: [] for name in _LISTS}, **container}
+def with_defaults(container: Mapping[str, Any], definition: Mapping[str, Any]) -> dict[str, Any]:
+    """``containerProperties`` with what AWS shows for missing members: empty lists, and Fargate's platform."""
+    platform = {"fargatePlatformConfiguration": {"platformVersion": "LATEST"}} if is_fargate(definition) else {}
+    return {**{name: [] for name in _LISTS}, **platform, **container}
 
 
 def node_ranges(properties: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,7 +126,7 @@ def _range(entry: Mapping[str, Any]) -> dict[str, Any]:
     rest = {key: value for key, value in entry.items() if key != "ecs"}
     if "ecsProperties" in entry:
         return {**rest, "ecsProperties": ecs_with_defaults(entry["ecsProperties"])}
-    container = with_defaults(entry["container"])
+    container = with_defaults(entry["container"], {})
     if "ecs" in entry:  # of a job, which keeps all in one form
         del rest["container"]
         return {**rest, "ecsProperties": to_ecs(container, entry["ecs"], {})}
@@ -154,7 +159,8 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
     index = gang.main if node is None else node
     record = job.attempts[-1].node(index) if job.attempts else None
     if record is not None and record.exit_code is not None:
-        summary["container"] = {"exitCode": record.exit_code, "reason": (record.reason or "")[:255]}
+        reason = container_reason(record.reason, record.status_reason)
+        summary["container"] = {"exitCode": record.exit_code, **({"reason": reason[:255]} if reason else {})}
     if job.share:
         summary["shareIdentifier"] = job.share
     if job.stop_reason is not None:  # AWS shows only the one that is true
@@ -180,9 +186,12 @@ def node_status(job: Job, node: int) -> str:
     return job.status
 
 
-def stream_name(job: Job, attempt: int, node: int) -> str:
-    """Name of the log stream of one node and attempt; AWS allows no colon in it, which the ids of array children have."""
-    return f"{job.name}/{job.id.replace(':', '.')}/{attempt}/node-{node}"
+def stream_name(job: Job, attempt: int, node: int, prefix: str | None = None) -> str:
+    """Name of the log stream of one node and attempt; AWS allows no colon in it, which the ids of array children have.
+
+    ``prefix``: of its container's ``logConfiguration``, where that has one.
+    """
+    return f"{prefix or job.name}/{job.id.replace(':', '.')}/{attempt}/node-{node}"
 
 
 def _common(job: Job, reason: str | None) -> dict[str, Any]:
@@ -222,10 +231,13 @@ def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
 
 def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
     record = attempt.node(node)
+    reason = container_reason(record.reason, record.status_reason) if record else None
     detail = {
         "exitCode": record.exit_code if record else None,
-        "reason": record.reason[:255] if record and record.reason else None,
-        "logStreamName": stream_name(job, attempt.number, node) if attempt.started_at else None,
+        "reason": reason[:255] if reason else None,
+        "logStreamName": stream_name(job, attempt.number, node, record.log_prefix if record else None)
+        if attempt.started_at
+        else None,
         "containerInstanceArn": ecs_arn("container-instance", attempt.environment, record.host) if record else None,
         "taskArn": ecs_arn(
             "task", attempt.environment, uuid.uuid5(uuid.NAMESPACE_OID, f"{job.id}/{attempt.number}/{node}").hex

@@ -7,12 +7,12 @@ from typing import Any
 
 from orchestrator.api.errors import ClientError
 
-_OF_TASK = {"executionRoleArn": "executionRoleArn", "taskRoleArn": "jobRoleArn", "volumes": "volumes"}
-"""Members of the task, and what they are called in ``containerProperties``."""
-_UNSUPPORTED_OF_TASK = (
-    *("ephemeralStorage", "platformVersion", "ipcMode", "pidMode", "networkConfiguration", "runtimePlatform"),
-    *("enableExecuteCommand", "networkMode"),
-)
+_OF_TASK = {
+    **{"executionRoleArn": "executionRoleArn", "taskRoleArn": "jobRoleArn", "volumes": "volumes"},
+    **{name: name for name in ("ephemeralStorage", "networkConfiguration", "platformVersion", "runtimePlatform")},
+}
+"""Members of the task, and what they are called in ``containerProperties``; ``platformVersion`` stands there by itself."""
+_UNSUPPORTED_OF_TASK = ("ipcMode", "pidMode", "enableExecuteCommand", "networkMode")
 _UNSUPPORTED_OF_CONTAINER = ("dependsOn", "firelensConfiguration", "startTimeout", "stopTimeout")
 
 

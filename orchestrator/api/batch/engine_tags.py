@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
-from orchestrator.control.compute_environments import ENGINE_TAG, engine_named_by
+from orchestrator.control.compute_environments import ENGINE_TAG, engine_named_by, environments_of
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.installed import ENGINES, check_tags
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue
@@ -17,8 +17,7 @@ def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) 
     if isinstance(resource, ComputeEnvironment):
         engines = [engine_named_by(tags, first)]
     elif isinstance(resource, JobQueue):
-        found = [context.session.get(ComputeEnvironment, name) for name in resource.compute_environments]
-        engines = [engine_named_by(each.tags, first) for each in found if each is not None]
+        engines = [engine_named_by(each.tags, first) for each in environments_of(context.session, resource)]
     else:
         return
     if not any(tag.startswith("muster:") for tag in tags):

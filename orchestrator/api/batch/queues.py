@@ -9,7 +9,7 @@ from sqlalchemy import select
 
 from orchestrator.api import permissions
 from orchestrator.api.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
@@ -127,7 +127,10 @@ def _apply(context: Context, queue: JobQueue, request: Mapping[str, Any]) -> Non
             raise ClientError(f"priority is {priority}; it must be 0 to 1000000")
         queue.priority = priority
     if order := request.get("computeEnvironmentOrder"):
-        queue.compute_environments = _compute_environments(context, order)
+        queue.sent_order = _checked_order(context, order)
+        queue.compute_environments = [
+            each["computeEnvironment"] for each in sorted(queue.sent_order, key=lambda each: each["order"])
+        ]
     if (limits := request.get("jobStateTimeLimitActions")) is not None:
         queue.limits = _limits(limits)
 
@@ -138,21 +141,23 @@ def _check_kind(request: Mapping[str, Any]) -> None:
             raise ClientError(f"{key} is not supported; use computeEnvironmentOrder")
 
 
-def _compute_environments(context: Context, order: Sequence[Mapping[str, Any]]) -> list[str]:
+def _checked_order(context: Context, order: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """``computeEnvironmentOrder`` as it was sent, with names for ARNs. Raises ClientError."""
     if len(order) > _MOST_COMPUTE_ENVIRONMENTS:
         raise ClientError(
             f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_COMPUTE_ENVIRONMENTS}"
         )
-    names = [
-        plain_name(each["computeEnvironment"], "compute-environment")
-        for each in sorted(order, key=lambda each: each["order"])
-    ]
+    names = [plain_name(each["computeEnvironment"], "compute-environment") for each in order]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
         raise ClientError("computeEnvironmentOrder: every compute environment and every order once")
+    kinds = set()
     for name in names:
-        if context.session.get(ComputeEnvironment, name) is None:
+        if (found := context.session.get(ComputeEnvironment, name)) is None:
             raise ClientError(f"Compute environment {name[:200]} does not exist")
-    return names
+        kinds.add(fargate.of_environment(found.document))
+    if len(kinds) > 1:
+        raise ClientError("computeEnvironmentOrder: compute environments of EC2 and of Fargate can't be mixed")
+    return [{"order": each["order"], "computeEnvironment": name} for each, name in zip(order, names, strict=True)]
 
 
 def _limits(limits: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -178,10 +183,10 @@ def _policy(context: Context, arn: str) -> str:
 
 
 def _describe(queue: JobQueue) -> dict[str, Any]:
-    order = [
-        {"order": i, "computeEnvironment": compute_environment_arn(name)}
-        for i, name in enumerate(queue.compute_environments, 1)
+    sent = queue.sent_order or [
+        {"order": number, "computeEnvironment": name} for number, name in enumerate(queue.compute_environments, 1)
     ]
+    order = [{**each, "computeEnvironment": compute_environment_arn(each["computeEnvironment"])} for each in sent]
     return {
         "jobQueueName": queue.name,
         "jobQueueArn": queue_arn(queue.name),

@@ -23,6 +23,7 @@ _MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
 _SHORTEST_TIMEOUT = 60
 _DEEPEST_SPEC = 100
 """Levels of MUSTER_SPEC; what is nested much deeper can be stored, but no answer could show it."""
+NO_KUBERNETES = "is not supported: no engine is a Kubernetes cluster; use"
 _MALFORMED = (
     "MUSTER_SPEC, MUSTER_STALL_TIMEOUT, MUSTER_LOG_LIMIT (bytes, at least 1048576) or MUSTER_RANKS_PER_NODE (at least 1) is malformed; "
     "they are written by `muster submit`"
@@ -83,8 +84,8 @@ def _check_condition(condition: Mapping[str, str]) -> None:
         raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
-def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = False) -> GangSpec:
-    """Check the nodes of a definition of type ``kind``, or of a job (``complete``: its overrides are applied). Raises ClientError.
+def check_nodes(properties: Mapping[str, Any], kind: str) -> GangSpec:
+    """Check the nodes of a definition of type ``kind``, or of a job of it once its overrides are applied. Raises ClientError.
 
     ``properties``: as :func:`node_properties` gives them. Returns the gang that they ask for.
     """
@@ -99,8 +100,6 @@ def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = Fa
         target = entry["targetNodes"]
         where = _where(entry, kind)
         check_container(entry["container"], where)
-        if complete and not entry["container"].get("command"):
-            raise ClientError(f"{where}: has no command; give one in the definition or in the overrides")
         _check_target(target, count)
     try:
         gang = gang_needs(properties)
@@ -219,6 +218,8 @@ def _where(entry: Mapping[str, Any], kind: str) -> str:
 
 def _in_container(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
     given = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
+    if "eksProperties" in given:
+        raise ClientError(f"{where}: eksProperties {NO_KUBERNETES} container or ecsProperties")
     if given not in (["container"], ["ecsProperties"]):
         raise ClientError(f"{where}: give container or ecsProperties, and only one of them")
     check_consumables(entry, where)
@@ -311,9 +312,10 @@ def override_range(entry: dict[str, Any], changes: Mapping[str, Any], kind: str)
     right, wrong = ("ecsPropertiesOverride", "containerOverrides")
     if "ecs" not in entry:
         right, wrong = wrong, right
-    for key in (wrong, "eksPropertiesOverride"):
-        if changes.get(key):
-            raise ClientError(f"{where}: {key} does not fit the job definition; use {right}")
+    if changes.get("eksPropertiesOverride"):
+        raise ClientError(f"{where}: eksPropertiesOverride {NO_KUBERNETES} {right}")
+    if changes.get(wrong):
+        raise ClientError(f"{where}: {wrong} does not fit the job definition; use {right}")
     override = changes.get(right) or {}
     if "ecs" in entry:
         override = override_from_ecs(override, entry["ecs"], where)

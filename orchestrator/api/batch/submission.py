@@ -13,17 +13,19 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import check_sources, hold_teacher
-from orchestrator.control.compute_environments import queue_engines
+from orchestrator.control.compute_environments import environments_of, queue_engines
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
+from orchestrator.persistence import log_groups
 from orchestrator.persistence.gangs import gangs
 from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.persistence.ownership import owner_of
@@ -54,6 +56,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     job, gang = _job(context, request, queue, definition)
     _check_automatic(context, request, gang)
     is_array, is_waiting = bool(request.get("arrayProperties")), bool(request.get("dependsOn"))
+    check_texts(context, gang)
     teacher = check_sources(context, gang, is_waiting)
     job.idempotency_key = _scoped(context.idempotency_key)
     if is_array:
@@ -65,6 +68,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         if teacher:
             hold_teacher(context, job.run, teacher)
     context.session.add(job)
+    log_groups.add_missing(context.session, gang.log_groups, job.owner)
     return answer(job)
 
 
@@ -101,8 +105,8 @@ def _queue(context: Context, request: Mapping[str, Any]) -> JobQueue:
         )
     if queue.policy is not None and not share:
         raise ClientError(f"Job queue {queue.name} has a fair share scheduling policy: give a shareIdentifier")
-    if share is not None and not re.fullmatch(r"[A-Za-z0-9]{1,255}", share):
-        raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits")
+    if share is not None and not re.fullmatch(r"[A-Za-z0-9]{1,255}\*?", share):
+        raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits, a * at the end at most")
     rules.check_priority("schedulingPriorityOverride", priority)
     return queue
 
@@ -129,8 +133,12 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     document, name = definition.document, request["jobName"]
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
-    gang = rules.check_nodes(properties, document["type"], complete=True)
+    gang = rules.check_nodes(properties, document["type"])
+    _check_commands(context, queue, gang, definition.name)
+    fargate.check_platform(document, properties, f"job definition {definition.name}")
+    fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     _check_secrets(context, queue, gang)
+    log_groups.check_room(context.session, gang.log_groups)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     copy = context.making or context.teacher
@@ -160,6 +168,19 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     )
     gangs.remember(job.id, properties, gang)
     return job, gang
+
+
+def _check_commands(context: Context, queue: JobQueue, gang: GangSpec, definition: str) -> None:
+    """A node without a command runs that of its image, where its engine runs images. Raises ClientError."""
+    if all(node.command for node in gang.nodes):
+        return
+    engine = context.reconciler.engine
+    if without := engine.without_images(queue_engines(context.session, queue.name, engine.names[0])):
+        raise ClientError(
+            f"job definition {definition} has no command, and engine {without[0]} of job queue {queue.name} runs no image, whose ENTRYPOINT "
+            "and CMD could stand for one: give a command in the definition or in the overrides, or use a queue of an engine with images "
+            "(docker, aws-batch)"
+        )
 
 
 def _check_secrets(context: Context, queue: JobQueue, gang: GangSpec) -> None:
@@ -202,6 +223,8 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
         raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
+    if holder and not permissions.is_visible(holder):
+        raise ClientError(f"run {run} is being written by another job; choose another name")
     if holder:
         raise ClientError(
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
@@ -302,7 +325,12 @@ def _dependencies(context: Context, request: Mapping[str, Any], size: int | None
             raise ClientError(f"dependsOn type is {kind[:50]!r}; it is N_TO_N or SEQUENTIAL")
         if kind is not None and size is None:
             raise ClientError(f"dependsOn type {kind} is for array jobs")
-        if kind == "SEQUENTIAL" and not reference:
+        if kind == "SEQUENTIAL":
+            if reference:
+                raise ClientError(
+                    "dependsOn SEQUENTIAL is among the children of the array itself and takes no jobId; "
+                    "leave the type out to wait for another job"
+                )
             found[""] = Dependency(on_id="", kind=kind)
             continue
         if not reference:

@@ -52,7 +52,7 @@ def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: Job
         place = place_of(queue.name, None, wanted)
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
-        shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
+        shape = rules.check_nodes(rules.node_properties(definition), "multinode").shape
         return fit_in_queue(session, reconciler.engine, named_queue(session, place["queue"]), shape).problem
     except (ClientError, SpecError) as error:
         return str(error)

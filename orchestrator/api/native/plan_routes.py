@@ -120,7 +120,7 @@ def _gang_of(body: PlanRequest) -> GangSpec:
     definition = validate("RegisterJobDefinition", body.definition)
     if definition["type"] != "multinode" or "nodeProperties" not in definition:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
-    return rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
+    return rules.check_nodes(rules.node_properties(definition), "multinode")
 
 
 def _planned(reconciler: Reconciler, gang: Gang) -> Plan[Any]:

@@ -17,8 +17,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions
+from orchestrator.api.batch.fargate import without_effect
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import queue_names, reconciler_of
+from orchestrator.api.context import named_definition, queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.following import PIECE, Following, looked, looked_patiently, pause
@@ -31,6 +32,7 @@ from orchestrator.api.native import (
     queue_overview,
     run_routes,
     runs,
+    text_routes,
     track_routes,
     webhook_routes,
 )
@@ -56,6 +58,7 @@ router = APIRouter(prefix="/api")
 router.include_router(job_list.router)
 router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
+router.include_router(text_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
 router.include_router(track_routes.router)
@@ -128,7 +131,8 @@ def _limit(capacity: Queued) -> dict[str, Any] | None:
 def job_detail(request: Request, reference: str) -> Any:
     """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results.
 
-    ``storeProblem``: why there are no results, where the store does not answer.
+    ``storeProblem``: why there are no results, where the store does not answer. ``withoutEffect``: members of its definition for
+    Fargate, which change nothing here.
     """
     reconciler = reconciler_of(request)
     with reconciler.database.session() as session:
@@ -148,6 +152,7 @@ def job_detail(request: Request, reference: str) -> Any:
     with reconciler.database.session() as session:
         job = permitted_job(session, job.id, Operation.READ_JOB)
         described = runs.described(session, results) if results else None
+        definition = named_definition(session, job.definition)
         with reading(job):
             attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
             gang = job.gang
@@ -168,6 +173,9 @@ def job_detail(request: Request, reference: str) -> Any:
                 "nodes": len(gang.nodes),
                 "attempts": attempts,
                 "attemptsAllowed": job.attempts_allowed,
+                "withoutEffect": without_effect(
+                    definition.document if definition else {}, [node.container for node in gang.nodes]
+                ),
                 "spec": gang.spec,
                 "results": described,
                 "progress": progress,

@@ -21,6 +21,11 @@ DIGEST, GANG = "muster:digest", "muster:gang"
 _MOST_RANGES = 5
 _TIMEOUT_SLACK = 600
 """Seconds after the controller's own timeout at which AWS ends an attempt whose controller is away."""
+_OURS = (
+    *("vcpus", "memory", "networkConfiguration", "fargatePlatformConfiguration", "platformVersion"),
+    *("ephemeralStorage", "runtimePlatform"),
+)
+"""Members of a container that are not passed on: the placement says the first two, and a job on EC2 must not have Fargate's."""
 _NODE_FIELDS = ("node_index", "node_count", "main_index", "master_address", "address", "bus", "bus_token")
 
 
@@ -56,6 +61,11 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
     supervisor; any other one, of a job that came through the Batch API, runs it as it is.
     """
     plain = [not _has_muster(gang, index, config) for index in range(len(nodes))]
+    if missing := [index for index, each in enumerate(plain) if not each and not nodes[index].command]:
+        raise EngineError(
+            f"node {missing[0]} has no command, and that of image {_image(gang, missing[0]) or 'muster'} can't be looked up at AWS to "
+            "run it under Muster's supervisor; give it one"
+        )
     ranges, overrides = [], []
     for _, group in groupby(range(len(nodes)), key=lambda index: json.dumps(_like(gang, nodes[index]), default=str)):
         indices = list(group)
@@ -138,14 +148,14 @@ def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> di
         resources.append({"type": "GPU", "value": str(len(placement.gpus))})
     image = _image(gang, index)
     container: dict[str, Any] = {
-        **{
-            key: value for key, value in given.items() if key not in ("vcpus", "memory") and value not in ([], {}, None)
-        },
+        **{key: value for key, value in given.items() if key not in _OURS and value not in ([], {}, None)},
         "image": config.image if image in ("", "muster") else image,
         "resourceRequirements": resources,
         "command": list(node.command) if plain else ["python", "-P", "-m", "worker.aws_node", "--", *node.command],
         "environment": _pairs(node.environment if plain else _supervised(node.environment, config)),
     }
+    if plain and not node.command:
+        del container["command"]  # the image's own runs
     linux = {"sharedMemorySize": max(64, placement.memory // 2), **(given.get("linuxParameters") or {})}
     if config.efa:
         device = {"hostPath": "/dev/infiniband/uverbs0", "containerPath": "/dev/infiniband/uverbs0"}

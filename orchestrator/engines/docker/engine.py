@@ -48,14 +48,14 @@ from orchestrator.engines.docker import TRAITS
 from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
-from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
+from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store import __version__
 from shared_store.files import DamagedFile
 from shared_store.layout import Store
-from shared_store.outcomes import read_outcome
+from shared_store.outcomes import OUT_OF_MEMORY, read_outcome
 from shared_store.wording import counted
 
 log = logging.getLogger("muster.engines")
@@ -247,13 +247,13 @@ class DockerEngine:
         supervised = _VERSION in (image.labels or {})
         if supervised:
             self._kernels.mkdir(parents=True, exist_ok=True)
-        entrypoint = (image.attrs.get("Config") or {}).get("Entrypoint") or []
+        entrypoint, default = _own_command(image)
         place = self._client.api.create_endpoint_config(ipv4_address=request.contract.address)
         return self._client.containers.create(
             image,
             network=network.name,
             networking_config={network.name: place},
-            **request.arguments(entrypoint, self._kernels if supervised else None),
+            **request.arguments(entrypoint, default, self._kernels if supervised else None),
         )
 
     # -- watching -----------------------------------------------------------------------------------------------------
@@ -347,7 +347,12 @@ def _ended(state: Mapping[str, Any], address: str) -> NodeStatus:
 
 
 def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
-    """Raises EngineError where the image lacks the Muster that the command needs, or has another one than the controller."""
+    """Raises EngineError where the image lacks the command or the Muster that the job needs, or has another one than the controller."""
+    if not command and not any(_own_command(image)):
+        raise EngineError(
+            f"CannotCreateContainerError: No command specified: image {name} has neither ENTRYPOINT nor CMD, and the job no command; "
+            "give it one"
+        )
     version = (image.labels or {}).get(_VERSION)
     module = next((b for a, b in pairwise(command) if a == "-m" and b.startswith("worker.")), None)
     if version is None and module is not None:
@@ -359,6 +364,12 @@ def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
         raise EngineError(
             f"image {name} has Muster {version}, the controller {__version__}: build it anew with the controller's version"
         )
+
+
+def _own_command(image: Image) -> tuple[list[str], list[str]]:
+    """``ENTRYPOINT`` and ``CMD`` of an image."""
+    config = image.attrs.get("Config") or {}
+    return config.get("Entrypoint") or [], config.get("Cmd") or []
 
 
 def _is_here(url: str, name: str) -> bool:

@@ -42,14 +42,16 @@ class ContainerRequest:
         """The same on another network: the node's address, and the main node's."""
         return replace(self, contract=replace(self.contract, address=address, master_address=main))
 
-    def arguments(self, entrypoint: Sequence[str], kernels: Path | None) -> dict[str, Any]:
+    def arguments(self, entrypoint: Sequence[str], default: Sequence[str], kernels: Path | None) -> dict[str, Any]:
         """Of Docker's ``create``, less the network. Raises OSError where the store can't be seen.
 
         Args:
             entrypoint: The image's own.
+            default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where it is told no entrypoint either.
             kernels: Directory for compiled kernels; None for an image without Muster, whose command runs without a supervisor.
         """
         told = self.contract.to_env()
+        own = list(self.command or default)
         node = str(self.contract.node_index)
         arguments: dict[str, Any] = {
             "name": self.name,
@@ -60,7 +62,7 @@ class ContainerRequest:
         if kernels is None:
             environment = {**self.environment, **told}
             environment = {name: value for name, value in environment.items() if name not in BUS_VARIABLES}
-            mounts, entry, command = [*self.mounts], list(entrypoint) or None, list(self.command)
+            mounts, entry, command = [*self.mounts], list(entrypoint) or None, own
         else:
             job = {"HOME": "/tmp", "WARP_CACHE_PATH": KERNELS, **self.environment}
             environment = {"HOME": "/tmp", **sealed_in_image(job, told)}
@@ -69,7 +71,7 @@ class ContainerRequest:
             owner = Path(self.store).stat()
             arguments.setdefault("user", f"{owner.st_uid}:{owner.st_gid}")
             entry = ["python", "-P", "-m", "worker.supervisor", "--"]
-            command = [*entrypoint, *self.command]
+            command = [*entrypoint, *own]
         return {**arguments, "command": command, "entrypoint": entry, "environment": environment, "mounts": mounts}
 
 

@@ -33,6 +33,7 @@ from orchestrator.engines.api import (
     Plan,
     Transient,
     node_plans,
+    unused_user,
 )
 from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
@@ -42,8 +43,9 @@ from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.cgroups import own_group, remove_abandoned_groups
-from shared_store.contract import sealed
+from shared_store.contract import NodeContract, sealed
 from shared_store.layout import Store
+from shared_store.memory_groups import memory_group, memory_home
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.outcomes import read_outcome
 from shared_store.ports import first_port, free_port
@@ -97,7 +99,10 @@ class LocalEngine:
         self._children: dict[int, subprocess.Popen[bytes]] = {}
         self._groups = own_group()
         """Directory in which control groups of nodes are made; empty where they can't be."""
-        remove_abandoned_groups(self._groups)
+        self._memory = memory_home(self._groups, arrange=True)
+        """Directory below which the memory of jobs of the Batch API is limited; empty where it can't be."""
+        for directory in {self._groups, self._memory}:
+            remove_abandoned_groups(directory)
         self._ended: dict[str, GangStatus] = {}
         self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
@@ -110,7 +115,10 @@ class LocalEngine:
         nodes = node_plans(gang, addresses, first_port(gang.name))
         for index, container in enumerate(gang.containers):
             if user := container.get("user"):
-                nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=_user(user)))
+                taken, note = _user(user)
+                nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=taken, note=note))
+        if self._memory and gang.isolated:  # of a job from YAML it is for the scheduler alone
+            nodes = [replace(node, contract=self._limited(gang.name, node)) for node in nodes]
         return Plan(gang, nodes, [self._process(gang, node) for node in nodes])
 
     def launch(self, plan: Plan[Sequence[NodeProcess]]) -> Handle:
@@ -134,7 +142,8 @@ class LocalEngine:
                     pid = self._start(plan.request[index], port, gang.name, index)
                 process, address = find_process(pid), plan.nodes[index].contract.address
                 start = process.start if process else ""
-                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group}
+                memory = plan.nodes[index].contract.memory_group
+                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group, "memory": memory}
         except BaseException as error:  # never half a gang
             # by its pid: for a moment after it was started a process has no environment yet by which it would be found
             for pid in self._children.keys() - before:
@@ -186,8 +195,13 @@ class LocalEngine:
             except OSError:
                 pass  # it was never started, or this was done before
 
+    def _limited(self, gang: str, node: NodePlan) -> NodeContract:
+        """The contract of a node whose job has no more than its memory."""
+        group = memory_group(self._memory, _group_name(gang, node.contract.node_index))
+        return replace(node.contract, memory_group=group, memory_limit=node.placement.memory)
+
     def _group(self, gang: str, index: int) -> str:
-        return f"{self._groups}/muster-{gang.replace('/', '-')}-{index}" if self._groups else ""
+        return f"{self._groups}/{_group_name(gang, index)}" if self._groups else ""
 
     def _process(self, gang: Gang, node: NodePlan) -> NodeProcess:
         own = inherited(["SLURM_JWT"])
@@ -248,25 +262,32 @@ class LocalEngine:
         return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.{kind}"
 
 
-def _user(given: str) -> str:
-    """``UID:GID`` of ``user`` in a job definition. Raises EngineError where it is not there, or can't be taken on."""
-    if os.geteuid() != 0:
-        raise EngineError(
-            f"user {given}: only a controller that runs as root can run a job as another user; leave user out"
-        )
+def _user(given: str) -> tuple[str | None, str]:
+    """``UID:GID`` of ``user`` in a job definition, where it can be taken on, and a note for the log where not all of it is.
+
+    Nodes have no image, so a name that this machine does not have is the image's, and is passed over like it. One that it has is taken
+    on: that gives the job no more than a controller that runs as root would have given it.
+    """
     name, _, group = given.partition(":")
+    if os.geteuid() != 0:
+        return None, unused_user(given, "the controller does not run as root")
     try:
         user = pwd.getpwuid(int(name)) if _ID.fullmatch(name) else pwd.getpwnam(name)
         uid, gid = user.pw_uid, user.pw_gid
     except KeyError:
         if not _ID.fullmatch(name):
-            raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
+            return None, unused_user(given, f"this machine has no user {name}")
         uid = gid = int(name)
+    note = ""
     try:
         gid = int(group) if _ID.fullmatch(group) else grp.getgrnam(group).gr_gid if group else gid
-    except KeyError:
-        raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
-    return f"{uid}:{gid}"
+    except KeyError:  # the user alone: without it the job would have more rights, not fewer
+        note = f"muster: group {group} is not used: this machine has no such group; the job runs with group {gid}"
+    return f"{uid}:{gid}", note
+
+
+def _group_name(gang: str, index: int) -> str:
+    return f"muster-{gang.replace('/', '-')}-{index}"
 
 
 def _address(gang: Gang, index: int) -> str:
@@ -311,8 +332,9 @@ def _shims(gang: str) -> dict[int, _Shim]:
 
 
 def _processes(node: Mapping[str, object]) -> NodeProcesses:
-    """Of a node in a handle; handles of older versions have no group."""
-    return NodeProcesses(int(str(node["pid"])), str(node["start"]), str(node.get("group") or ""))
+    """Of a node in a handle; handles of older versions have no groups."""
+    groups = (str(node.get(name) or "") for name in ("group", "memory"))
+    return NodeProcesses(int(str(node["pid"])), str(node["start"]), *groups)
 
 
 def _signal(pid: int, number: int) -> None:

@@ -49,12 +49,12 @@ from orchestrator.engines.slurm.commands import (
 )
 from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
-from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
+from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
 from shared_store.layout import Store
-from shared_store.outcomes import Outcome
+from shared_store.outcomes import OUT_OF_MEMORY, Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """Errors of sbatch after which it would accept the job later."""

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from orchestrator.engines.api import Cause, NodePhase, NodeStatus
 
-OUT_OF_MEMORY = "OutOfMemoryError: Container killed due to memory usage"
-"""AWS's reason for a container that exceeded its memory limit."""
-
 
 def ended(address: str, exit_code: int | None, words: str = "", gpus: tuple[str, ...] = ()) -> NodeStatus:
     """A node that has ended: unobserved (None), by a signal (128 + n), or by itself."""

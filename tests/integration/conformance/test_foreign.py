@@ -172,8 +172,20 @@ def test_a_job_runs_as_the_user_that_it_names(batch: Batch) -> None:
     ours = {"MUSTER_ON_CHILD_FAILURE": "restart"}  # a job of our own kind, which has no directory of its own
     job = batch.submit(batch.single("iso-ours", "id -u; echo $HOME", env=ours, container={"user": "nobody"}))
     assert batch.wait(job)["status"] == "SUCCEEDED" and batch.lines(job) == [str(nobody.pw_uid), nobody.pw_dir]
-    job = batch.submit(batch.single("iso-nobody", "true", container={"user": "no-such-user"}))
-    assert "there is no user 'no-such-user' on this machine" in batch.wait(job)["statusReason"]
+    # who is this machine's loses root's rights, also where the group is the image's
+    job = batch.submit(batch.single("iso-group", "id -u; id -g", container={"user": "nobody:no-such-group"}))
+    assert batch.wait(job)["status"] == "SUCCEEDED"
+    gid = nobody.pw_gid
+    note = f"muster: group no-such-group is not used: this machine has no such group; the job runs with group {gid}"
+    assert sorted(batch.lines(job)) == sorted([note, str(nobody.pw_uid), str(gid)])
+
+
+def test_the_user_of_an_image_that_is_not_used_is_passed_over_with_a_note_in_the_log(batch: Batch) -> None:
+    job = batch.submit(batch.single("iso-image", "id -u", container={"user": "efauser"}))
+    assert batch.wait(job)["status"] == "SUCCEEDED" and batch.describe(job)["container"]["user"] == "efauser"
+    why = "the controller does not run as root" if os.geteuid() else "this machine has no user efauser"
+    note = f"muster: user efauser is not used: nodes run without the image, and {why}"
+    assert sorted(batch.lines(job)) == sorted([note, str(os.geteuid())])
 
 
 def test_secrets_reach_the_job_and_nothing_else(batch: Batch) -> None:

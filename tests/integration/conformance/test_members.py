@@ -19,7 +19,6 @@ SECRET = [{"name": "A", "valueFrom": "b"}]
 LIMITED = "consumableResourceProperties"
 EKS = {"podProperties": {"containers": [{"image": "any"}]}}
 S3 = {"volumes": [{"name": "v", "s3filesVolumeConfiguration": {"fileSystemArn": "any"}}]}
-FARGATE = {"fargatePlatformConfiguration": {"platformVersion": "LATEST"}}
 
 SAME = {
     "nodeProperties.nodeRangeProperties.container": "container",
@@ -48,7 +47,10 @@ WORKS = {
 """Tests elsewhere show that they do."""
 
 WITHOUT_EFFECT = {
-    *("propagateTags", "nodeProperties.nodeRangeProperties.instanceTypes"),
+    *("propagateTags", "platformCapabilities", "nodeProperties.nodeRangeProperties.instanceTypes"),
+    *(f"container.{name}" for name in ("networkConfiguration", "fargatePlatformConfiguration")),
+    *(f"task.{name}" for name in ("networkConfiguration", "platformVersion")),
+    *(f"{place}.{name}" for place in ("container", "task") for name in ("ephemeralStorage", "runtimePlatform")),
     *("containerOverrides.instanceType", "nodeOverrides.nodePropertyOverrides.instanceTypes"),
     *(f"container.{name}" for name in ("jobRoleArn", "executionRoleArn", "instanceType", "logConfiguration.options")),
     *(f"container.{name}" for name in ("readonlyRootFilesystem", "privileged", "ulimits", "linuxParameters")),
@@ -63,11 +65,7 @@ WITHOUT_EFFECT = {
 """On every engine, or on those whose nodes are processes: docs/aws-differences.md has each of them."""
 
 REFUSED: dict[str, dict[str, Any]] = {
-    "container.networkConfiguration": {"container": {"networkConfiguration": {"assignPublicIp": "ENABLED"}}},
-    "container.fargatePlatformConfiguration": {"container": FARGATE},
     "container.enableExecuteCommand": {"container": {"enableExecuteCommand": True}},
-    "container.ephemeralStorage": {"container": {"ephemeralStorage": {"sizeInGiB": 30}}},
-    "container.runtimePlatform": {"container": {"runtimePlatform": {"cpuArchitecture": "ARM64"}}},
     "container.repositoryCredentials": {"container": {"repositoryCredentials": {"credentialsParameter": "any"}}},
     "container.logConfiguration.logDriver": {"container": {"logConfiguration": {"logDriver": "syslog"}}},
     "container.logConfiguration.secretOptions": {"container": {"logConfiguration": {**LOG, "secretOptions": SECRET}}},
@@ -80,15 +78,10 @@ REFUSED: dict[str, dict[str, Any]] = {
     "task.containers.logConfiguration.logDriver": {"only": {"logConfiguration": {"logDriver": "splunk"}}},
     "task.containers.logConfiguration.secretOptions": {"only": {"logConfiguration": {**LOG, "secretOptions": SECRET}}},
     "task.volumes.s3filesVolumeConfiguration": {"task": S3},
-    "task.ephemeralStorage": {"task": {"ephemeralStorage": {"sizeInGiB": 30}}},
-    "task.platformVersion": {"task": {"platformVersion": "LATEST"}},
     "task.ipcMode": {"task": {"ipcMode": "host"}},
     "task.pidMode": {"task": {"pidMode": "host"}},
     "task.networkMode": {"task": {"networkMode": "host"}},
-    "task.networkConfiguration": {"task": {"networkConfiguration": {"assignPublicIp": "ENABLED"}}},
-    "task.runtimePlatform": {"task": {"runtimePlatform": {"cpuArchitecture": "ARM64"}}},
     "task.enableExecuteCommand": {"task": {"enableExecuteCommand": True}},
-    "platformCapabilities": {"definition": {"platformCapabilities": ["FARGATE"]}},
     "eksProperties": {"definition": {"eksProperties": EKS}},
     LIMITED: {"definition": {LIMITED: CONSUMABLE}},
     "nodeProperties.nodeRangeProperties.eksProperties": {"range": {"eksProperties": EKS}},
@@ -135,7 +128,6 @@ def test_members_without_effect_stand_in_the_documentation() -> None:
 def test_unsupported_members_are_refused_by_name(batch: Batch, member: str) -> None:
     change = REFUSED[member]
     name = member.rpartition(".")[2]
-    name = {"eksProperties": "Properties", "platformCapabilities": "FARGATE"}.get(name, name)
     if "range" in change or "override" in change:
         entry = {"targetNodes": "0:", "container": CONTAINER, **change.get("range", {})}
         kind, properties = "multinode", {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [entry]}

@@ -50,7 +50,10 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
     assert batch.api.describe_compute_environments(computeEnvironments=["q-ce"])["computeEnvironments"] == []
     for change, message in [
         ({"type": "OTHER"}, "MANAGED or UNMANAGED"),
-        ({"computeResources": {**resources, "type": "FARGATE"}}, "FARGATE is not supported"),
+        (
+            {"computeResources": {**resources, "type": "ECS_MANAGED_INSTANCES"}},
+            "'ECS_MANAGED_INSTANCES' is not supported",
+        ),
         ({"computeResources": {**resources, "maxvCpus": -1}}, "maxvCpus is -1"),
         ({"computeEnvironmentName": "a b"}, "computeEnvironmentName"),
         ({"state": "ON"}, "ENABLED or DISABLED"),
@@ -77,8 +80,8 @@ def test_a_queue_from_its_creation_to_its_end(batch: Batch, parked: str) -> None
     [shown] = batch.api.describe_job_queues(jobQueues=[arn])["jobQueues"]
     assert (shown["priority"], shown["state"], shown["status"]) == (7, "ENABLED", "VALID")
     assert shown["jobStateTimeLimitActions"] == [limit] and shown["tags"] == {"a": "1"}
-    [place] = shown["computeEnvironmentOrder"]
-    assert place["computeEnvironment"] == f"{PREFIX}compute-environment/{parked}"
+    place = {"order": 5, "computeEnvironment": f"{PREFIX}compute-environment/{parked}"}
+    assert shown["computeEnvironmentOrder"] == [place]
     definition = batch.single("q-lives", "true")
     waiting = batch.submit(definition, queue=arn)
     with refused("q-lives is ENABLED"):
@@ -96,6 +99,30 @@ def test_a_queue_from_its_creation_to_its_end(batch: Batch, parked: str) -> None
     wait_for(lambda: not batch.api.describe_job_queues(jobQueues=["q-lives"])["jobQueues"], what="its end")
     assert batch.describe(waiting)["jobQueue"] == arn, "its history stays"
     batch.api.delete_job_queue(jobQueue="q-lives")
+
+
+def test_the_order_of_compute_environments_is_described_as_it_was_sent_and_tried_ascending(batch: Batch) -> None:
+    """Terraform compares it at each plan, with its sequence: its acceptance test wants (2, 1, 3) back."""
+    names = [batch.compute_environment(f"q-order-{letter}", cpus=0 if letter == "a" else 8) for letter in "abc"]
+    arns = [f"{PREFIX}compute-environment/{name}" for name in names]
+    batch.queue("q-order", names[0])
+
+    def described(*orders: int) -> list[dict[str, Any]]:
+        sent = [{"order": order, "computeEnvironment": name} for order, name in zip(orders, names, strict=False)]
+        batch.api.update_job_queue(jobQueue="q-order", computeEnvironmentOrder=sent)
+        [queue] = batch.api.describe_job_queues(jobQueues=["q-order"])["jobQueues"]
+        return list(queue["computeEnvironmentOrder"])
+
+    for orders in ([1], [0], [5], [0, 1], [10, 20], [2, 1, 3], [3, 1, 2]):
+        shown = [{"order": order, "computeEnvironment": arn} for order, arn in zip(orders, arns, strict=False)]
+        assert described(*orders) == shown
+    batch.api.update_job_queue(jobQueue="q-order", priority=2)
+    [queue] = batch.api.describe_job_queues(jobQueues=["q-order"])["jobQueues"]
+    assert [each["order"] for each in queue["computeEnvironmentOrder"]] == [3, 1, 2], "another change leaves it alone"
+    job = batch.submit(batch.single("q-order", 'echo "$AWS_BATCH_CE_NAME"'), queue="q-order")
+    batch.wait(job, "SUCCEEDED")
+    assert batch.lines(job) == [names[1]]
+    batch.remove(["q-order"], names)
 
 
 @pytest.mark.parametrize(

@@ -59,13 +59,13 @@ def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch,
     too_wide = batch.submit(wide, queue="q-low")
     impossible = batch.submit(gang)
     pending = batch.submit(plain, queue="q-low", dependsOn=[{"jobId": head}])
-    needs = "needs 1 node with 0.5 CPUs, 0 GPUs, 16 MiB in all"
+    needs = "needs 1 node with 0.5 CPUs, 0 GPUs, 64 MiB in all"
     free = f"{NO_ROOM} - {needs}; compute environment q-one-cpu may use 0 CPUs"
     assert batch.reason(head, NO_ROOM) == f"{free} more at this time until job q-holds ({first[:8]}) ends"
     behind = f"2nd in queue q-low, behind job q-plain ({head[:8]}), which {needs}"
     assert batch.reason(second, "2nd") == behind
     assert batch.reason(too_wide, "MISCONFIGURATION") == (
-        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 1 node with 2 CPUs, 0 GPUs, 16 MiB in all; "
+        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 1 node with 2 CPUs, 0 GPUs, 64 MiB in all; "
         "compute environment q-one-cpu has at most 1 CPU"
     )
     said = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
@@ -112,10 +112,13 @@ def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch
         batch.submit(definition, queue="q-shares")
     with refused("1 to 255 letters and digits"):
         batch.submit(definition, queue="q-shares", shareIdentifier="a b")
+    for share in ("*", "A**", "A*1", "A" * 256):
+        with refused("1 to 255 letters and digits, a * at the end at most"):
+            batch.submit(definition, queue="q-shares", shareIdentifier=share)
     with refused("must be 0 to 9999"):
         batch.submit(definition, queue="q-shares", shareIdentifier="A", schedulingPriorityOverride=10000)
     shares: dict[str, str] = {}
-    for share in ["Light"] * 4 + ["Heavy1"] * 8:
+    for share in ["Light"] * 4 + ["Heavy1*"] * 8:  # AWS's reference allows an asterisk at the end
         shares[batch.submit(definition, queue="q-shares", shareIdentifier=share)] = share
     urgent = batch.submit(definition, queue="q-shares", shareIdentifier="Light", schedulingPriorityOverride=6)
     shares[urgent] = "Light"
@@ -128,6 +131,8 @@ def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch
     assert light == [urgent, *rest], "the higher priority first, then the older"
     detail = batch.describe(urgent)
     assert (detail["shareIdentifier"], detail["schedulingPriority"]) == ("Light", 6)
+    heavy = next(job for job in order if shares[job] == "Heavy1*")
+    assert batch.describe(heavy)["shareIdentifier"] == "Heavy1*"
     assert batch.describe(rest[0])["schedulingPriority"] == 5, "the definition's"
     found = batch.api.list_jobs(jobQueue="q-shares", filters=[{"name": "SHARE_IDENTIFIER", "values": ["Light"]}])
     assert [each["jobId"] for each in found["jobSummaryList"]] == [urgent, *reversed(rest)]

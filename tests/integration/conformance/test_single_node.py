@@ -35,14 +35,18 @@ def test_a_container_job_has_a_container_and_knows_nothing_of_nodes(batch: Batch
     assert not {"nodeProperties", "nodeDetails", "arrayProperties"} & detail.keys()
     assert detail["container"]["exitCode"] == detail["attempts"][0]["container"]["exitCode"] == 4
     assert detail["container"]["environment"] == pairs({"WHO": "I", "WHAT": "works"})
-    needs = [{"type": "VCPU", "value": "0.2"}, {"type": "MEMORY", "value": "16"}]
+    needs = [{"type": "VCPU", "value": "0.2"}, {"type": "MEMORY", "value": "64"}]
     assert detail["container"]["resourceRequirements"] == needs
     assert (detail["status"], detail["statusReason"]) == ("FAILED", EXITED)
     assert detail["parameters"] == {"unused": "1"} and detail["propagateTags"] is True
     assert batch.api.describe_jobs(jobs=[f"{job}#0", f"{job}:0"])["jobs"] == []
     listed = batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
     [summary] = [each for each in listed if each["jobId"] == job]
-    assert "nodeProperties" not in summary and summary["container"]["exitCode"] == 4
+    assert "nodeProperties" not in summary and summary["container"] == {"exitCode": 4}, "no reason: an ordinary exit"
+    assert "reason" not in detail["container"] and "reason" not in detail["attempts"][0]["container"]
+    [node] = batch.server.client.get(f"/api/jobs/{job}")["attempts"][0]["nodes"]
+    assert node["reason"].startswith("rank 0 exited with code 4"), "Muster's own words"
+    assert "rank 0 exited with code 4" in batch.server.muster("show", job, MUSTER_URL=batch.server.url).stdout
 
 
 def test_parameters_replace_references_the_submissions_before_the_definitions(batch: Batch, parked: str) -> None:
@@ -143,6 +147,25 @@ def test_an_array_is_ended_with_its_children(batch: Batch, tmp_path: Path) -> No
     assert batch.describe(job)["isTerminated"] and batch.describe(f"{job}:0")["isTerminated"]
 
 
+@pytest.mark.parametrize("cancelled", [True, False])
+def test_an_array_that_is_cancelled_while_all_children_run_and_then_terminated_has_the_second_reason(
+    batch: Batch, tmp_path: Path, cancelled: bool
+) -> None:
+    definition = batch.single("one-array-both", UNTIL.format("never"), env={"GATE": str(tmp_path)})
+    job = batch.submit(definition, arrayProperties={"size": 2})
+    for index in range(2):
+        batch.wait(f"{job}:{index}", "RUNNING")
+    if cancelled:
+        batch.api.cancel_job(jobId=job, reason="too late")
+        detail = batch.describe(job)
+        assert (detail["status"], detail["isCancelled"], detail["isTerminated"]) == ("PENDING", False, False)
+    batch.api.terminate_job(jobId=job, reason="enough of it")
+    for each in (job, f"{job}:0", f"{job}:1"):
+        detail = batch.wait(each)
+        assert (detail["status"], detail["statusReason"]) == ("FAILED", "enough of it")
+        assert (detail["isCancelled"], detail["isTerminated"]) == (False, True)
+
+
 def test_children_come_one_by_one_in_a_sequential_array(batch: Batch, tmp_path: Path) -> None:
     script = f"echo begin {INDEX} >> $GATE/log; {UNTIL.format('go')}; echo end {INDEX} >> $GATE/log"
     definition = batch.single("one-sequential", script, env={"GATE": str(tmp_path)})
@@ -183,6 +206,10 @@ def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
         ({"arrayProperties": {"size": 2}, "dependsOn": [{"jobId": "JOB", "type": "N_TO_N"}]}, "same size"),
         ({"dependsOn": [{"jobId": "ARRAY", "type": "N_TO_N"}]}, "for array jobs"),
         ({"dependsOn": [{}]}, "needs a jobId"),
+        (
+            {"arrayProperties": {"size": 2}, "dependsOn": [{"jobId": "ARRAY", "type": "SEQUENTIAL"}]},
+            "SEQUENTIAL is among the children of the array itself and takes no jobId",
+        ),
         ({"nodeOverrides": {"numNodes": 2}}, "use containerOverrides"),
     ],
 )
@@ -238,8 +265,8 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         ([{"onExitCode": "1*", **AGAIN}, {"onExitCode": "12", **END}], 3),
         ([{"onExitCode": "12", **END}, {"onExitCode": "1*", **AGAIN}], 1),
         ([{"onExitCode": "1", **END}, {"onExitCode": "2*", **END}], 3),  # none matches: tried again
-        ([{"onReason": "rank 0 exited with code 12*", **END}], 1),
-        ([{"onReason": "exited with code 12*", **END}], 3),  # only the end may be left open
+        ([{"onReason": "rank 0 exited with code 12*", **END}], 3),  # an ordinary exit has no reason
+        ([{"onStatusReason": f"{EXITED[1:9]}*", **END}], 3),  # only the end may be left open
         ([{"onExitCode": "12", "onReason": "CannotPull*", **END}], 3),  # all of an entry must match
         ([{"onStatusReason": f"{EXITED[:9]}*", "onExitCode": "12", "action": "exit"}], 1),
         ([{"onExitCode": "0", **END}, {"onReason": "*", **END}], 1),  # the documentation's catch-all
@@ -267,7 +294,9 @@ def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tm
     detail = batch.wait(job)
     lost, failed = detail["attempts"]
     assert lost["statusReason"].startswith("Host EC2 (instance ") and lost["statusReason"].endswith(") terminated.")
+    assert lost["container"]["reason"] == lost["statusReason"]
     assert (failed["container"]["exitCode"], failed["statusReason"]) == (3, EXITED)
+    assert "reason" not in failed["container"]
     assert detail["status"] == "FAILED"
 
 
@@ -321,8 +350,17 @@ def test_the_command_may_come_with_the_submission(batch: Batch) -> None:
     definition = batch.register("one-open", "container", containerProperties=properties)
     job = batch.submit(definition, containerOverrides={"command": ["echo", "from the submission"]})
     assert batch.wait(job)["status"] == "SUCCEEDED" and batch.lines(job) == ["from the submission"]
-    with refused("has no command; give one in the definition or in the overrides"):
-        batch.submit(definition)
+    empty = batch.register("one-empty", "container", containerProperties={**properties, "command": []})
+    for each, name in ((definition, "one-open"), (empty, "one-empty")):
+        why = f"job definition {name} has no command, and engine local of job queue default runs no image"
+        with refused(why, "give a command in the definition or in the overrides", "docker"):
+            batch.submit(each)
+    ranges = [
+        {"targetNodes": "0:0", "container": container("true", {})},
+        {"targetNodes": "1:", "container": properties},
+    ]
+    with refused("job definition one-part has no command, and engine local"):
+        batch.submit(batch.multinode("one-part", "", ranges=ranges))
 
 
 def test_a_container_definition_needs_no_image_of_ours_and_refuses_what_is_not_run(batch: Batch) -> None:
@@ -333,6 +371,3 @@ def test_a_container_definition_needs_no_image_of_ours_and_refuses_what_is_not_r
     ]:
         with refused(message):
             batch.register("one-bad", "container", containerProperties=properties)
-    with refused("FARGATE is not supported"):
-        fargate = {"platformCapabilities": ["FARGATE"]}
-        batch.register("one-bad", "container", containerProperties=container("true", {}), **fargate)

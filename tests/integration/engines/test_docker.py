@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import socket
+import tarfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -319,6 +321,47 @@ def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_
     assert bench.left() == (0, 0)
 
 
+OWN = ('ENTRYPOINT ["echo", "entrypoint"]', 'CMD ["of", "the image"]')
+SHELL = ("ENTRYPOINT exec sh -c 'echo entrypoint of the shell'",)
+
+
+@pytest.mark.parametrize("labels", [(), (f"LABEL muster.version={__version__}",)], ids=["plain", "supervised"])
+@pytest.mark.parametrize(
+    ("own", "command", "line"),
+    [
+        (OWN, (), "entrypoint of the image"),
+        (OWN, ("of", "the job"), "entrypoint of the job"),
+        (OWN[:1], (), "entrypoint"),
+        (('CMD ["echo", "command alone"]',), (), "command alone"),
+        (SHELL, (), "entrypoint of the shell"),
+    ],
+)
+def test_a_job_without_a_command_runs_that_of_its_image(
+    bench: DockerBench, labels: tuple[str, ...], own: tuple[str, ...], command: tuple[str, ...], line: str
+) -> None:
+    """As Docker runs it by itself; each node of a gang the same."""
+    image = f"muster-test-own-{bench.job}"
+    empty = io.BytesIO()
+    with tarfile.open(fileobj=empty, mode="w"):
+        pass
+    changes = [*own, *labels]
+    bench.client.api.import_image_from_data(empty.getvalue(), repository=image, tag="1", changes=changes)
+    try:
+        handle = bench.launch(bench.gang(nodes=2, image=f"{image}:1", commands=[command] * 2))
+        assert [node.exit_code for node in bench.ended(handle)] == [0, 0], bench.log()
+        assert bench.log() == [line, line]
+        bench.stopped(handle)
+    finally:
+        bench.client.images.remove(f"{image}:1", force=True)
+
+
+def test_an_image_that_has_no_command_either_is_refused(bench: DockerBench) -> None:
+    for image in (PLAIN, SUPERVISED):
+        with pytest.raises(EngineError, match=f"No command specified: image {image} has neither ENTRYPOINT nor CMD"):
+            bench.engine.launch(bench.engine.plan(bench.gang(image=image, commands=[()] * 2)))
+    assert bench.left() == (0, 0)
+
+
 def test_images_that_are_built_here_say_the_controller_s_version() -> None:
     said = (REPOSITORY / "containers" / "Dockerfile").read_text()
     assert f"muster.version={__version__} " in said and f"image.version={__version__} " in said
@@ -353,7 +396,7 @@ def test_docker_creates_the_containers_of_the_plan(bench: DockerBench, image: st
     addresses = handle.facts["addresses"]
     kernels = None if image == PLAIN else bench.engine._kernels
     for index, planned in enumerate(plan.request):
-        sent = planned.at(addresses[index], addresses[0]).arguments((), kernels)
+        sent = planned.at(addresses[index], addresses[0]).arguments((), (), kernels)
         found = bench.client.containers.get(sent["name"]).attrs
         config, host = found["Config"], found["HostConfig"]
         assert (config["Cmd"], config["Entrypoint"]) == (sent["command"], sent["entrypoint"])

@@ -280,8 +280,8 @@ def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, A
 # -- reward functions that can't be: refused before anything is asked of a controller ----------------------------------
 
 BODIES = {
-    "return params['sped']": ":2: TEST_FAILURE: the sample 'start': KeyError: 'sped'",
-    "raise SystemExit(0)": ":2: TEST_FAILURE: the sample 'start': it ended the program (SystemExit)",
+    "return params['sped']": ":2: TEST_FAILURE: the sample 'start': KeyError: 'sped', on track oval with 133 waypoints",
+    "raise SystemExit(0)": ":2: TEST_FAILURE: the sample 'start': it ended the program (SystemExit), on track oval with 133 waypoints",
 }
 
 

@@ -284,7 +284,7 @@ def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(clie
     waiting = submit_gang(client, "pass", queue="fake")
     await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
     silent = "the fake engine has not answered "  # yet, and later since when
-    said = f"CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 0.1 CPUs, 0 GPUs, 16 MiB in all; {silent}"
+    said = f"CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 0.1 CPUs, 0 GPUs, 64 MiB in all; {silent}"
     wait_for(lambda: detail(client, waiting)["statusReason"].startswith(said), 20, "the reason")
     engines = {each["name"]: each for each in client.get("/api/queues")["engines"]}
     assert engines["local"]["problem"] is None and engines["local"]["toldAt"] is not None
@@ -377,8 +377,8 @@ def test_a_node_is_on_the_host_that_the_engine_tells_later(queued: Client, engin
 def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_called_a_host(queued: Client) -> None:
     limit = "queue fake/q gives a gang at most 8 CPUs, 2 GPUs, 8 GiB"
     for nodes, cpus, needs in (
-        (1, "12", "each node needs 12 CPUs, 0 GPUs, 16 MiB"),
-        (3, "3", "needs 3 nodes with 9 CPUs, 0 GPUs, 48 MiB in all"),
+        (1, "12", "each node needs 12 CPUs, 0 GPUs, 64 MiB"),
+        (3, "3", "needs 3 nodes with 9 CPUs, 0 GPUs, 192 MiB in all"),
     ):
         with pytest.raises(ApiError) as refused:
             queued.post("/api/plan", {"definition": multinode("a", container(cpus=cpus), nodes)})

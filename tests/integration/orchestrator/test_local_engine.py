@@ -323,3 +323,27 @@ def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: LocalBench) -> None:
     assert bench.engine.observe(handles[2])[0].words.startswith("muster supervisor: run run: this attempt has epoch 4")
     assert list((bench.home / "home" / "supervisors").iterdir()) == []
     assert not bench.engine._children
+
+
+# -- memory -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("blow", ["none", "supervisor", "shim", "shim and supervisor"])
+def test_no_memory_group_is_left_whatever_dies(bench: LocalBench, blow: str) -> None:
+    gang = bench.gang(nodes=2, isolated=True, directory=None)
+    groups = [node.contract.memory_group for node in bench.engine.plan(gang).nodes]
+    if not all(groups):
+        pytest.skip("this process can't limit memory: run the test as root, or in a delegated group")
+    handle = bench.ready(gang)
+    assert all(os.path.isdir(group) for group in groups) and len(set(groups)) == 2
+    shim = pids(handle)[0]
+    [supervisor] = children(shim)
+    killed = {"supervisor": [supervisor], "shim": [shim], "shim and supervisor": [shim, supervisor]}.get(blow, [])
+    for pid in killed:
+        os.kill(pid, signal.SIGKILL)
+    bench.engine.stop(handle, 1.0)
+    assert [group for group in groups if os.path.exists(group)] == [] and bench.processes() == []
+
+
+def test_a_gang_of_a_job_from_yaml_is_not_limited(bench: LocalBench) -> None:
+    assert {node.contract.memory_group for node in bench.engine.plan(bench.gang()).nodes} == {""}

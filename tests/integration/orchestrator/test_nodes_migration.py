@@ -76,6 +76,7 @@ def test_queues_keep_their_compute_environments_in_order_and_back_again(old: str
     with database.session() as session:
         queues = {queue.name: queue.compute_environments for queue in session.scalars(select(JobQueue))}
         assert queues == {"default": ["local"], "lab": ["b", "a"]}
+        assert {queue.sent_order for queue in session.scalars(select(JobQueue))} == {None}
     database.close()
     migrate(old, "downgrade", "0010")
     with engine.connect() as connection:

@@ -8,10 +8,19 @@ import numpy as np
 import torch
 
 from worker.racer.presets import make_preset
+from worker.racer.track import Track
 from worker.tasks.configs.racer import RacerConfig
 from worker.tasks.racer import Racer
 
 OVAL = make_preset("oval")
+
+
+def round_the_guard(source: str, file: str = "r.py") -> str:
+    """A reward function with all built-in functions and modules of Python, as one gets at them who wants to."""
+    return (
+        "import random\n__builtins__ = random.Random.seed.__globals__['__builtins__']\n"
+        f"__builtins__['exec'](__builtins__['compile']({source!r}, {file!r}, 'exec'), (lambda: 0).__globals__)\n"
+    )
 
 
 def racer(worlds: int = 1, **fields: Any) -> Racer:
@@ -31,3 +40,9 @@ def counted(task: Racer, name: str) -> float:
 def straight(task: Racer, speed: float = 0.0) -> torch.Tensor:
     """Actions of cars that do not steer."""
     return torch.tensor([[0.0, speed]] * task.world_count)
+
+
+def open_track() -> Track:
+    """Half an oval, driven from its start line to the end of its second straight, to the left: 12 m or so, 1 m wide."""
+    rows = slice(0, 80)
+    return Track("horseshoe", OVAL.center[rows], OVAL.inner[rows], OVAL.outer[rows], closed=False)

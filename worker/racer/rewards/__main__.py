@@ -1,12 +1,19 @@
-"""``python -m worker.racer.rewards FILE`` says whether a reward function is valid, and whether it compiles."""
+"""``python -m worker.racer.rewards FILE`` says whether a reward function is valid, and whether it compiles.
+
+Standard error has the fault of a file that is not valid; of a valid one, notes: where it was not run, or not on the job's tracks.
+"""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
+from shared_store.layout import Store
+from shared_store.texts import IN_DEFINITION, size_in_definition
 from worker.racer.rewards.guard import check, read_file
+from worker.racer.rewards.samples import FINE_OVAL, Course
 from worker.racer.rewards.translation import Outside, translate
 
 
@@ -18,19 +25,37 @@ def main() -> int:
         epilog="example: python -m worker.racer.rewards reward_function.py",
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    failed = 0
-    for path in parser.parse_args().files:
-        problem = check(path)
+    parser.add_argument(
+        "--config",
+        type=json.loads,
+        metavar="JSON",
+        help='track and obstacles of the task, such as {"track": "chicane"}: the samples are of them; by default of an oval',
+    )
+    parser.add_argument("--store", type=Path, metavar="DIRECTORY", help="of the tracks that are not made from a name")
+    failed, asked = 0, parser.parse_args()
+    courses: tuple[Course, ...] = (FINE_OVAL,)
+    unknown: list[str] = []
+    if asked.config is not None:
+        from worker.racer.rewards.courses import courses_for  # it takes numpy
+
+        courses, unknown = courses_for(asked.config, Store(asked.store) if asked.store else None)
+    for path in asked.files:
+        for line in unknown:
+            print(f"{path}: {line}", file=sys.stderr)
+        problem = check(path, courses, note=lambda line: print(line, file=sys.stderr))
         if problem is not None:
             failed = 1
             print(problem, file=sys.stderr)
             continue
+        text = read_file(path)
         try:
-            notes = translate(read_file(path)).notes
+            notes = translate(text).notes
         except Outside as outside:
             print(f"{path}: valid; {outside}")
         else:
             print("\n".join([f"{path}: valid, compiled to the device", *(f"  {note}" for note in notes)]))
+        if size_in_definition({"file": str(path), "text": text}) > IN_DEFINITION:
+            print(f"  {len(text.encode()):,} bytes: a job keeps it in the store, not in its definition")
     return failed
 
 

@@ -31,6 +31,7 @@ class RaceArrays:
         counts: How many waypoints each track has, shape ``(tracks,)``.
         errors: Of each car the last error of its reward function (16 times the line, and its number in
             :data:`~worker.racer.rewards.translation.prelude.ERRORS`) and how many there were, shape ``(worlds, 2)``.
+        values: Of each car the last reward that was too large, shape ``(worlds,)``.
     """
 
     numbers: wp.array2d[wp.float32]
@@ -38,6 +39,7 @@ class RaceArrays:
     waypoints: wp.array3d[wp.float32]
     counts: wp.array[wp.int32]
     errors: wp.array2d[wp.int32]
+    values: wp.array[wp.float32]
 
 
 def race_arrays(worlds: int, tracks: Sequence[Sequence[Point]], device: str) -> Any:
@@ -57,6 +59,7 @@ def race_arrays(worlds: int, tracks: Sequence[Sequence[Point]], device: str) -> 
     race.waypoints = wp.array(lines, dtype=wp.float32, device=device)
     race.counts = wp.array([len(track) for track in tracks], dtype=wp.int32, device=device)
     race.errors = wp.zeros((worlds, 2), dtype=wp.int32, device=device)
+    race.values = wp.zeros(worlds, dtype=wp.float32, device=device)
     return race
 
 
@@ -101,10 +104,10 @@ def _run(text: str, name: str, scope: dict[str, Any]) -> None:
     exec(compile(text, file, "exec"), scope)
 
 
-def told_errors(errors: np.ndarray) -> dict[str, Failure]:
-    """Content of ``race.errors``: the calls that gave no reward, by their message."""
-    found: dict[str, Failure] = {}
+def failures_of(race: Any) -> dict[int, tuple[str, Failure]]:
+    """The calls that gave no reward, by the number in ``race.errors``: the message of the first car, and how many. Waits for the device."""
+    errors, values, found = race.errors.numpy(), race.values.numpy(), dict[int, tuple[str, Failure]]()
     for car in np.flatnonzero(errors[:, 1]).tolist():
         code, count = errors[car].tolist()
-        found.setdefault(told(code), Failure(0, car)).count += count
+        found.setdefault(code, (told(code, float(values[car])), Failure(0, car)))[1].count += count
     return found

@@ -1,4 +1,4 @@
-"""A process that runs a learner's function: its limits, how it is loaded and called, and what its failures are called.
+"""A process that runs a learner's function: its limits, how it is called, and what its failures are called.
 
 It imports nothing but the standard library: a process that runs a function starts in a few hundredths of a second.
 """
@@ -8,40 +8,60 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import math
+import os
 import resource
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection
+from importlib.machinery import PathFinder
 from typing import Any
 
-from worker.racer.rewards.problems import one_line
+from worker.racer.rewards import sandbox
+from worker.racer.rewards.namespaces import Forbidden
+from worker.racer.rewards.problems import LARGEST_REWARD, one_line, out_of_range
 
 MEMORY = 2 << 30
 """Bytes of address space of a process that runs a reward function."""
 MOST_PRINTED = 64 << 10
 """Characters that one call may print; what it prints is dropped."""
-_NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 _PARENT_DEATH_SIGNAL = 1
-Reward = Callable[[dict[str, Any]], Any]
 
 
-def confine(memory: int = MEMORY, cpu: int | None = None) -> None:
-    """Limit this process: memory, CPU time, no file with content, no core dump, no further process, and no network where it can be had.
+def confine(memory: int = MEMORY, cpu: int | None = None, keep: Collection[int] = ()) -> str:
+    """Limit this process for good: memory, CPU time, descriptors, and what its system calls reach (:mod:`~worker.racer.rewards.sandbox`).
 
     Args:
         memory: Bytes of address space.
         cpu: Seconds of CPU time; None: no limit.
+        keep: Descriptors that stay open, beside the first three.
+
+    Returns:
+        Why the sandbox does not hold here, one line; empty where it does.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    libc.unshare(_NEW_USER | _NEW_NETWORK)  # refused in some containers; the rest holds there, too
-    limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0, resource.RLIMIT_NPROC: 0}
+    for name in os.listdir("/proc/self/fd"):
+        if (descriptor := int(name)) > 2 and descriptor not in keep:
+            with contextlib.suppress(OSError):  # that of the list itself
+                os.close(descriptor)
+    limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}
     if cpu is not None:
         limits[resource.RLIMIT_CPU] = cpu
     for kind, most in limits.items():
-        hard = resource.getrlimit(kind)[1]
-        least = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (least, least))
+        sandbox.limit(kind, most)
+    libc.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    sys.meta_path.insert(0, _Hidden())
+    return sandbox.enter(libc)
+
+
+class _Hidden:
+    """Packages that can't be read any more are not there: NumPy and SciPy use some of them where they find them."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> None:
+        """Raises ModuleNotFoundError for them."""
+        known = path is not None or name in sandbox.PACKAGES or name in sys.stdlib_module_names
+        if not known and PathFinder.find_spec(name, [os.path.dirname(os.__file__)]) is None:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
 class Flooded(BaseException):
@@ -84,19 +104,6 @@ def line_of(error: BaseException, file: str) -> int:
     return line
 
 
-def load(source: str, file: str) -> Reward:
-    """Run a file's text and give its ``reward_function``.
-
-    Args:
-        source: Its text.
-        file: Its name, in tracebacks.
-    """
-    scope: dict[str, Any] = {"__name__": "reward_function"}
-    exec(compile(source, file, "exec", dont_inherit=True), scope)
-    function: Reward = scope["reward_function"]
-    return function
-
-
 def told_result(result: Any) -> str:
     """The fault of a function's return value; empty without one.
 
@@ -117,15 +124,18 @@ def told_result(result: Any) -> str:
         return f"it returned a {kind} that is no float"
     if not math.isfinite(value):
         return f"it returned {value}; return a finite number"
-    if abs(value) > 3.4e38:
-        return f"it returned {value:g}; return a number of at most 3.4e38"
+    if abs(value) > LARGEST_REWARD:
+        return out_of_range(value)
     return ""
 
 
 def told_error(error: BaseException) -> str:
     """The message for an exception that a function raised."""
+    if isinstance(error, Forbidden):
+        return str(error)
     if isinstance(error, ModuleNotFoundError):
-        return f"{error.name} is not installed here"
+        way = f": pip install {error.name} (the extra 'worker' has it)" if error.name in sandbox.PACKAGES else ""
+        return f"{error.name} is not installed here{way}"
     if isinstance(error, MemoryError):
         return f"it used more than {MEMORY >> 30} GiB of memory"
     if isinstance(error, RecursionError):
@@ -133,23 +143,6 @@ def told_error(error: BaseException) -> str:
     if isinstance(error, SystemExit):
         return "it ended the program (SystemExit)"
     return one_line(error)
-
-
-def changed(before: Any, after: Any, place: str = "params") -> str:
-    """The first part of ``params`` that a function changed; empty: none. NaN counts as equal to NaN."""
-    if type(before) is not type(after):
-        return place
-    if isinstance(before, Mapping):
-        if list(before) != list(after):
-            return place
-        pairs = [(f"{place}[{key!r}]", before[key], after[key]) for key in before]
-    elif isinstance(before, list | tuple):
-        if len(before) != len(after):
-            return place
-        pairs = [(f"{place}[{index}]", *pair) for index, pair in enumerate(zip(before, after, strict=True))]
-    else:
-        return "" if before == after or (before != before and after != after) else place
-    return next((found for name, one, other in pairs if (found := changed(one, other, name))), "")
 
 
 class Alarm:

@@ -1,68 +1,65 @@
 """Checks a reward function before any job starts: its text, its imports and names, and what it does with sample inputs.
 
-It is a guard against mistakes and carelessness, not a sandbox: a determined attacker gets round it. What isolates jobs is in
-docs/security.md.
+The text's check is against mistakes and carelessness: a determined attacker gets round it. What holds such a one, while the samples
+are tried, is the process's sandbox (:mod:`~worker.racer.rewards.sandbox`).
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
+import dataclasses
+import dis
+import functools
 import io
 import json
 import os
+import re
 import subprocess
 import sys
+import threading
 import tokenize
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import CodeType
+from typing import Any
 
 from shared_store.wording import nearest
-from worker.racer.rewards.problems import Problem, RewardRefused
-from worker.racer.rewards.samples import samples
+from worker.racer.rewards.namespaces import FILES, MODULES, NAMES, SUBMODULES
+from worker.racer.rewards.problems import KINDS, Problem, RewardRefused
+from worker.racer.rewards.samples import OVAL, Course
 
 LARGEST = 140_000
 """Characters of a file."""
-MODULES = ("math", "random", "numpy", "scipy", "shapely")
-"""Packages that may be imported."""
+MOST_TOKENS = 60_000
+"""Words, signs and lines of a file: what its parser takes time and memory for. The longest of 299 real files has 45,000."""
 SECONDS = 5.0
-"""For a call on one sample, and for the file's own statements with their imports [s]."""
+"""For a call on one sample; the file's own statements, with their imports, have four times as long [s]."""
+_LOOKS_UP = ("LOAD_NAME", "LOAD_GLOBAL", "LOAD_FROM_DICT_OR_GLOBALS")
+"""Instructions that look a name up among the built-in functions, too."""
+_MOST_COUNTED = 100_000_000
+"""Characters of a file that is too long; then the count ends."""
 _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
-NAMES = frozenset(
-    (  # noqa: SIM905
-        "open exec eval compile input breakpoint exit quit help globals locals vars dir getattr setattr delattr"
-    ).split()
-)
-"""Built-in functions that may not be named."""
+_MOST_SAID = 64 << 10
+"""Bytes that the process may answer."""
+Note = Callable[[str], object]
+"""Is called with a line for the user."""
 _SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())  # noqa: SIM905
-_FILES = frozenset(
-    (  # noqa: SIM905
-        "load save savez savez_compressed savetxt loadtxt fromfile tofile genfromtxt fromregex memmap "
-        "open_memmap DataSource dump dumps ctypeslib f2py distutils testing lib datasets system popen"
-    ).split()
-)
-"""Attributes of modules, and methods of arrays, that read or write files or start programs."""
-_SUBMODULES = {
-    "scipy.io",
-    "scipy.datasets",
-    "scipy.weave",
-    "numpy.ctypeslib",
-    "numpy.f2py",
-    "numpy.lib",
-    "numpy.testing",
-}
 _OWN = {"self", "cls"}
 
 
-def check(path: Path) -> Problem | None:
+def check(path: Path, courses: Sequence[Course] = (OVAL,), note: Note | None = None) -> Problem | None:
     """The first fault of a reward function in a file, or None.
 
     Args:
         path: The file.
+        courses: As of :func:`check_source`.
+        note: As of :func:`check_source`.
     """
     try:
-        return check_source(read_file(path), str(path))
+        return check_source(read_file(path), str(path), courses, note=note)
     except RewardRefused as refused:
         return refused.problem
 
@@ -74,46 +71,100 @@ def read_file(path: Path) -> str:
         RewardRefused: It can't be read, or is no text.
     """
     try:
-        with open(path, "rb") as opened:
-            data = opened.read(4 * LARGEST + 4)
+        with io.BufferedReader(io.FileIO(path), 1 << 20) as opened:
+            encoding, _ = tokenize.detect_encoding(io.BytesIO(opened.peek()).readline)
+            lines = io.TextIOWrapper(opened, encoding)
+            text = lines.read(LARGEST + 1)
+            if len(text) <= LARGEST:
+                return text
+            count = len(text)
+            while count <= _MOST_COUNTED and (part := lines.read(1 << 20)):
+                count += len(part)
     except OSError as error:
         told = f"the file can't be read: {error.strerror}"
         raise RewardRefused(Problem("TEST_FAILURE", told, str(path))) from error
-    try:
-        encoding, _ = tokenize.detect_encoding(io.BytesIO(data).readline)
-        return io.TextIOWrapper(io.BytesIO(data), encoding).read()
     except (SyntaxError, UnicodeDecodeError, LookupError) as error:
         told = f"the file is no text: {str(error).splitlines()[0]}"
         raise RewardRefused(Problem("SYNTAX_ERROR", told, str(path))) from error
+    raise RewardRefused(_too_long(count, str(path)))
 
 
-def check_source(source: str, file: str = "reward_function.py") -> Problem | None:
+def check_source(
+    source: str,
+    file: str = "reward_function.py",
+    courses: Sequence[Course] = (OVAL,),
+    *,
+    anyway: bool = False,
+    note: Note | None = None,
+) -> Problem | None:
     """:func:`check`, of a text.
 
     Args:
         source: The text.
         file: The name of its file, for messages.
+        courses: The job's tracks with their objects, on which it is tried.
+        anyway: Run it also where the sandbox does not hold: for a job's own node, which runs the function in any case.
+        note: Called with one line where the sandbox does not hold, and for a function that passes with objects alone, on a track without.
     """
-    return read(source, file) or try_out(source, file)
+    if problem := read(source, file):
+        return problem
+    notes: list[str] = []
+    found = (_fault_on(course, source, file, anyway, notes) for course in courses)
+    problem = next((each for each in found if each is not None), None)
+    if note is not None:
+        for line in dict.fromkeys(notes):
+            note(line)
+    return problem
 
 
+def _fault_on(course: Course, source: str, file: str, anyway: bool, notes: list[str]) -> Problem | None:
+    """The fault that a function has on a track; None where it passes one of the track's trials."""
+    first, *others = course.trials()
+    fault = try_out(source, file, first, anyway=anyway, note=notes.append)
+    if fault is not None and fault.message.startswith("the sample "):
+        fault = dataclasses.replace(fault, message=f"{fault.message}{course.where}")
+    if fault is None or fault.kind != "TEST_FAILURE":
+        return fault
+    for other in others:
+        if try_out(source, file, other, anyway=anyway, note=notes.append) is None:
+            place = f"{file}:{fault.line}" if fault.line else file
+            failing = (
+                f"it fails where there are no objects{', as in this job' if course.name else ''} ({fault.message})"
+            )
+            notes.append(
+                f"{place}: {failing}; it is valid, since it passes with objects, with which AWS tries it: add obstacles"
+            )
+            return None
+    return fault
+
+
+@functools.lru_cache(maxsize=16)
 def read(source: str, file: str) -> Problem | None:
     """Faults of the text itself, which is not run."""
     if len(source) > LARGEST:
-        return Problem("SYNTAX_ERROR", f"{len(source):,} characters; a reward function has at most {LARGEST:,}", file)
+        return _too_long(len(source), file)
+    if (tokens := len(re.findall(r"\w+|[^\w \t]", source))) > MOST_TOKENS:
+        told = f"{tokens:,} words, signs and lines; a reward function has at most {MOST_TOKENS:,}"
+        return Problem("SYNTAX_ERROR", told, file)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = ast.parse(source, file)
+            code = compile(tree, file, "exec", dont_inherit=True)
     except SyntaxError as error:
         return Problem("SYNTAX_ERROR", error.msg, file, error.lineno or 0)
     except (ValueError, RecursionError, MemoryError) as error:
         told = str(error) if isinstance(error, ValueError) else "it is nested too deeply"
         return Problem("SYNTAX_ERROR", told, file)
-    return next((Problem(kind, told, file, line) for kind, told, line in _findings(tree)), None)
+    return next((Problem(kind, told, file, line) for kind, told, line in _findings(tree, code)), None)
 
 
-def _findings(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
+def _too_long(count: int, file: str) -> Problem:
+    told = f"{count:,}" if count <= _MOST_COUNTED else f"more than {_MOST_COUNTED:,}"
+    return Problem("SYNTAX_ERROR", f"{told} characters; a reward function has at most {LARGEST:,}", file)
+
+
+def _findings(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]]:
     """Kind, message and line of all that is wrong, imports and names before the function itself."""
     nodes = sorted(ast.walk(tree), key=lambda node: getattr(node, "lineno", 0))
     imported: dict[str, str] = {}
@@ -121,12 +172,16 @@ def _findings(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
         if isinstance(node, ast.Import):
             imported |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
         yield from _import(node)
+    starred = any(isinstance(node, ast.ImportFrom) and node.names[0].name == "*" for node in nodes)
+    used = [*_unbound(code, NAMES | FILES if starred else NAMES, _bound(code))]
+    used += [(node.id, node.lineno) for node in nodes if isinstance(node, ast.Name) and node.id[:2] == "__"]
+    for name, line in sorted(used, key=lambda item: item[1]):
+        if name != "__name__":
+            yield "FORBIDDEN", f"{name} can't be used in a reward function", line
     for node in nodes:
-        if isinstance(node, ast.Name):
-            yield from _name(node)
-        elif isinstance(node, ast.Attribute):
+        if isinstance(node, ast.Attribute):
             yield from _attribute(node, imported)
-    yield from _function(tree)
+    yield from _function(tree, code)
 
 
 def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
@@ -148,18 +203,33 @@ def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
                 f"{name} can't be imported; a reward function may import {', '.join(MODULES)}",
                 node.lineno,
             )
-        elif any(name == each or name.startswith(f"{each}.") for each in _SUBMODULES) or "._" in name:
+        elif any(name == each or name.startswith(f"{each}.") for each in SUBMODULES) or "._" in name:
             yield "FORBIDDEN", f"{name} can't be used in a reward function", node.lineno
         for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-            if alias.name in _FILES | _SYSTEM or alias.name.startswith("_"):
+            if alias.name in FILES | _SYSTEM or alias.name.startswith("_"):
                 yield "FORBIDDEN", f"{name}.{alias.name} can't be used in a reward function", node.lineno
-            if alias.name == "*":
-                yield "IMPORT_ERROR", f"from {name} import *: name what you use", node.lineno
 
 
-def _name(node: ast.Name) -> Iterator[tuple[str, str, int]]:
-    if node.id in NAMES or (node.id.startswith("__") and node.id != "__name__"):
-        yield "FORBIDDEN", f"{node.id} can't be used in a reward function", node.lineno
+def _bound(code: CodeType, stores: tuple[str, ...] = ("STORE_NAME", "STORE_GLOBAL")) -> set[str]:
+    """The global names to which a file gives values, also in its functions."""
+    found = {each.argval for each in dis.get_instructions(code) if each.opname in stores}
+    return found.union(*(_bound(part, ("STORE_GLOBAL",)) for part in _parts(code)))
+
+
+def _unbound(code: CodeType, names: frozenset[str], bound: set[str]) -> Iterator[tuple[str, int]]:
+    """Uses of those of ``names`` that stand for built-in functions, with their lines: the compiler knows what is a variable."""
+    instructions = list(dis.get_instructions(code))
+    own = bound | {each.argval for each in instructions if each.opname == "STORE_NAME"}  # of a class
+    for each in instructions:
+        if each.opname in _LOOKS_UP and each.argval in names - own and each.positions:
+            yield each.argval, each.positions.lineno or 0
+    for part in _parts(code):
+        yield from _unbound(part, names, bound)
+
+
+def _parts(code: CodeType) -> list[CodeType]:
+    """The functions and classes right inside some code."""
+    return [each for each in code.co_consts if isinstance(each, CodeType)]
 
 
 def _attribute(node: ast.Attribute, imported: dict[str, str]) -> Iterator[tuple[str, str, int]]:
@@ -170,60 +240,128 @@ def _attribute(node: ast.Attribute, imported: dict[str, str]) -> Iterator[tuple[
     own = isinstance(node.value, ast.Name) and node.value.id in _OWN
     dunder = name.startswith("__") and name != "__init__"
     hidden = name.startswith("_") and not name.startswith("__") and not own
-    if dunder or hidden or name in _SYSTEM or name == "tofile" or (of_module and name in _FILES):
+    if dunder or hidden or name in _SYSTEM or name == "tofile" or (of_module and name in FILES):
         yield "FORBIDDEN", f"the attribute {name} can't be used in a reward function", node.lineno
 
 
-def _function(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
+def _function(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]]:
     found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "reward_function"]
-    if not found:
-        other = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
-        near = (
-            nearest("reward_function", other, "define it at the top level of the file")
-            if other
-            else "the file defines none"
-        )
-        yield "TEST_FAILURE", f"there is no def reward_function(params); {near}", 0
-        return
     if len(found) > 1:
-        yield (
-            "TEST_FAILURE",
-            f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}",
-            found[1].lineno,
-        )
-    arguments = found[0].args
-    given = [*arguments.posonlyargs, *arguments.args]
-    if len(given) != 1 or arguments.vararg or arguments.kwarg or arguments.kwonlyargs:
-        yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", found[0].lineno
+        told = f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}"
+        yield "TEST_FAILURE", told, found[1].lineno
+    for node in found:
+        if not _takes_one(node.args) and not node.decorator_list:
+            yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", node.lineno
+    if "reward_function" not in _bound(code):
+        near = "the file defines none"
+        if other := [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]:
+            near = nearest("reward_function", other, "define it at the top level of the file")
+        yield "TEST_FAILURE", f"there is no def reward_function(params); {near}", 0
 
 
-def try_out(source: str, file: str) -> Problem | None:
-    """Faults with sample inputs, found in a process of its own with limits."""
+def _takes_one(arguments: ast.arguments) -> bool:
+    """Whether a function can be called with one argument."""
+    names = len(arguments.posonlyargs) + len(arguments.args)
+    needed = names - len(arguments.defaults)
+    return needed <= 1 and (names > 0 or arguments.vararg is not None) and None not in arguments.kw_defaults
+
+
+def try_out(
+    source: str,
+    file: str,
+    samples: Mapping[str, Any],
+    *,
+    anyway: bool = False,
+    note: Note | None = None,
+) -> Problem | None:
+    """Faults with sample inputs, found in a process of its own with limits. Other arguments as of :func:`check_source`.
+
+    Args:
+        source: The text.
+        file: The name of its file.
+        samples: By name.
+        anyway: Run it without a sandbox.
+        note: Called with one line.
+
+    The process may be in the hands of an attacker: its answer is bounded, and can say nothing but a fault of this function.
+    """
     root = str(Path(__file__).parents[3])
-    asked = {"source": source, "file": file, "samples": samples(), "seconds": SECONDS, "root": root}
-    command = [sys.executable, "-I", "-B", str(Path(__file__).with_name("trial.py"))]
-    try:
-        ended = subprocess.run(
-            command, input=json.dumps(asked), capture_output=True, text=True, timeout=_PATIENCE, env=environment()
+    asked = {
+        "source": source,
+        "file": file,
+        "samples": samples,
+        "seconds": SECONDS,
+        "root": root,
+        "anyway": anyway,
+    }
+    answer, errors, code = _answer(json.dumps(asked).encode())
+    lines = [line for each in answer.decode(errors="replace").splitlines() if (line := _read_line(each))]
+    unconfined = next((str(line["unconfined"]) for line in lines[:1] if "unconfined" in line), "")
+    if unconfined and note is not None:
+        fate = (
+            "the function is not kept from this job's files" if anyway else "it was not run: the job's own nodes try it"
         )
-    except subprocess.TimeoutExpired as error:
-        said = error.stdout.decode() if isinstance(error.stdout, bytes) else error.stdout or ""
-        return Problem("TIMEOUT", f"{_last(said)} did not end within {_PATIENCE:g} s", file)
-    lines = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
-    if lines and "kind" in lines[-1]:
-        found = lines[-1]
-        return Problem(found["kind"], found["message"], file, found["line"]) if found["kind"] else None
+        note(f"{file}: no sandbox, since {unconfined}; {fate}")
+    if unconfined and not anyway:
+        return None
+    if code is None:
+        return Problem("TIMEOUT", f"{_last(lines)} did not end within {_PATIENCE:g} s", file)
     if not lines:
-        told = " ".join(ended.stderr.split())[-300:]
+        told = " ".join(errors.decode(errors="replace").split())[-300:]
         return Problem("TEST_FAILURE", f"the process that tries the function did not start: {told}", file)
-    cause = f"signal {-ended.returncode}" if ended.returncode < 0 else f"exit code {ended.returncode}"
-    return Problem("TEST_FAILURE", f"{_last(ended.stdout)} ended the process ({cause})", file)
+    found = lines[-1]
+    if found.get("kind") == "":
+        return None
+    if found.get("kind") in KINDS and isinstance(found.get("line"), int):
+        return Problem(found["kind"], " ".join(str(found.get("message")).split()), file, found["line"])
+    cause = f"signal {-code}" if code < 0 else f"exit code {code}"
+    return Problem("TEST_FAILURE", f"{_last(lines)} ended the process ({cause})", file)
 
 
-def _last(said: str) -> str:
+def _answer(asked: bytes) -> tuple[bytes, bytes, int | None]:
+    """What the process wrote, its errors, and its exit code; None: it did not end in time."""
+    late = threading.Event()
+
+    def expire() -> None:
+        late.set()
+        process.kill()
+
+    with subprocess.Popen(
+        [sys.executable, "-I", "-B", str(Path(__file__).with_name("trial.py"))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment(),
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+        timer = threading.Timer(_PATIENCE, expire)
+        timer.start()
+        try:
+            with contextlib.suppress(BrokenPipeError), process.stdin:
+                process.stdin.write(asked)
+            said = process.stdout.read(_MOST_SAID)
+            if len(said) == _MOST_SAID:
+                process.kill()
+            errors = process.stderr.read(_MOST_SAID)
+            code = process.wait()
+        finally:
+            timer.cancel()
+            process.kill()
+    return said, errors, None if late.is_set() else code
+
+
+def _read_line(line: str) -> dict[str, Any]:
+    """A line of the answer; nothing where it is none."""
+    try:
+        said = json.loads(line)
+    except (ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+def _last(lines: list[dict[str, Any]]) -> str:
     """The last step that the process reported."""
-    lines = [json.loads(line) for line in said.splitlines() if line.startswith('{"trying"') and line.endswith("}")]
-    return str(lines[-1]["trying"]) if lines else "the file"
+    return next((str(line["trying"]) for line in reversed(lines) if "trying" in line), "the file")
 
 
 def environment() -> dict[str, str]:

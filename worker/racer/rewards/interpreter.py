@@ -1,12 +1,13 @@
 """A process of the pool: calls a reward function for its share of the cars, a step at a time.
 
 Run by its path, in isolated mode. The first line of standard input is a JSON object (``source``, ``file``, ``seconds``, ``memory``,
-``root``, ``worlds``, ``first``, ``last``, ``tracks``, ``shared``: the descriptor of the shared memory); then each line is a step. Each
-line of standard output answers one: a JSON list of failures (message, line, car, how many).
+``root``, ``worlds``, ``first``, ``last``, ``tracks``, ``shared``: the descriptor of the shared memory); then each line is a step, or
+``anew``: every car's function begins anew. Each line of standard output answers one: a JSON list of failures (message, line, car, how many).
 """
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import mmap
@@ -15,6 +16,9 @@ import sys
 import warnings
 from typing import Any, NoReturn
 
+ANEW = b"anew\n"
+_LOADING = 60.0
+"""For the statements of the file, with its imports on a loaded machine [s]."""
 _MOST_TOLD = 20
 """Different failures in an answer."""
 
@@ -23,7 +27,7 @@ def main() -> None:
     """Serve steps until standard input ends."""
     asked = json.loads(sys.stdin.buffer.readline())
     sys.path.append(asked["root"])
-    from worker.racer.rewards import confined, parameters
+    from worker.racer.rewards import confined, namespaces, parameters, problems
 
     warnings.simplefilter("ignore")
     steps, out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "w")
@@ -32,11 +36,11 @@ def main() -> None:
         os.dup2(nothing, descriptor)
     file, seconds, worlds = asked["file"], asked["seconds"], asked["worlds"]
     tracks = [[tuple(point) for point in track] for track in asked["tracks"]]
-    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")
+    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")  # its descriptor is closed, and its size sealed
     width, most, of_object = parameters.NUMBERS, parameters.MOST_OBJECTS, parameters.OBJECT_NUMBERS
     numbers, objects = shared[: worlds * width], shared[worlds * width : worlds * (width + most * of_object)]
     rewards = shared[worlds * (width + most * of_object) :]
-    car = -1
+    car, late = -1, ""
 
     def answer(what: Any) -> None:
         out.write(json.dumps(what) + "\n")
@@ -47,25 +51,55 @@ def main() -> None:
         os._exit(0)
 
     def expired(frame: Any) -> None:
-        end(f"the function did not return within {seconds:g} s", confined.line_of_frame(frame, file))
+        end(late, confined.line_of_frame(frame, file))
 
     def flooded() -> None:
         line = confined.line_of_frame(sys._getframe(), file)
         end(f"the function printed more than {confined.MOST_PRINTED >> 10} KiB of text in one call", line)
 
-    alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
-    confined.confine(asked["memory"])
-    with confined.printing(printed):
+    def load() -> list[namespaces.Car]:
+        """A function for each car."""
+        nonlocal car, late
+        car, late = -1, f"the statements of the file did not end within {_LOADING:g} s"
+        made: list[namespaces.Car] = []
+        gc.unfreeze()
+        gc.collect()
+        gc.disable()
         try:
-            alarm.set(60.0)  # imports, on a loaded machine
-            function = confined.load(asked["source"], file)
+            program = namespaces.Program(asked["source"], file)
+            for _ in cars:
+                printed.count = 0
+                alarm.set(_LOADING)
+                made.append(program.car())
             alarm.set(0)
         except BaseException as error:
-            end(confined.told_error(error), confined.line_of(error, file))
+            alarm.set(0)
+            told, count = confined.told_error(error), len(made)
+            if isinstance(error, MemoryError) and made:
+                made.clear()
+                gc.collect()
+                told = f"{told} after {count} of {len(cars)} copies, one for each car: shorten its tables or have fewer worlds"
+            end(told, confined.line_of(error, file))
+        gc.enable()
+        gc.freeze()  # what thousands of copies hold is not looked at again and again
+        late = f"the function did not return within {seconds:g} s"
+        return made
+
+    alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
+    # where it does not hold, the guard has told it
+    confined.confine(asked["memory"], keep=(steps.fileno(), out.fileno()))
+    cars = range(asked["first"], asked["last"])
+    with confined.printing(printed):
+        functions = load()
         answer([])
-        while steps.readline():
-            failures: dict[tuple[str, int], list[int]] = {}
-            for car in range(asked["first"], asked["last"]):
+        while request := steps.readline():
+            if request == ANEW:
+                functions.clear()
+                functions = load()
+                answer([])
+                continue
+            failures: dict[tuple[str, int], list[Any]] = {}
+            for car in cars:
                 row = numbers[car * width : (car + 1) * width].tolist()
                 start = car * most * of_object
                 count = int(row[parameters.OBJECT_COUNT])
@@ -77,16 +111,17 @@ def main() -> None:
                 result: Any = None
                 try:
                     alarm.set(seconds)
-                    result = function(params)
+                    result = functions[car - cars.start].call(params)
                     alarm.set(0)
                     told = confined.told_result(result)
                 except BaseException as error:
                     alarm.set(0)
                     told, line = confined.told_error(error), confined.line_of(error, file)
                 rewards[car] = math.nan if told else float(result)
-                if told and ((told, line) in failures or len(failures) < _MOST_TOLD):
-                    failures.setdefault((told, line), [car, 0])[1] += 1
-            answer([[told, line, *rest] for (told, line), rest in failures.items()])
+                kind = problems.alike(told), line
+                if told and (kind in failures or len(failures) < _MOST_TOLD):
+                    failures.setdefault(kind, [told, line, car, 0])[3] += 1
+            answer(list(failures.values()))
 
 
 if __name__ == "__main__":

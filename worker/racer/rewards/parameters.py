@@ -63,11 +63,11 @@ PARAMETERS = (
     ),
     Parameter("distance_from_center", "float", "one", "m", "Distance from the centre line", (0.0, None)),
     Parameter("is_left_of_center", "bool", "one", "", "Whether the car is on the left of the centre line"),
-    Parameter("is_reversed", "bool", "one", "", "Whether the car drives against the order of the waypoints"),
+    Parameter("is_reversed", "bool", "one", "", "Whether the car drives against the direction of the track"),
     Parameter("is_crashed", "bool", "one", "", "Whether the car has hit an object"),
     Parameter("is_offtrack", "bool", "one", "", "Whether no wheel is on the road"),
-    Parameter("progress", "float", "one", "%", "Share of the lap that is done", (0.0, 100.0)),
-    Parameter("steps", "int", "one", "", "Control steps since the episode began", (0, None)),
+    Parameter("progress", "float", "one", "%", "Share of the lap that is done", (-100.0, 100.0)),
+    Parameter("steps", "int", "one", "", "Control steps since the episode began", (1, None)),
     Parameter("speed", "float", "one", "m/s", "Speed that the action asks for", (0.0, 5.0)),
     Parameter(
         "steering_angle",
@@ -105,7 +105,9 @@ PARAMETERS = (
         documented=False,
     ),
     Parameter("sim_time", "float", "one", "s", "Time since the episode began", (0.0, None), documented=False),
-    Parameter("object_in_camera", "bool", "one", "", "Whether an object is in the camera's image", documented=False),
+    Parameter(
+        "object_in_camera", "bool", "one", "", "Whether the next object is in the camera's image", documented=False
+    ),
     Parameter("waypoints", "float", "waypoints", "m", "The centre line, a point after the other", points=True),
     Parameter("objects_location", "float", "objects", "m", "Where the objects are", points=True),
     Parameter(

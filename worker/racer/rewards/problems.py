@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from worker.errors import UserError
 
+LARGEST_REWARD = 1e5
+"""Rewards are from minus this to this, as in AWS's check and in its simulator."""
 KINDS = ("SYNTAX_ERROR", "IMPORT_ERROR", "FORBIDDEN", "TEST_FAILURE", "TIMEOUT")
 
 
@@ -57,6 +60,16 @@ class Failure:
 
     count: int
     car: int
+
+
+def out_of_range(value: float) -> str:
+    """The fault of a reward beyond :data:`LARGEST_REWARD`."""
+    return f"it returned {value:.9g}; a reward is from {-LARGEST_REWARD:,.0f} to {LARGEST_REWARD:,.0f}, as on AWS"
+
+
+def alike(message: str) -> str:
+    """A failure's message without its numbers: failures that differ in these alone count as one."""
+    return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", message)
 
 
 def one_line(error: BaseException, most: int = 200) -> str:

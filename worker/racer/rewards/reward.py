@@ -9,11 +9,13 @@ from typing import Any
 
 import warp as wp
 
-from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
+from worker.racer.rewards.compiled import failures_of, kernels, race_arrays, warp_function
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
-from worker.racer.rewards.problems import Failure, RewardRefused, one_line
+from worker.racer.rewards.problems import Failure, Problem, RewardFailed, RewardRefused, one_line
+from worker.racer.rewards.samples import OVAL, Course
 from worker.racer.rewards.translation import Outside, translate
+from worker.racer.rewards.translation.prelude import ERRORS, LOOP
 from worker.racer.rewards.workers import Workers
 
 
@@ -22,12 +24,13 @@ class RewardFunction:
 
     Args:
         source: Text of its file.
-        tracks: Waypoints of each track [m].
+        tracks: Waypoints of each track, or of each track and direction [m]; the cars' rows say which line is theirs.
         worlds: How many cars there are.
         device: Where the arrays are, such as ``cuda:0``.
         file: Name of the file, in messages.
         compiled: False: in Python workers, even if it could be compiled.
         processes: How many Python workers; by default as many as there are processors.
+        courses: On which the guard tries it.
 
     Attributes:
         race: The arrays that a step fills before the call (:class:`worker.racer.rewards.compiled.RaceArrays`).
@@ -51,14 +54,16 @@ class RewardFunction:
         *,
         compiled: bool = True,
         processes: int | None = None,
+        courses: tuple[Course, ...] = (OVAL,),
     ) -> None:
-        if problem := checked(source, file):
+        if problem := checked(source, file, courses)[0]:
             raise RewardRefused(problem)
         self.file = file
         self.function: Any = None
         self.reason = "" if compiled else "Python workers were asked for"
         self.notes: tuple[str, ...] = ()
         self._kernel: Any = None
+        self._told: dict[int, str] = {}
         if compiled:
             self.function, self._kernel, self.reason, self.notes = compiled_function(source, file, device)
         self.race = race_arrays(worlds, tracks, device)
@@ -99,19 +104,30 @@ class RewardFunction:
         """The calls that gave no reward so far, by their message, the most frequent first. Waits for the device.
 
         A compiled function keeps of each car its last error and the number of all: they count under the last one.
+
+        Raises:
+            RewardFailed: A call of the compiled function would not have returned.
         """
         if self._workers is not None:
             found = self._workers.failures
         else:
-            errors = told_errors(self.race.errors.numpy())
-            found = {f"{self.file}: {told}": failure for told, failure in errors.items()}
+            found = {}
+            for code, (told, failure) in failures_of(self.race).items():
+                if code % 16 == LOOP:
+                    raise RewardFailed(f"{self.file}:{code // 16}: car {failure.car}: {ERRORS[LOOP]}")
+                found[f"{self.file}: {self._told.setdefault(code, told)}"] = failure
         return dict(sorted(found.items(), key=lambda item: -item[1].count))
 
-    def forget_failures(self) -> None:
-        """Begin to count failures anew."""
+    def begin_anew(self) -> None:
+        """Forget all failures, and all that the cars' functions remember.
+
+        Raises:
+            RewardFailed: The Python workers can't load the file again.
+        """
         self.race.errors.zero_()
+        self._told.clear()
         if self._workers is not None:
-            self._workers.failures.clear()
+            self._workers.begin_anew()
 
     def close(self) -> None:
         """End the Python workers."""
@@ -119,8 +135,11 @@ class RewardFunction:
             self._workers.close()
 
 
-checked = functools.lru_cache(maxsize=64)(check_source)
-"""The guard, asked once in a process for each function."""
+@functools.lru_cache(maxsize=64)
+def checked(source: str, file: str, courses: tuple[Course, ...] = (OVAL,)) -> tuple[Problem | None, tuple[str, ...]]:
+    """The guard's answer on a job's own node, asked once in a process for each function, with its warnings, a line each."""
+    notes: list[str] = []
+    return check_source(source, file, courses, anyway=True, note=notes.append), tuple(notes)
 
 
 def compiled_function(source: str, file: str, device: str) -> tuple[Any, Any, str, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Sample inputs of reward functions: cars, and objects, placed on an oval that is computed here."""
+"""Sample inputs of reward functions: cars, and objects, placed on the tracks of a job, or on an oval that is computed here."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from worker.racer.rewards.parameters import BY_NAME, MOST_OBJECTS, PARAMETERS, P
 
 WIDTH = 1.07
 """Width of the oval's road [m]."""
+SIX = 6
+"""Objects with which AWS tries every function."""
 _CAR = 0.08
 """Half the width of a car [m]."""
 
@@ -34,27 +36,41 @@ class Placed:
 
 
 class Line:
-    """A closed centre line.
+    """A centre line.
 
     Args:
-        points: The first one is also the last one [m].
+        points: The first one of a closed line is also the last one [m].
+        widths: Of the road at each of them [m].
+        closed: Whether it is a loop.
 
     Attributes:
         points: As given.
+        closed: As given.
         starts: Way from the first point to each point [m].
         length: Of the whole line [m].
+        period: After which ways along it come back [m]; of an open line more than they are apart.
     """
 
-    def __init__(self, points: Sequence[Point]) -> None:
-        self.points = list(points)
+    def __init__(self, points: Sequence[Point], widths: Sequence[float] = (), closed: bool = True) -> None:
+        self.points, self.closed = list(points), closed
+        self.widths = list(widths) or [WIDTH] * len(points)
         self.starts = [0.0]
         for before, after in zip(self.points, self.points[1:], strict=False):
             self.starts.append(self.starts[-1] + math.dist(before, after))
         self.length = self.starts[-1]
+        self.period = self.length if closed else 2 * self.length
+
+    def on(self, way: float) -> float:
+        """A way along the line, which may be more than a lap: from the start, and no farther than the ends of an open line [m]."""
+        return way % self.length if self.closed else min(max(way, 0.0), self.length)
+
+    def width(self, way: float) -> float:
+        """Of the road [m]."""
+        return self.widths[self.at(way)[0]]
 
     def at(self, way: float) -> tuple[int, Point, float]:
         """The segment's number, the point and the direction [rad] at a way along the line, which may be more than a lap."""
-        way %= self.length
+        way = self.on(way)
         segment = max(index for index, start in enumerate(self.starts[:-1]) if start <= way)
         (x0, y0), (x1, y1) = self.points[segment], self.points[segment + 1]
         share = (way - self.starts[segment]) / max(self.starts[segment + 1] - self.starts[segment], 1e-9)
@@ -101,15 +117,15 @@ def sample(
         KeyError: There is no such key.
     """
     segment, (x, y), direction = line.at(car.way)
-    after = (segment + 1) % (len(line.points) - 1)
+    points, width = line.points, line.width(car.way)
     if is_reversed:
-        segment, after, direction = after, segment, direction + math.pi
+        segment, points, direction = len(points) - 2 - segment, points[::-1], direction + math.pi
     far = abs(car.offset)
     left = car.offset > 0.0
     poses = [line.at(each.way) for each in objects]
-    ahead = sorted(range(len(objects)), key=lambda index: (objects[index].way - car.way) % line.length)
+    ahead = sorted(range(len(objects)), key=lambda index: (objects[index].way - car.way) % line.period)
     params = {
-        "all_wheels_on_track": far + _CAR <= WIDTH / 2,
+        "all_wheels_on_track": far + _CAR <= width / 2,
         "x": x - car.offset * math.sin(direction),
         "y": y + car.offset * math.cos(direction),
         "heading": _degrees(direction + math.radians(car.turned)),
@@ -117,27 +133,25 @@ def sample(
         "is_left_of_center": left,
         "is_reversed": is_reversed,
         "is_crashed": False,
-        "is_offtrack": far - _CAR > WIDTH / 2,
-        "progress": 100.0 * (car.way % line.length) / line.length,
+        "is_offtrack": far - _CAR > width / 2,
+        "progress": 100.0 * line.on(car.way) / line.length,
         "steps": 1,
         "speed": car.speed,
         "steering_angle": 0.0,
         "track_length": line.length,
-        "track_width": WIDTH,
-        "closest_waypoints": [segment, after],
+        "track_width": width,
+        "closest_waypoints": [segment, segment + 1],
         "closest_objects": [ahead[-1], ahead[0]] if ahead else [0, 0],
-        "projection_distance": car.way % line.length,
+        "projection_distance": line.on(car.way),
         "sim_time": 0.0,
-        "object_in_camera": any((each.way - car.way) % line.length < 2.0 for each in objects),
-        "waypoints": list(line.points),
+        "object_in_camera": any((each.way - car.way) % line.period < 2.0 for each in objects),
+        "waypoints": list(points),
         "objects_location": [
             (px - each.offset * math.sin(angle), py + each.offset * math.cos(angle))
             for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
         ],
-        "objects_distance": [each.way % line.length for each in objects],
-        "objects_heading": [
-            _degrees(angle + math.radians(each.turned)) for each, (*_, angle) in zip(objects, poses, strict=True)
-        ],
+        "objects_distance": [line.on(each.way) for each in objects],
+        "objects_heading": [0.0] * len(objects),
         "objects_left_of_center": [each.offset > 0.0 for each in objects],
         "objects_speed": [each.speed for each in objects],
         "objects_distance_from_center": [abs(each.offset) for each in objects],
@@ -149,20 +163,78 @@ def sample(
     return {each.name: params[each.name] for each in PARAMETERS}
 
 
-def samples() -> dict[str, dict[str, Any]]:
-    """Sample inputs by name, on the oval: those with which the guard tries a function."""
-    line = Line(oval())
-    boxes = [Placed(7.0, 0.25), Placed(11.0, -0.25), Placed(15.5, 0.25)]
+@dataclass(frozen=True)
+class Course:
+    """A track of a job with its objects.
+
+    Attributes:
+        name: Of the track; empty: it is none of a job's.
+        points: As :class:`Line` has them.
+        widths: Of the road at each point [m].
+        closed: Whether it is a loop.
+        objects: On it.
+    """
+
+    name: str
+    points: tuple[Point, ...]
+    widths: tuple[float, ...] = ()
+    closed: bool = True
+    objects: tuple[Placed, ...] = ()
+
+    @property
+    def where(self) -> str:
+        """The end of a message: the track; empty where it is none of a job's."""
+        waypoints = len(self.points) - self.closed
+        return f", on track {self.name} with {waypoints} waypoints" if self.name else ""
+
+    def trials(self) -> list[dict[str, dict[str, Any]]]:
+        """Sample inputs with each of which a function may pass: with the job's objects, or without any, and as AWS tries it."""
+        if self.objects:
+            return [samples(self, self.objects)]
+        line = Line(self.points, self.widths, self.closed)
+        ways = [line.length * (number + 0.5) / SIX for number in range(SIX)]
+        six = [Placed(way, 0.25 * line.width(way) * (-1) ** number) for number, way in enumerate(ways)]
+        return [samples(self, () if self.name else None), samples(self, six)]
+
+
+OVAL = Course("", tuple(oval()))
+FINE_OVAL = Course("", tuple(oval(spacing=0.03)))
+"""In the place of tracks that are not known: no index of a waypoint that some track has is missing on it."""
+
+
+def samples(course: Course = OVAL, objects: Sequence[Placed] | None = None) -> dict[str, dict[str, Any]]:
+    """Sample inputs by name, with which the guard tries a function.
+
+    Args:
+        course: The track.
+        objects: On it in all samples; None: three boxes in those in which the car meets some.
+    """
+    line = Line(course.points, course.widths, course.closed)
+    share = line.length / Line(OVAL.points).length
+
+    def car(way: float, offset: float, turned: float, speed: float) -> Placed:
+        way *= share
+        return Placed(way, offset * line.width(way) / WIDTH, turned, speed)
+
+    boxes = [car(7.0, 0.25, 0, 0), car(11.0, -0.25, 0, 0), car(15.5, 0.25, 0, 0)] if objects is None else objects
+    others = objects or ()
+    off = car(12.0, 0.0, -55.0, 1.0)
+    off = Placed(off.way, -line.width(off.way) / 2 - 0.165, off.turned, off.speed)
+    before, at = car(6.4, 0.2, 3.0, 1.8), car(7.0, 0.25, 0.0, 0.5)
+    if boxes:
+        before = Placed(boxes[0].way - 0.6, before.offset, before.turned, before.speed)
+        at = Placed(boxes[0].way, boxes[0].offset, 0.0, 0.5)
+    finish = Placed(line.length - 0.01, 0.05, 2.0, 3.9)
     return {
-        "start": sample(line, Placed(0.02, 0.0, 0.0, 0.6)),
-        "straight": sample(line, Placed(1.5, 0.21, -8.0, 2.5), steps=40, sim_time=2.6, steering_angle=-12.0),
-        "curve": sample(line, Placed(6.1, -0.31, 15.0, 1.2), steps=95, sim_time=6.3, steering_angle=25.0),
-        "edge": sample(line, Placed(9.4, 0.5, 31.0, 3.0), steps=150, sim_time=10.0, steering_angle=-30.0),
-        "off-track": sample(line, Placed(12.0, -0.7, -55.0, 1.0), steps=171, sim_time=11.4, steering_angle=30.0),
-        "reversed": sample(line, Placed(3.3, 0.1, 5.0, 1.5), is_reversed=True, steps=60, sim_time=4.0),
-        "objects": sample(line, Placed(6.4, 0.2, 3.0, 1.8), boxes, steps=110, sim_time=7.3, steering_angle=10.0),
-        "crashed": sample(line, Placed(7.0, 0.25, 0.0, 0.5), boxes, is_crashed=True, steps=120, sim_time=8.0),
-        "finish": sample(line, Placed(line.length - 0.01, 0.05, 2.0, 3.9), progress=100.0, steps=310, sim_time=20.6),
+        "start": sample(line, Placed(0.02, 0.0, 0.0, 0.6), others),
+        "straight": sample(line, car(1.5, 0.21, -8.0, 2.5), others, steps=40, sim_time=2.6, steering_angle=-12.0),
+        "curve": sample(line, car(6.1, -0.31, 15.0, 1.2), others, steps=95, sim_time=6.3, steering_angle=25.0),
+        "edge": sample(line, car(9.4, 0.5, 31.0, 3.0), others, steps=150, sim_time=10.0, steering_angle=-30.0),
+        "off-track": sample(line, off, others, steps=171, sim_time=11.4, steering_angle=30.0),
+        "reversed": sample(line, car(3.3, 0.1, 5.0, 1.5), others, is_reversed=True, steps=60, sim_time=4.0),
+        "objects": sample(line, before, boxes, steps=110, sim_time=7.3, steering_angle=10.0),
+        "crashed": sample(line, at, boxes, is_crashed=True, steps=120, sim_time=8.0),
+        "finish": sample(line, finish, others, progress=100.0, steps=310, sim_time=20.6),
     }
 
 
@@ -190,4 +262,5 @@ def random_sample(line: Line, chance: random.Random) -> dict[str, Any]:
         steering_angle=chance.choice((-30.0, -15.0, 0.0, 15.0, 30.0, chance.uniform(-30.0, 30.0))),
         progress=chance.choice((chance.uniform(0.0, 100.0), 100.0)),
         is_crashed=chance.random() < 0.1,
+        objects_heading=[chance.uniform(-180.0, 180.0) for _ in objects],
     )

@@ -1,11 +1,14 @@
 """A pool of processes that call a reward function for all cars of a step: for functions that are not compiled.
 
+Each car has a copy of the file's own, as on AWS, where a process drives one car: what the function remembers is that car's.
+
 The arrays are in shared memory; a step costs one message to each process and one back.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import mmap
 import os
@@ -21,13 +24,16 @@ import numpy as np
 
 from worker.racer.rewards.confined import MEMORY
 from worker.racer.rewards.guard import environment
+from worker.racer.rewards.interpreter import ANEW
 from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
-from worker.racer.rewards.problems import Failure, RewardFailed
+from worker.racer.rewards.problems import Failure, RewardFailed, alike
 
 SECONDS = 2.0
 """For one call [s]."""
-_START = 120.0
-"""For a process to start and import what the function imports [s]."""
+_START, _COPY = 120.0, 5.0
+"""For a process to start and import what the function imports, and for the copy of a car [s]."""
+_MOST_SAID = 1 << 20
+"""Bytes of an answer."""
 
 
 class Workers:
@@ -48,6 +54,7 @@ class Workers:
         numbers: What the cars are told, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
         objects: Of their objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``, float32.
         failures: The calls that gave no reward so far, by their message.
+        processes: The processes; none once they are ended.
 
     Raises:
         RewardFailed: The file can't be loaded.
@@ -66,14 +73,18 @@ class Workers:
         count = processes or min(len(os.sched_getaffinity(0)), -(-worlds // 16))
         self.file, self._seconds, self._share = file, seconds, -(-worlds // count)
         cells = worlds * (NUMBERS + MOST_OBJECTS * OBJECT_NUMBERS + 1)
-        self._descriptor = os.memfd_create("rewards")
+        self._descriptor = os.memfd_create("rewards", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(self._descriptor, 4 * cells)
+        # shorter, it would kill those that have it mapped
+        fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
         shared = np.frombuffer(mmap.mmap(self._descriptor, 0), dtype=np.float32)
         self.numbers, rest = np.split(shared, [worlds * NUMBERS])
         self.objects, self._rewards = np.split(rest, [worlds * MOST_OBJECTS * OBJECT_NUMBERS])
         self.numbers = self.numbers.reshape(worlds, NUMBERS)
         self.objects = self.objects.reshape(worlds, MOST_OBJECTS, OBJECT_NUMBERS)
         self.failures: dict[str, Failure] = {}
+        self._first: dict[str, str] = {}
+        self._called = False
         asked = {
             "source": source,
             "file": file,
@@ -85,14 +96,25 @@ class Workers:
             "shared": self._descriptor,
         }
         firsts = range(0, worlds, self._share)
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self.processes: list[subprocess.Popen[bytes]] = []
         try:
             for first in firsts:
                 self._start({**asked, "first": first, "last": min(first + self._share, worlds)})
-            self._answers(_START)
+            self._answers(_START + _COPY * self._share)
         except BaseException:
             self.close()
             raise
+
+    def begin_anew(self) -> None:
+        """Forget all that the cars' functions remember, and the failures.
+
+        Raises:
+            RewardFailed: The file can't be loaded again. The pool is closed.
+        """
+        self.failures.clear()
+        if self._called:
+            self._called = False
+            self._ask(ANEW, _START + _COPY * self._share)
 
     def _start(self, asked: Mapping[str, Any]) -> None:
         process = subprocess.Popen(
@@ -102,7 +124,7 @@ class Workers:
             env=environment(),
             pass_fds=[self._descriptor],
         )
-        self._processes.append(process)
+        self.processes.append(process)
         assert process.stdin is not None
         process.stdin.write(json.dumps(asked).encode() + b"\n")
         process.stdin.flush()
@@ -115,24 +137,28 @@ class Workers:
         Raises:
             RewardFailed: A call does not return, floods its output or ends its process. The pool is closed.
         """
-        if not self._processes:
+        self._called = True
+        self._ask(b"\n", self._seconds * (self._share + 1) + 5.0)
+        return self._rewards.copy()
+
+    def _ask(self, line: bytes, patience: float) -> None:
+        if not self.processes:
             raise RewardFailed(f"{self.file}: the processes that call the reward function have ended")
         try:
-            for process in self._processes:
+            for process in self.processes:
                 assert process.stdin is not None
                 with contextlib.suppress(BrokenPipeError):  # its end is told when its answer is missing
-                    process.stdin.write(b"\n")
+                    process.stdin.write(line)
                     process.stdin.flush()
-            self._answers(self._seconds * (self._share + 1) + 5.0)
+            self._answers(patience)
         except BaseException:
             self.close()
             raise
-        return self._rewards.copy()
 
     def _answers(self, patience: float) -> None:
         """Wait for a line from each process."""
         until = time.monotonic() + patience
-        for number, process in enumerate(self._processes):
+        for number, process in enumerate(self.processes):
             line = self._line(process, number, until)
             said = json.loads(line)
             if isinstance(said, dict):
@@ -141,7 +167,8 @@ class Workers:
                 raise RewardFailed(f"{place}: {car}{said['message']}")
             for told, at, car, count in said:
                 place = f"{self.file}:{at}" if at else self.file
-                self.failures.setdefault(f"{place}: {told}", Failure(0, car)).count += count
+                first = self._first.setdefault(f"{at}: {alike(told)}", f"{place}: {told}")
+                self.failures.setdefault(first, Failure(0, car)).count += count
 
     def _line(self, process: subprocess.Popen[bytes], number: int, until: float) -> bytes:
         """An answer, whole."""
@@ -154,6 +181,8 @@ class Workers:
             if not poll.poll(max(0.0, 1000.0 * (until - time.monotonic()))):
                 raise RewardFailed(f"{self.file}: {cars}: the function did not return, and its process takes no signal")
             part = os.read(process.stdout.fileno(), 1 << 16)
+            if len(said) > _MOST_SAID:
+                raise RewardFailed(f"{self.file}: {cars}: the function's process answers without end")
             if not part:
                 code = process.wait()
                 cause = f"signal {-code}" if code < 0 else f"exit code {code}"
@@ -163,15 +192,15 @@ class Workers:
 
     def close(self) -> None:
         """End the processes."""
-        for process in self._processes:
+        for process in self.processes:
             process.kill()
-        for process in self._processes:
+        for process in self.processes:
             process.wait()
             for pipe in (process.stdin, process.stdout):
                 assert pipe is not None
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
-        self._processes = []
+        self.processes = []
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

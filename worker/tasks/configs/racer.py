@@ -132,7 +132,10 @@ class RacerConfig(TaskConfig):
     """Contents or path of a ``model_metadata.json``, or the list of actions alone; steering in degrees, speed in m/s."""
     reward_function: Annotated[
         Annotated[RewardFile | str | None, expecting("the path of a reward function")], from_mapping(RewardFile)
-    ] = field(default=None, metadata=kept_file("text", check="worker.racer.rewards", needs=("numpy", "scipy")))
+    ] = field(
+        default=None,
+        metadata=kept_file("text", "worker.racer.rewards", needs=("numpy", "scipy"), given=("track", "obstacles")),
+    )
     """Path of a file with ``def reward_function(params)``, which replaces all other rewards."""
     speed_lag: Amount = 0.2
     """Time constant of the speed's response [s]."""

@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from orchestrator.domain.attempt import Phase
-from orchestrator.domain.job import TRANSITIONS, Ending, NodeEnd, Status, check_transition, judge
+from orchestrator.domain.job import TRANSITIONS, Ending, NodeEnd, Status, check_transition, container_reason, judge
 
 S = Status
 LEGAL = {
@@ -124,3 +124,22 @@ def test_on_aws_only_the_main_node_matters_and_a_gang_never_goes_on_without_it()
         assert judge("ignore", 0, ends(main_code, *child_codes)) == alone
     for policy, main_code, child in itertools.product(("restart", "fail", "ignore"), (0, 1, 75, 137), (None, 0, 1, 75)):
         assert judge(policy, 0, ends(main_code, child)) is not None
+
+
+@pytest.mark.parametrize(
+    ("reason", "status_reason", "shown"),
+    [
+        (None, None, None),
+        ("done", "Essential container in task exited", None),
+        ("rank 0 exited with code 1: ValueError: x", "Essential container in task exited", None),
+        ("rank 1 was killed by SIGTERM", None, None),
+        ("container exited with code 2", None, None),
+        ("exit 0, outcome not written (OSError: x)", None, None),
+        *((f"{name}Error: x", None, f"{name}Error: x") for name in ("OutOfMemory", "CannotPullContainer")),
+        ("the supervisor died", "Host EC2 (instance a) terminated.", "Host EC2 (instance a) terminated."),
+    ],
+)
+def test_the_reason_of_a_container_is_the_one_that_aws_gives(
+    reason: str | None, status_reason: str | None, shown: str | None
+) -> None:
+    assert container_reason(reason, status_reason) == shown

@@ -181,13 +181,12 @@ def test_secrets_go_the_way_that_the_engine_declares(way: SecretValues, monkeypa
             several.check_secrets(["fake"], [CONTAINER], "default")
 
 
-def test_a_user_is_refused_by_an_engine_that_can_t_take_one_on() -> None:
-    gang = make_gang("job", "/store", 1, "fake/host", ["any"], [{"user": "1000"}])
-    refused = pytest.raises(EngineError, match="the fake engine runs jobs as the user of its nodes")
-    taken = nullcontext()
-    for traits, outcome in ((Traits(), refused), (Traits(users=True), taken), (Traits(images=True), taken)):
-        with served(traits) as several, outcome:
-            several.plan(gang)
+def test_a_user_is_passed_over_with_a_note_by_an_engine_that_can_t_take_one_on() -> None:
+    gang = make_gang("job", "/store", 2, "fake/host", ["any"], [{"user": "1000"}, {}])
+    note = "muster: user 1000 is not used: nodes run without the image, and the fake engine runs jobs as the user of its nodes"
+    for traits, notes in ((Traits(), [note, ""]), (Traits(users=True), ["", ""]), (Traits(images=True), ["", ""])):
+        with served(traits) as several:
+            assert [node.contract.note for node in several.plan(gang).nodes] == notes
 
 
 def test_a_handle_is_read_as_it_was_written() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import event, func, select
+from sqlalchemy import event, func, or_, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 from sqlalchemy.orm import Session
 
@@ -20,6 +20,7 @@ from orchestrator.persistence.gangs import Gangs
 from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of, record_owner
+from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 from shared_store.layout import Run, Store
 from tests.support.orchestrator.rows import job
@@ -210,3 +211,54 @@ def test_a_run_without_a_queue_exists_and_has_no_owner(session: Session, run: Ru
     (run.path / "run.json").write_bytes(content)
     assert known(owner_of(session, run)) == ("", None)
     assert known(record_owner(session, run, submitted(session, "a", "lab", 1))) == ("lab", "key lab")
+
+
+_CANCELLED, _TERMINATED, _LEFT = ("c", True), ("t", False), (None, False)
+
+
+@pytest.mark.parametrize(
+    ("children", "requests", "array", "ends"),
+    [
+        (["RUNNING", "RUNNING"], "c", _LEFT, [_LEFT, _LEFT]),
+        (["RUNNING", "RUNNING"], "ct", _TERMINATED, [_TERMINATED, _TERMINATED]),
+        (["RUNNING", "RUNNABLE"], "c", _CANCELLED, [_LEFT, _CANCELLED]),
+        (["RUNNING", "RUNNABLE"], "ct", _TERMINATED, [_TERMINATED, _CANCELLED]),
+        (["RUNNING", "RUNNABLE"], "ctc", _TERMINATED, [_TERMINATED, _CANCELLED]),
+        (["RUNNING", "RUNNABLE"], "tc", _TERMINATED, [_TERMINATED, _TERMINATED]),
+        (["PENDING", "SUBMITTED"], "c", _CANCELLED, [_CANCELLED, _CANCELLED]),
+        (["PENDING", "SUBMITTED"], "ct", _CANCELLED, [_CANCELLED, _CANCELLED]),
+        (["PENDING", "SUBMITTED"], "tc", _TERMINATED, [_TERMINATED, _TERMINATED]),
+        (["SUCCEEDED", "FAILED"], "tc", _LEFT, [_LEFT, _LEFT]),
+        (["SUCCEEDED", "STARTING"], "ct", _TERMINATED, [_LEFT, _TERMINATED]),
+    ],
+)
+def test_an_array_is_asked_to_end_by_the_request_that_asked_its_children(
+    tmp_path: Path, children: list[str], requests: str, array: object, ends: list[object]
+) -> None:
+    """``c``: cancelled, ``t``: terminated; each is sent twice, the second time with another reason."""
+    database = Database.at(tmp_path)
+    with database.session() as session:
+        session.add(job("a", kind="array", status="PENDING", array_size=2))
+        session.flush()
+        for index, status in enumerate(children):
+            session.add(job(f"a:{index}", kind="container", parent="a", array_index=index, status=status))
+        session.commit()
+        for request in requests:
+            for reason in (request, "again"):
+                ask_to_end(session, or_(Job.id == "a", Job.parent == "a"), reason, cancel=request == "c")
+        session.commit()
+        found = session.scalars(select(Job).order_by(Job.id).execution_options(populate_existing=True))
+        assert [(each.stop_reason, each.cancelled) for each in found] == [array, *ends]
+    database.close()
+
+
+def test_a_child_that_is_ended_alone_leaves_its_array_alone(tmp_path: Path) -> None:
+    database = Database.at(tmp_path)
+    with database.session() as session:
+        session.add_all([job("a", kind="array", status="PENDING"), job("a:0", parent="a"), job("a:1", parent="a")])
+        session.commit()
+        ask_to_end(session, Job.id == "a:1", "c", cancel=True)
+        session.commit()
+        found = session.scalars(select(Job).order_by(Job.id).execution_options(populate_existing=True))
+        assert [(each.stop_reason, each.cancelled) for each in found] == [_LEFT, _LEFT, _CANCELLED]
+    database.close()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.support.worker.racing import open_track
 from worker.racer import road
 from worker.racer.arithmetic import sine_cosine
 from worker.racer.bicycle import Motion, drive
@@ -51,7 +52,8 @@ def test_sines_are_made_of_nothing_but_operations_that_are_rounded_alike_everywh
 def test_the_measures_of_a_square_are_those_of_its_sides() -> None:
     track = square()
     assert (track.length, track.direction, len(track.center)) == (16.0, COUNTER_CLOCKWISE, 32)
-    assert track.width.min() == 1.0 and track.width.max() == pytest.approx(math.sqrt(2))  # the diagonal at a corner
+    # at a corner from the inner one to a side: the borders' nearest points, as in AWS's simulator
+    assert track.width.min() == 1.0 and track.width.max() == pytest.approx(math.hypot(0.5, 1.0))
     assert list(track.along[:4]) == [0.0, 0.5, 1.0, 1.5]
     assert track.rows().shape == (33, 6) and (track.rows()[0] == track.rows()[-1]).all()
 
@@ -66,9 +68,10 @@ def test_a_point_is_projected_onto_the_centre_line_and_the_width_between_waypoin
     np.testing.assert_allclose(found.heading, [0, math.pi / 2, math.pi, -math.pi / 2])
     np.testing.assert_allclose(degrees(found.heading), [0, 90, 180, -90])
     assert list(found.before) == [2, 13, 18, 30] and list(found.after) == [3, 14, 19, 31]
-    # from the corner, where the road is √2 wide, to the next waypoint: 2.5 from the middle, its borders are half as far apart
+    # from the corner to the next waypoint, beside the corner of the inner border
     found = project(square(), [[0.125, 0.0], [2.0, 0.3]])
-    np.testing.assert_allclose(found.width, [math.sqrt(2) + 0.25 * (1.25 - math.sqrt(2)), 1.0])
+    corner = math.hypot(0.5, 1.0)
+    np.testing.assert_allclose(found.width, [corner + 0.25 * (1.0 - corner), 1.0])
     found = project(square(), [[4.3, -0.4]])
     np.testing.assert_allclose(found.point, [[4, 0]], err_msg="the corner is the nearest point for a car outside it")
     assert found.distance[0] == pytest.approx(0.5) and not found.left[0]
@@ -81,17 +84,17 @@ def test_driving_backwards_reverses_left_progress_and_waypoints() -> None:
     np.testing.assert_allclose(found.along, [14.8, 9.4])
     np.testing.assert_allclose(np.abs(found.heading), [math.pi, math.pi / 2])
     assert found.heading[1] < 0
-    assert list(found.before) == [3, 14] and list(found.after) == [2, 13]
+    assert list(found.before) == [29, 18] and list(found.after) == [30, 19]
     mixed = project(square(), [[1.2, 0.3], [1.2, 0.3]], backwards=[False, True])
-    assert list(mixed.left) == [True, False] and list(mixed.before) == [2, 3]
+    assert list(mixed.left) == [True, False] and list(mixed.before) == [2, 29]
 
 
 def test_a_waypoint_that_the_car_has_reached_counts_as_the_one_behind() -> None:
     track = square()
     forth, back = project(track, track.center), project(track, track.center, backwards=True)
     rows = np.arange(32)
-    assert (forth.before == rows).all() and (forth.after == (rows + 1) % 32).all()
-    assert (back.before == rows).all() and (back.after == (rows - 1) % 32).all()
+    assert (forth.before == rows).all() and (forth.after == rows + 1).all()
+    assert (back.before == -rows % 32).all() and (back.after == back.before + 1).all()
     assert forth.along[0] == 0.0 and back.along[0] == 0.0
     assert not forth.left.any() and not back.left.any(), "on the line is not to the left of it"
 
@@ -107,7 +110,7 @@ def test_a_track_that_is_turned_round_is_the_track_driven_backwards(direction: s
     np.testing.assert_allclose(here.point, there.point, atol=1e-12)
     np.testing.assert_allclose(here.along, there.along, atol=1e-9)
     np.testing.assert_array_equal(here.left, there.left)
-    np.testing.assert_array_equal(here.before, -there.before % len(track.center))
+    np.testing.assert_array_equal(here.before, there.before)
     np.testing.assert_allclose(np.cos(here.heading - there.heading), 1)
 
 
@@ -156,7 +159,7 @@ def test_many_points_at_once_give_the_same_results_as_one() -> None:
     assert on_road(track, points)[2345] == on_road(track, points[2345])[0]
 
 
-TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3)]
+TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3), open_track()]
 
 
 @wp.struct

@@ -14,14 +14,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from shared_store.layout import Run
+from shared_store.layout import Run, Store
 from shared_store.races import race_changes, rules_of
 from tests.support.worker.loop import alone
-from tests.support.worker.racing import OVAL, counted, known, racer, straight
+from tests.support.worker.racing import OVAL, counted, known, open_track, racer, straight
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.evaluation import result_of
 from worker.evaluation.race import SIM_TRACE_COLUMNS, Laps, Race
 from worker.racer.geometry import place_at, project
+from worker.racer.naming import keep
 from worker.racer.resets import COUNTS
 from worker.racer.trace import COLUMNS
 from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
@@ -71,6 +72,18 @@ def test_a_lap_takes_as_long_as_its_control_steps_and_three_alike_take_three_tim
     headings = [float(line.split(",")[yaw]) for line in list(race.trials[0].sim_trace(0))[1:]]
     turned = np.diff(np.unwrap(np.radians(headings))).sum()
     assert turned == pytest.approx(2 * math.pi, abs=0.2), "once round, to the left, in degrees"
+
+
+def test_a_lap_of_an_open_track_is_timed_from_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keep(Store(tmp_path).open(), open_track(), {})
+    monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
+    _, played, race = drive(track="horseshoe", trials=2)
+    told = race.summary()
+    steps = int(played.lengths[0])
+    assert 0.9 * (open_track().length - 0.29) < 1.25 * steps / 15 < open_track().length
+    assert [(trial["status"], trial["completion"]) for trial in told["trials"]] == [("lap_complete", 100.0)] * 2
+    assert (told["completed"], told["best_lap"]) == (2, steps / 15)
+    assert (told["track"], told["direction"]) == (["horseshoe"], "open")
 
 
 def test_two_runs_of_a_race_are_the_same_bit_for_bit() -> None:

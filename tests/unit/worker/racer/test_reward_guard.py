@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import REPOSITORY
-from worker.racer.rewards import confined, guard
+from tests.support.worker.racing import round_the_guard
+from worker.racer.rewards import guard
 from worker.racer.rewards.__main__ import main
 from worker.racer.rewards.guard import check, check_source
 from worker.racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
@@ -38,6 +39,7 @@ def forbidden(line: int, what: str) -> str:
 MISTYPED = ": TEST_FAILURE: there is no def reward_function(params); did you mean reward?"
 TWICE = ":3: TEST_FAILURE: reward_function is defined 2 times; the first is in line 1"
 LONG = ": SYNTAX_ERROR: 140,045 characters; a reward function has at most 140,000"
+MANY = ": SYNTAX_ERROR: 120,015 words, signs and lines; a reward function has at most 60,000"
 BESIDE = ":1: IMPORT_ERROR: a reward function is one file: it can't import from beside it"
 ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_function(params)"
 
@@ -48,7 +50,8 @@ ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_fu
         ("def reward_function(params:\n    return 1\n", ":1: SYNTAX_ERROR: '(' was never closed"),
         (f"{HEAD}return 1\x00", ": SYNTAX_ERROR: source code string cannot contain null bytes"),
         ("x = " + "(" * 5000 + ")" * 5000, ":1: SYNTAX_ERROR: too many nested parentheses"),
-        (f"{HEAD}return {'1+' * 60_000}1", ": SYNTAX_ERROR: it is nested too deeply"),
+        (f"{HEAD}return {'1+' * 25_000}1", ": SYNTAX_ERROR: it is nested too deeply"),
+        (f"{HEAD}return 1.0\nx = 1{'<1' * 60_000}", MANY),
         (f"{HEAD}return 1.0\n#{'x' * 140_000}", LONG),
         (f"import os\n{HEAD}return 1", imports(1, "os")),
         (f"{HEAD}from subprocess import run\n    return 1", imports(2, "subprocess")),
@@ -64,18 +67,29 @@ ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_fu
         ("def reward(params):\n    return 1.0", MISTYPED),
         ("def reward_function(params, other):\n    return 1.0", ARGUMENTS),
         (f"{HEAD}return 1.0\n{HEAD}return 2.0", TWICE),
+        (f"{HEAD}break\n    return 1", ":2: SYNTAX_ERROR: 'break' outside loop"),
+        ("def reward_function(params, x, y=1):\n    return 1", ARGUMENTS),
+        (f"{HEAD}return float(len(dir(params)))", forbidden(2, "dir")),
+        (f"{HEAD}return max([1], key=vars)", forbidden(2, "vars")),
+        (f"def other():\n    dir = 1\n    return dir\n{HEAD}return len(dir())", forbidden(5, "dir")),
+        (
+            f"class A:\n    input = 1\n    x = input\n    def y(self): return input\n{HEAD}return [input for _ in 'a']",
+            forbidden(4, "input"),
+        ),
+        (f"from numpy import *\n{HEAD}return load('a')", forbidden(3, "load")),
+        ("from math import *\nx = 1", ": TEST_FAILURE: there is no def reward_function(params); the file defines none"),
     ],
 )
 def test_a_text_that_cannot_be_used_is_refused_without_running_it(
     source: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guard, "try_out", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr(guard, "try_out", lambda *_, **__: pytest.fail("it was run"))
     assert told(source) == f"r.py{message}"
 
 
 NONE = "it returned None; return a number on every way through the function"
 TRUTH = "it returned False, a truth value; return a number such as float(False)"
-CHANGED = "it changed params['objects_location']; copy what you change"
+LARGE = "it returned -100000.5; a reward is from -100,000 to 100,000, as on AWS"
 
 
 @pytest.mark.parametrize(
@@ -88,7 +102,13 @@ CHANGED = "it changed params['objects_location']; copy what you change"
         (1, "finish", "it returned inf; return a finite number", "return params['progress'] == 100 and 1e999 or 1"),
         (1, "start", "it returned a str; return a number", "return '1'"),
         (1, "start", "it returned a generator; return a number", "yield 1"),
-        (1, "objects", CHANGED, "params['objects_location'][0:] = []\n    return 1"),
+        (1, "start", LARGE, "return -100000.5"),
+        (
+            1,
+            "finish",
+            LARGE.replace("-100000.5", "1e+30"),
+            "return 1e28 * params['progress'] if params['progress'] == 100 else 1",
+        ),
         (2, "start", "it used more than 2 GiB of memory", "return len('x' * 10**10)"),
         (2, "start", "it calls itself too often (RecursionError)", "return reward_function(params)"),
     ],
@@ -107,11 +127,50 @@ def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_li
             "3: {}: the sample 'start' printed more than 64 KiB of text",
         ),
         (f"A = [][0]\n{HEAD}return 1", "1: {}: the module: IndexError: list index out of range"),
-        (f"{HEAD}break\n    return 1", "2: {}: the module: SyntaxError: 'break' outside loop (r.py, line 2)"),
+        ("reward_function = 1.0", ": {}: the module: TypeError: reward_function is a float, which can't be called"),
+        (
+            "A = 0\nif A:\n    reward_function = A",
+            ": {}: the module: NameError: the file defines no reward_function when it runs",
+        ),
     ],
 )
 def test_a_flood_of_text_and_an_error_of_the_module_are_refused_with_their_line(source: str, message: str) -> None:
-    assert told(source) == f"r.py:{message.format('TEST_FAILURE')}"
+    assert told(source) == f"r.py:{message.format('TEST_FAILURE')}".replace("::", ":")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            f"import numpy as np\n{HEAD}return len(np.ma.core.inspect.linecache.getlines('a'))",
+            "3: the sample 'start': inspect",
+        ),
+        (
+            f"import numpy as np\nbox = [np]\n{HEAD}box[0].savetxt('a', [])\n    return 1",
+            "4: the sample 'start': numpy.savetxt",
+        ),
+        (f"import scipy\nx = scipy\n{HEAD}return 1\nx.datasets", "5: the module: scipy.datasets"),
+        (
+            f"import numpy as np\n{HEAD}return np.random.get_bit_generator()",
+            "3: the sample 'start': numpy.random.get_bit_generator",
+        ),
+    ],
+)
+def test_a_module_outside_the_packages_and_a_function_for_files_are_refused_by_whatever_name(
+    source: str, message: str
+) -> None:
+    line, _, rest = message.partition(": ")
+    assert told(source) == f"r.py:{line}: FORBIDDEN: {rest} can't be used in a reward function"
+
+
+def test_what_the_packages_need_inside_themselves_works() -> None:
+    source = (
+        "import numpy as np, scipy\nfrom scipy import interpolate, spatial\ndef reward_function(params):\n"
+        "    near = spatial.cKDTree(params['waypoints']).query([params['x'], params['y']])[0]\n"
+        "    line = interpolate.interp1d([0.0, 1.0], [1.0, 3.0])(0.5) + scipy.spatial.distance.euclidean([0.0], [2.0])\n"
+        "    return float(np.emath.sqrt(4.0) + np.fft.fft([1.0]).real[0] + near + line + np.random.default_rng(1).random())\n"
+    )
+    assert told(source) == ""
 
 
 CATCHING = "while True:\n        try:\n            while True: pass\n        except: pass"
@@ -133,6 +192,14 @@ def test_a_function_that_loops_for_ever_is_refused_with_its_line(body: str, monk
         f"import math, random\n{HEAD}print('load', 'save', '__import__')\n    return random.random() + math.pi",
         "class A:\n    def __init__(self):\n        self.load = 1.0\nA1 = A()\ndef reward_function(params):\n    return A1.load\n",
         f"{HEAD}waypoints = list(params['waypoints'])\n    waypoints.append((0, 0))\n    return float(len(waypoints))",
+        f"{HEAD}params['waypoints'].append((0, 0))\n    params['speed'] = 1\n    return 1",
+        f"{HEAD}dir = params['heading']\n    return float(abs(dir))",
+        "help = 2.0\ndef vars(input, eval=1):\n    return input\ndef reward_function(params):\n    return vars(help, eval=2)",
+        "def reward_function(params, x=1, *rest, y=2, **more):\n    return x + y",
+        "reward_function = lambda params: params['speed']",
+        "from math import *\nreward_function = lambda params: hypot(3, 4) + pi",
+        "from numpy import *\ndef reward_function(params):\n    return float(sqrt(params['speed']))",
+        "class Reward:\n    def of(self, params):\n        return 1.0\nreward_function = Reward().of",
     ],
 )
 def test_a_valid_function_is_accepted_whatever_its_words(source: str) -> None:
@@ -144,8 +211,9 @@ def test_a_tried_function_writes_no_file_and_sees_no_secret(tmp_path: Path, monk
     kept = tmp_path / "kept.npy"
     monkeypatch.setattr(guard, "read", lambda *_: None)  # as one who gets round it would
     source = f"import os\n{HEAD}assert 'MUSTER_TOKEN' not in os.environ\n    open({str(kept)!r}, 'w').write('x' * 9999)\n    return 1"
-    assert told(source) == "r.py:4: TEST_FAILURE: the sample 'start': OSError: [Errno 27] File too large"
-    assert not kept.exists() or kept.stat().st_size == 0
+    denied = f"PermissionError: [Errno 1] Operation not permitted: {str(kept)!r}"
+    assert told(round_the_guard(source)) == f"r.py:4: TEST_FAILURE: the sample 'start': {denied}"
+    assert not kept.exists()
 
 
 def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
@@ -162,13 +230,17 @@ def test_the_command_reports_errors_or_the_mode_of_execution(
     good.write_text(f"{HEAD}print(1)\n    return params['speed']\n")
     slow.write_text(f"{HEAD}seen = []\n    seen.append({{}})\n    return 1.0\n")
     bad.write_text(f"{HEAD}return None\n")
-    monkeypatch.setattr(sys, "argv", ["rewards", str(good), str(slow), str(bad)])
+    long = tmp_path / "long.py"
+    long.write_text(f"{HEAD}return params['speed']\n{'#' * 21_000}\n")
+    monkeypatch.setattr(sys, "argv", ["rewards", str(good), str(slow), str(bad), str(long)])
     assert main() == 1
     said, errors = capsys.readouterr()
     assert said.splitlines() == [
         f"{good}: valid, compiled to the device",
         "  line 2: print() is left out",
         f"{slow}: valid; line 3: a list that grows: such functions run in Python workers",
+        f"{long}: valid, compiled to the device",
+        f"  {long.stat().st_size:,} bytes: a job keeps it in the store, not in its definition",
     ]
     assert errors.strip().endswith(NONE)
 
@@ -206,9 +278,7 @@ def test_the_page_has_the_table_of_the_contract_and_an_example_that_is_valid_and
     assert table() in page and told(source) == "" and translate(source).notes == ()
 
 
-def test_a_changed_parameter_is_named_and_nan_counts_as_unchanged() -> None:
-    nan = float("nan")
-    assert confined.changed({"a": [nan, (1, 2)]}, {"a": [nan, (1, 2)]}) == ""
-    assert confined.changed({"a": [1, (1, 2)]}, {"a": [1, (1, 3)]}) == "params['a'][1][1]"
-    assert confined.changed({"a": 1}, {"a": 1, "b": 2}) == "params"
-    assert confined.changed({"a": 1}, {"a": True}) == "params['a']"
+def test_the_characters_of_a_large_file_are_counted_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "large.py"
+    path.write_text("# é" + "x" * 5_000_000, encoding="utf-8")
+    assert str(check(path)) == f"{path}: SYNTAX_ERROR: 5,000,003 characters; a reward function has at most 140,000"

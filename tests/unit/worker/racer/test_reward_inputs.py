@@ -15,7 +15,7 @@ import torch
 
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
-from tests.support.worker.racing import known, racer
+from tests.support.worker.racing import known, racer, round_the_guard
 from worker.racer.geometry import on_road, project
 from worker.racer.rewards import parameters
 from worker.racer.rewards.problems import Failure, RewardFailed
@@ -102,7 +102,7 @@ def test_a_function_s_parameters_agree_with_the_track_s_geometry(driven: Racer) 
                 "is_reversed": way,
                 "is_crashed": False,
                 "is_offtrack": False,
-                "progress": 100 * max(0.0, float(known(driven, "travelled")[world])) / track.length,
+                "progress": 100 * float(known(driven, "travelled")[world]) / track.length,
                 "steps": steps,
                 "speed": commands[world][1],
                 "steering_angle": math.degrees(commands[world][0]),
@@ -113,7 +113,7 @@ def test_a_function_s_parameters_agree_with_the_track_s_geometry(driven: Racer) 
                 "projection_distance": found.along[0],
                 "sim_time": steps / 15,
                 "objects_distance": ways,
-                "objects_heading": [math.degrees(box[2]) for box in boxes],
+                "objects_heading": [0.0] * 3,
                 "objects_speed": [0.0] * 3,
                 "objects_distance_from_center": beside.distance.tolist(),
             }
@@ -121,7 +121,10 @@ def test_a_function_s_parameters_agree_with_the_track_s_geometry(driven: Racer) 
                 assert params[name] == pytest.approx(value, abs=2e-3, rel=1e-4), (name, world, step)
             assert np.allclose(params["objects_location"], boxes[:, :2], atol=1e-5)
             assert params["objects_left_of_center"][:2] == beside.left.tolist()[:2]  # the third stands on the line
-            assert np.allclose(params["waypoints"], np.vstack((track.center, track.center[:1])), atol=1e-5)
+            line = np.vstack((track.center, track.center[:1]))
+            assert np.allclose(params["waypoints"], line[::-1] if way else line, atol=1e-5)
+            behind, ahead = (np.array(params["waypoints"][index]) for index in params["closest_waypoints"])
+            assert (ahead - behind) @ [math.cos(found.heading[0]), math.sin(found.heading[0])] > 0
             assert set(params) == set(expected) | {
                 "objects_location", "objects_left_of_center", "waypoints", "object_in_camera",
             }  # fmt: skip
@@ -155,7 +158,8 @@ def test_a_compiled_function_earns_the_same_as_a_called_one(driven: Racer) -> No
     grows = STEER.replace("    total =", "    kept = []\n    kept.append(1)\n    total =")
     called = Racer(dataclasses.replace(config, reward_function=RewardFile("reward.py", grows)), 24, seed=3)
     grows = "reward.py: line 5: a list that grows: such functions run in Python workers"
-    assert called.waits_for_host and called.notes() == [grows]
+    copies = "each car has its own copy of the function and of what it remembers"
+    assert called.waits_for_host and called.notes() == [f"{grows}; {copies}"]
     driven.restart(3, 0)
     called.restart(3, 0)
     random = torch.Generator().manual_seed(8)
@@ -238,9 +242,11 @@ def test_a_path_is_read_where_the_worlds_are_built(tmp_path: Path) -> None:
 WORLDS = 9
 
 
-def pool(body: str, worlds: int = WORLDS, processes: int = 2, **options: Any) -> Workers:
+def pool(body: str, worlds: int = WORLDS, processes: int = 2, *, unguarded: bool = False, **options: Any) -> Workers:
     """Workers of a function whose statements are ``body``; car k drives at k m/s."""
     source = "def reward_function(params):\n" + "".join(f"    {line}\n" for line in body.split("\n"))
+    if unguarded:
+        source = round_the_guard(source, "reward.py")
     workers = Workers(source, "reward.py", [oval()], worlds, processes, **options)
     row, objects = parameters.row_of(samples()["objects"])
     workers.numbers[:] = row
@@ -267,6 +273,7 @@ def test_a_function_that_changes_its_parameters_changes_nothing_for_others() -> 
         assert workers.rewards().tolist() == workers.rewards().tolist() == [float(len(oval()))] * WORLDS
 
 
+RANGE = "a reward is from -100,000 to 100,000, as on AWS"
 NONE = "reward.py: it returned None; return a number on every way through the function"
 
 
@@ -277,6 +284,8 @@ NONE = "reward.py: it returned None; return a number on every way through the fu
         ("return None if params['speed'] == 3 else 1", NONE),
         ("return float('nan') if params['speed'] == 3 else 1", "reward.py: it returned nan; return a finite number"),
         ("return 'much' if params['speed'] == 3 else 1", "reward.py: it returned a str; return a number"),
+        ("return 100001 if params['speed'] == 3 else -1e5", f"reward.py: it returned 100001; {RANGE}"),
+        ("return 1e9 * params['speed'] if params['speed'] == 3 else 1", f"reward.py: it returned 3e+09; {RANGE}"),
         ("if params['speed'] == 3: [0] * 10**9\nreturn 1", "reward.py:2: it used more than 2 GiB of memory"),
         ("if params['speed'] == 3: raise SystemExit\nreturn 1", "reward.py:2: it ended the program (SystemExit)"),
     ],
@@ -301,7 +310,7 @@ def test_a_call_that_does_not_end_or_floods_ends_the_pool_with_its_line_and_car(
     body: str, line: int, message: str
 ) -> None:
     workers = pool(body, seconds=0.3)
-    processes = list(workers._processes)
+    processes = list(workers.processes)
     assert refusal(workers.rewards, error=RewardFailed) == f"reward.py:{line}: car 7: {message}"
     assert all(process.returncode is not None for process in processes)
     with pytest.raises(RewardFailed, match="have ended"):
@@ -310,7 +319,7 @@ def test_a_call_that_does_not_end_or_floods_ends_the_pool_with_its_line_and_car(
 
 def test_a_process_that_dies_is_reported_with_its_cars() -> None:
     workers = pool("return 1.0")
-    workers._processes[1].kill()
+    workers.processes[1].kill()
     with pytest.raises(RewardFailed, match=r"reward.py: cars 5 to 8: the process of the function ended \(signal 9\)"):
         workers.rewards()
 
@@ -321,10 +330,12 @@ def test_a_file_that_cannot_be_loaded_is_reported_at_the_start() -> None:
 
 
 def test_a_worker_keeps_no_file_and_starts_no_process(tmp_path: Path) -> None:
-    with pool(f"open({str(tmp_path / 'kept')!r}, 'w').write('text' * 5000)\nreturn 1.0", 1, 1) as workers:
+    writes = f"open({str(tmp_path / 'kept')!r}, 'w').write('text' * 5000)\nreturn 1.0"
+    with pool(writes, 1, 1, unguarded=True) as workers:
         assert math.isnan(workers.rewards()[0])
-        assert list(workers.failures) == ["reward.py:2: OSError: [Errno 27] File too large"]
-    assert not (tmp_path / "kept").exists() or (tmp_path / "kept").stat().st_size == 0
+        denied = f"PermissionError: [Errno 1] Operation not permitted: {str(tmp_path / 'kept')!r}"
+        assert list(workers.failures) == [f"reward.py:2: {denied}"]
+    assert not (tmp_path / "kept").exists()
 
 
 def test_workers_end_with_the_process_that_started_them() -> None:
@@ -332,7 +343,7 @@ def test_workers_end_with_the_process_that_started_them() -> None:
     child = os.fork()
     if child == 0:
         workers = pool("return 1.0", 2, 1)
-        os.write(writer, f"{workers._processes[0].pid}\n".encode())
+        os.write(writer, f"{workers.processes[0].pid}\n".encode())
         time.sleep(600)
     os.close(writer)
     with os.fdopen(reader) as said:

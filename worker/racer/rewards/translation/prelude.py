@@ -21,9 +21,10 @@ ERRORS = {
     11: "ValueError: min() or max() of nothing",
     12: "KeyError: no such key",
     13: "ValueError: range() steps by 0",
+    14: "the reward is too large",
 }
 """Errors of a compiled function: the number in ``errors``, less 16 times the line."""
-ZERO, DOMAIN, OVERFLOW, INDEX, LOOP, NOT_FINITE, NO_INT, COMPLEX, UNBOUND, NO_RESULT, EMPTY, KEY, STEP = ERRORS
+ZERO, DOMAIN, OVERFLOW, INDEX, LOOP, NOT_FINITE, NO_INT, COMPLEX, UNBOUND, NO_RESULT, EMPTY, KEY, STEP, BEYOND = ERRORS
 MOST_ROUNDS = 1_000_000
 """Times that the loops of one call go round at most: a kernel that never ends would take the device with it."""
 

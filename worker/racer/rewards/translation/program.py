@@ -86,6 +86,7 @@ class Program:
         self.notes: list[str] = []
         self._texts: dict[str, int] = {}
         self._constants: dict[str, str] = {}
+        self._starred: set[str] = set()
         self._count = self._work = 0
         for statement in tree.body:
             _check_harmless(statement)
@@ -198,11 +199,17 @@ class Program:
                 module = alias.name if alias.asname else name
                 self._name(name, Thing("module", module, statement))
         elif isinstance(statement, ast.ImportFrom):
-            for alias in statement.names:
-                value: Value = Thing("builtin", f"{statement.module}.{alias.name}", statement)
-                if statement.module == "math" and alias.name in CONSTANTS:
-                    value = self.wrap(CONSTANTS[alias.name], statement)
-                self._name(alias.asname or alias.name, value)
+            names = {alias.asname or alias.name: alias.name for alias in statement.names}
+            if starred := "*" in names:
+                if statement.module != "math":
+                    raise Outside(statement, f"from {statement.module} import *")
+                names = {name: name for name in vars(math) if not name.startswith("_")}
+            for name, original in names.items():
+                value: Value = Thing("builtin", f"{statement.module}.{original}", statement)
+                if statement.module == "math" and original in CONSTANTS:
+                    value = self.wrap(CONSTANTS[original], statement)
+                self._name(name, value)
+            self._starred |= set(names) if starred else set()
         elif isinstance(statement, ast.ClassDef):
             self._name(statement.name, Thing("refused", f"the class {statement.name}", statement))
         elif isinstance(statement, ast.Assign | ast.AnnAssign | ast.AugAssign):
@@ -238,8 +245,9 @@ class Program:
                     self._name(name.id, kept)
 
     def _name(self, name: str, value: Value) -> None:
-        if name in self.names:
+        if name in self.names and name not in self._starred:
             value = Thing("refused", f"{name}, which the module sets more than once", getattr(value, "node", None))
+        self._starred.discard(name)
         self.names[name] = value
 
     def constant(self, node: ast.expr) -> Any:

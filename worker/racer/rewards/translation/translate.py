@@ -6,8 +6,9 @@ import ast
 from dataclasses import dataclass
 
 from worker.racer.rewards.parameters import TRACK
+from worker.racer.rewards.problems import LARGEST_REWARD, out_of_range
 from worker.racer.rewards.translation.body import Body
-from worker.racer.rewards.translation.prelude import ERRORS, MOST_ROUNDS, NOT_FINITE, used
+from worker.racer.rewards.translation.prelude import BEYOND, ERRORS, MOST_ROUNDS, NOT_FINITE, used
 from worker.racer.rewards.translation.program import Program
 from worker.racer.rewards.translation.values import C_TYPES, Outside, Thing, described
 
@@ -43,13 +44,12 @@ def translate(source: str) -> Translated:
 def _translate(tree: ast.Module) -> Translated:
     program = Program(tree)
     main = program.names.get("reward_function")
-    if not isinstance(main, Thing) or main.kind != "function" or not isinstance(main.node, ast.FunctionDef):
+    if not isinstance(main, Thing) or main.kind != "function":
         raise Outside(getattr(main, "node", None) or 1, "a reward_function that is no plain function")
-    if main.node.decorator_list:
-        raise Outside(main.node, "a decorated function")
-    names = [each.arg for each in (*main.node.args.posonlyargs, *main.node.args.args)]
-    program.running.append(main.node)
-    body = Body(program, main.node, {names[0]: Thing("params", "params")}, None)
+    call = ast.parse("lambda params: reward_function(params)", mode="eval").body
+    assert isinstance(call, ast.Lambda)
+    ast.increment_lineno(call, main.node.lineno - 1)
+    body = Body(program, call, {"params": Thing("params", "params")}, None)
     if body.result not in ("int", "float"):
         found = "nothing" if body.result is None else described(body.result)
         raise Outside(main.node, f"a reward_function that returns {found}")
@@ -75,15 +75,18 @@ def _translate(tree: ast.Module) -> Translated:
         f"auto reward_function = [&]() -> {body.returns} {{",
         *body.text,
         "};",
-        "const float reward = (float)reward_function();",
+        "const double reward = (double)reward_function();",
         f"if (!py_finite(reward)) py_fail({NOT_FINITE});",
+        f"if (::fabs(reward) > {LARGEST_REWARD!r}) {{ py_fail({BEYOND}); wp::index(race.values, world) = (float)reward; }}",
         "if (error) { wp::index(race.errors, world, 0) = error; wp::index(race.errors, world, 1) += 1; return (float)NAN; }",
-        "return reward;",
+        "return (float)reward;",
     ]
     return Translated("\n".join(lines) + "\n", tuple(program.notes))
 
 
-def told(code: int) -> str:
-    """The meaning of an entry of ``errors``, in one line."""
+def told(code: int, value: float) -> str:
+    """The meaning of an entry of ``errors``, in one line; ``value`` is that of the reward, where it was too large."""
     line, kind = divmod(code, 16)
+    if kind == BEYOND:
+        return out_of_range(value)
     return f"line {line}: {ERRORS[kind]}" if line else ERRORS[kind]

@@ -1,0 +1,167 @@
+"""The samples of a reward function's check: they come from the tracks and obstacles of its job."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shared_store.layout import Store
+from tests.support.refusals import refusal
+from tests.support.worker.racing import OVAL, open_track, racer
+from worker.racer.circuit import circuit_of
+from worker.racer.geometry import on_road, project
+from worker.racer.naming import keep, resolve
+from worker.racer.presets import make_preset
+from worker.racer.rewards.__main__ import main
+from worker.racer.rewards.courses import courses_for, courses_of
+from worker.racer.rewards.guard import check_source
+from worker.racer.rewards.parameters import row_of
+from worker.racer.rewards.samples import FINE_OVAL
+from worker.tasks.configs.racer import ObstacleConfig, RewardFile
+
+NEXT = """def reward_function(params):
+    _, ahead = params["closest_objects"]
+    gap = params["objects_distance"][ahead] - params["projection_distance"]
+    return 0.2 if 0.0 < gap < 0.8 else 1.0
+"""
+FAR = "def reward_function(params):\n    return params['waypoints'][140][0]\n"
+BOXES = (ObstacleConfig(2.0, "inner"), ObstacleConfig(8.0, "outer"), ObstacleConfig(9.5, "center"))
+
+
+def told(source: str, *names: str, boxes: tuple[ObstacleConfig, ...] = ()) -> tuple[str, list[str]]:
+    """The guard's answer on these tracks, and its notes."""
+    notes: list[str] = []
+    courses = courses_of(circuit_of([resolve(name, None) for name in names], boxes))
+    return str(check_source(source, "r.py", courses, anyway=True, note=notes.append) or ""), [
+        note for note in notes if "no sandbox" not in note
+    ]
+
+
+def test_a_function_that_needs_objects_is_valid_with_the_job_s_and_noted_without() -> None:
+    assert told(NEXT, "oval", boxes=BOXES) == ("", [])
+    problem, (note,) = told(NEXT, "oval")
+    assert problem == "" and note == (
+        "r.py:3: it fails where there are no objects, as in this job (the sample 'start': IndexError: list index out of range, "
+        "on track oval with 133 waypoints); it is valid, since it passes with objects, with which AWS tries it: add obstacles"
+    )
+    broken = NEXT.replace('["closest_objects"]', '["closest_object"]')
+    assert told(broken, "oval") == (
+        "r.py:2: TEST_FAILURE: the sample 'start': KeyError: 'closest_object', on track oval with 133 waypoints",
+        [],
+    )
+
+
+def test_a_function_that_fails_with_objects_is_valid_in_a_job_without() -> None:
+    many = "def reward_function(params):\n    return 1.0 / (3 - len(params['objects_speed']))\n"
+    assert told(many, "oval") == ("", [])
+    problem, _ = told(many, "oval", boxes=BOXES)
+    assert (
+        problem
+        == "r.py:2: TEST_FAILURE: the sample 'start': ZeroDivisionError: float division by zero, on track oval with 133 waypoints"
+    )
+
+
+def test_a_waypoint_that_the_job_s_track_has_may_be_asked_for() -> None:
+    assert told(FAR, "chicane") == ("", [])
+    problem = "r.py:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track oval with 133 waypoints"
+    assert told(FAR, "oval")[0] == told(FAR, "chicane", "oval")[0] == problem
+    assert check_source(FAR, "r.py", [FINE_OVAL], anyway=True) is None
+
+
+def test_of_tracks_that_are_drawn_one_is_tried_and_of_others_each() -> None:
+    names = ("random:3", "oval", "random:4", "oval", "chicane")
+    courses = courses_of(circuit_of([resolve(name, None) for name in names], ()))
+    assert [course.name for course in courses] == ["random:3", "oval", "chicane"]
+
+
+@pytest.mark.parametrize(
+    "track",
+    [OVAL, make_preset("chicane", direction="clockwise", width=0.6), open_track(), open_track().turned_round()],
+    ids=["oval", "clockwise", "open", "open, back"],
+)
+@pytest.mark.parametrize("boxes", [(), BOXES], ids=["without", "with"])
+def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[ObstacleConfig, ...]) -> None:
+    circuit = circuit_of([track], boxes)
+    (course,) = courses_of(circuit)
+    trials = course.trials()
+    assert [len(each["start"]["objects_speed"]) for each in trials] == ([3] if boxes else [0, 6])
+    for samples in trials:
+        for name, params in samples.items():
+            back = params["is_reversed"]
+            found = project(track, [[params["x"], params["y"]]], back)
+            assert params["distance_from_center"] == pytest.approx(found.distance[0], abs=0.04), name
+            assert params["track_width"] == pytest.approx(found.width[0], abs=0.03)
+            assert params["is_offtrack"] == (name == "off-track")
+            assert on_road(track, [[params["x"], params["y"]]])[0] == (name != "off-track"), name
+            np.testing.assert_array_equal(params["waypoints"], track.line())
+            assert max(params["closest_waypoints"]) < len(params["waypoints"])
+            places = np.array(params["objects_location"]).reshape(-1, 2)
+            there = project(track, places)
+            np.testing.assert_allclose(there.along, params["objects_distance"], atol=0.06)
+            np.testing.assert_array_equal(
+                there.left[there.distance > 0.01],
+                np.array(params["objects_left_of_center"], bool)[there.distance > 0.01],
+            )
+            if boxes:
+                np.testing.assert_allclose(places, circuit.obstacle_poses[0, :, :2], atol=0.05)
+            row_of(params)
+
+
+def test_the_command_tries_the_tracks_that_it_finds_and_says_which_it_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keep(Store(tmp_path / "store").open(), make_preset("oval", "short", length=12.0), {})
+    file = tmp_path / "far.py"
+    file.write_text(FAR)
+
+    def run(config: Any, *more: str) -> tuple[int, list[str]]:
+        monkeypatch.setattr(sys, "argv", ["rewards", str(file), "--config", json.dumps(config), *more])
+        code = main()
+        errors = [line for line in capsys.readouterr().err.splitlines() if "no sandbox" not in line]
+        return code, errors
+
+    assert run({"track": "chicane"}) == (0, [])
+    code, (problem,) = run({"track": "short"}, "--store", str(tmp_path / "store"))
+    assert (
+        code == 1
+        and problem
+        == f"{file}:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track short with 80 waypoints"
+    )
+    code, notes = run({"track": "short"})
+    assert code == 0 and notes[0].startswith(
+        f"{file}: it is not tried on track short, but on the job's nodes (track 'short': there is no such"
+    )
+    assert notes[1] == f"{file}: it is tried on an oval of 602 waypoints instead"
+    code, notes = run({"track": ["chicane", "short"]})
+    assert code == 0 and len(notes) == 1
+    code, (note,) = run({"track": "oval", "obstacles": [{"distance": 99.0}]})
+    assert (
+        code == 0
+        and "it is tried on an oval, not on the job's tracks (obstacles.0.distance: 99 m is beyond the end" in note
+    )
+
+
+def test_settings_that_are_wrong_are_another_s_to_refuse() -> None:
+    for config in ({"track": 3}, {"obstacles": "none"}, {"obstacles": [{"lane": "middle"}]}):
+        courses, notes = courses_for(config, None)
+        assert courses == (FINE_OVAL,) and len(notes) == 1
+
+
+def test_a_rank_tries_its_function_on_its_own_track_and_notes_what_needs_objects() -> None:
+    words = refusal(racer, track="oval", reward_function=RewardFile("far.py", FAR), error=ValueError)
+    assert words.endswith(
+        "far.py:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track oval with 133 waypoints"
+    )
+    task = racer(track="chicane", reward_function=RewardFile("far.py", FAR))
+    assert not [note for note in task.notes() if "objects" in note]
+    noted = racer(track="oval", reward_function=RewardFile("next.py", NEXT))
+    assert [
+        note
+        for note in noted.notes()
+        if note.startswith("next.py:3: it fails where there are no objects, as in this job")
+    ]

@@ -1,0 +1,34 @@
+"""The limit of a node's memory, as its supervisor keeps it."""
+
+from __future__ import annotations
+
+from shared_store.contract import NodeContract
+from shared_store.memory_groups import entering, killed_for_memory, make_memory_group
+
+
+class MemoryLimit:
+    """What the ranks of a node may use together, with all that they start."""
+
+    def __init__(self, contract: NodeContract) -> None:
+        """Make the control group that the contract names, if it names one."""
+        self.limit = contract.memory_limit
+        """MiB."""
+        self.prefix: list[str] = []
+        """Put before a rank's command: it enters the group. Empty for no limit."""
+        self.problem = ""
+        """Why there is no limit although the contract names one; empty where there is one, or none is wanted."""
+        self._group = contract.memory_group
+        self._used_up = False
+        if self._group:
+            try:
+                make_memory_group(self._group, self.limit << 20)
+                self.prefix = entering(self._group)
+            except OSError as error:
+                self.problem = f"muster: memory is not limited to {self.limit} MiB: {error.strerror}: {error.filename}"
+                self._group = ""
+
+    def is_used_up(self) -> bool:
+        """Whether the kernel has ended a process of the node for it."""
+        if self._group and not self._used_up:
+            self._used_up = killed_for_memory(self._group)
+        return self._used_up

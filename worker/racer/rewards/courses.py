@@ -1,0 +1,62 @@
+"""The tracks and obstacles of a job, as the samples of its reward function's check have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from shared_store.layout import Store
+from shared_store.wording import Refused
+from worker.racer.checks import BadTrack
+from worker.racer.circuit import Circuit, circuit_of
+from worker.racer.geometry import project
+from worker.racer.naming import RANDOM, resolve
+from worker.racer.rewards.parameters import MOST_OBJECTS
+from worker.racer.rewards.samples import FINE_OVAL, Course, Placed
+from worker.tasks.configs.racer import RacerConfig
+from worker.tasks.overrides import configured
+
+
+def courses_of(circuit: Circuit) -> tuple[Course, ...]:
+    """Each track of a circuit with its obstacles; of those that are drawn from seeds, which are alike, the first one."""
+    found: dict[str, Course] = {}
+    for track, poses in zip(circuit.tracks, circuit.obstacle_poses, strict=True):
+        boxes = project(track, poses[:MOST_OBJECTS, :2])
+        sides = zip(boxes.along.tolist(), boxes.distance.tolist(), boxes.left.tolist(), strict=True)
+        objects = tuple(Placed(along, distance if left else -distance) for along, distance, left in sides)
+        widths = track.width.tolist()
+        course = Course(
+            name=track.name,
+            points=tuple((x, y) for x, y in track.line().tolist()),
+            widths=tuple([*widths, widths[0]] if track.closed else widths),
+            closed=track.closed,
+            objects=objects,
+        )
+        found.setdefault(RANDOM if track.name.startswith(RANDOM) else track.name, course)
+    return tuple(found.values())
+
+
+def courses_for(config: Mapping[str, Any], store: Store | None) -> tuple[tuple[Course, ...], list[str]]:
+    """The courses of a job's configuration as far as they are known here; an oval where none is.
+
+    Args:
+        config: Tracks and obstacles as a job's YAML has them; what is wrong with them is refused with the job's configuration.
+        store: Where imported and made tracks lie; None: they are not known here.
+
+    Returns:
+        The courses; lines that say on which tracks the function is not tried.
+    """
+    notes, tracks = list[str](), []
+    try:
+        wanted = configured(RacerConfig, config)
+        for name in wanted.tracks:
+            try:
+                tracks.append(resolve(name, store))
+            except BadTrack as error:
+                notes.append(f"it is not tried on track {name}, but on the job's nodes ({error})")
+        if tracks:
+            return courses_of(circuit_of(tracks, wanted.obstacles)), notes
+    except Refused as error:
+        notes.append(f"it is tried on an oval, not on the job's tracks ({error})")
+        return (FINE_OVAL,), notes
+    return (FINE_OVAL,), [*notes, f"it is tried on an oval of {len(FINE_OVAL.points) - 1} waypoints instead"]
