@@ -109,6 +109,7 @@ class Run:
             "telemetry",
             "tracking",
             "texts",
+            "sim-trace",
             "logs",
             "outcomes",
             "parent",

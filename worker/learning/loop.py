@@ -23,7 +23,7 @@ from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
 from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
-from worker.learning.job import StopRequest, end_startup
+from worker.learning.job import StopRequest, end_startup, user_errors
 from worker.learning.leaving import patience_of
 from worker.learning.randomness import seed_generators
 from worker.learning.report import Report, Stopwatch, figures_of, shown_of, straggler
@@ -114,11 +114,12 @@ class Loop:
         return task, made
 
     def _step_log(self, facts: dict[str, Any]) -> StepLog | None:
-        """The task's log of control steps. Raises UserError if the store does not take it."""
+        """The task's log of control steps. Raises UserError if a link is in its place, TrainingError if the store does not take it."""
         try:
-            return self.task.step_log(self.job.run, self.algorithm.steps, self.state.progress.iteration, facts)
+            with user_errors():
+                return self.task.step_log(self.job.run, self.algorithm.steps, self.state.progress.iteration, facts)
         except OSError as error:
-            raise UserError(f"{error.filename or self.job.run.path}: {error.strerror or error}") from None
+            raise TrainingError(f"{error.filename or self.job.run.path}: {error.strerror or error}") from None
 
     def _begin_run(self, facts: dict[str, Any]) -> Checkpoint | None:
         """Start a run for the first time; returns a clone's checkpoint with the initial weights."""

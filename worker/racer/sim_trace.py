@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared_store.files import write_json
+from shared_store.files import refuse_links, write_json
 from worker.racer.hyperparameters import deepracer_names
 from worker.racer.resets import MISHAPS
 from worker.racer.trace import COLUMNS
@@ -94,7 +94,8 @@ def model_documents(task: Racer, algorithm: str, settings: Mapping[str, Any], wo
 
 
 def write_documents(folder: Path, documents: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write :func:`model_documents` below ``folder``. Raises OSError."""
+    """Write :func:`model_documents` below ``folder``. Raises OSError, and DamagedFile if a link is in the place of a directory."""
     for name, document in documents.items():
+        refuse_links((folder / name).parent, 1)
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_json(folder / name, document)

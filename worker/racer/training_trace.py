@@ -81,6 +81,7 @@ class TrainingTrace:
 
     Raises:
         OSError: The store can't be written.
+        DamagedFile: A link is in the place of a directory.
     """
 
     def __init__(self, run: Run, task: Racer, steps: int, iteration: int, documents: Mapping[str, Any]) -> None:

@@ -54,6 +54,7 @@ class Telling:
 
         Raises:
             OSError: The store can't be written.
+            DamagedFile: A link is in the place of one of its directories.
         """
         return None
 

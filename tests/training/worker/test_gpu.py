@@ -38,6 +38,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
             }
         },
     ),
+    "cars of which each step is logged": ("Racer", {"config": {"sim_trace": 16}}),
     "a camera on a car": ("RacerPixels", {"config": {"front": {"width": 64, "height": 64}}}),
     "a camera on a body": ("tests.support.worker.seeing:SeeingDepth", {}),
     "a critic of its own": (
