@@ -162,7 +162,7 @@ def test_a_digest_stands_for_a_text_and_never_beside_one() -> None:
         (b"\xff\xfe", r"space\.json: it is not a text file \(UTF-8\)"),
         (b'"other.json"', r"space\.json: it holds a text alone"),
         (
-            b'{"action_space": [{"steering_angle": 0, "speed": 9}, {}]}',
+            b'{"action_space": [{"steering_angle": 0, "speed": "fast"}, {}]}',
             r"action_space\.action_space\.0\.speed: expected a number",
         ),
     ],
