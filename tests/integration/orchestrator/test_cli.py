@@ -257,7 +257,7 @@ def test_who_follows_a_command_that_waits_is_told_why(server: Serving) -> None:
     for each in following:
         assert each.stderr is not None
         line = each.stderr.readline()
-        assert line.startswith("all-reduce (") and f" free until job test ({full[:8]}) ends" in line, line
+        assert line.startswith("all-reduce (") and f": waits for job test ({full[:8]}) to end: " in line, line
     server.client.batch("TerminateJob", jobId=full, reason="enough")
     for each in following:
         assert each.communicate(timeout=60 * PATIENCE)[1].count("RUNNABLE") == 0 and each.returncode == 0
