@@ -222,6 +222,26 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
         refused(["show", missing], shared_server.home, 2, f"job {missing} does not exist")
 
 
+def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(shared_server: Serving) -> None:
+    client = shared_server.client
+    fails = ["sh", "-c", "exit $((AWS_BATCH_JOB_ARRAY_INDEX % 2 * AWS_BATCH_JOB_ARRAY_INDEX))"]
+    client.batch("RegisterJobDefinition", **single("odd", container(command=fails)))
+    job = {"jobName": "odd", "jobQueue": "default", "jobDefinition": "odd", "arrayProperties": {"size": 9}}
+    array = client.batch("SubmitJob", **job)["jobId"]
+    found = shared_server.wait(array)
+    why = [f"{index} (main node: rank 0 exited with code {index})" for index in (1, 3, 5)]
+    reason = f"4 of 9 array jobs failed: {', '.join(why)}, 1 more"
+    assert (found["status"], found["statusReason"]) == ("FAILED", reason)
+    assert client.batch("DescribeJobs", jobs=[array])["jobs"][0]["statusReason"] == reason
+    states = [(each["index"], each["status"]) for each in found["children"]]
+    assert states == [*((i, "FAILED") for i in (1, 3, 5, 7)), *((i, "SUCCEEDED") for i in (0, 2, 4, 6, 8))]
+    assert all(each["ranSeconds"] >= 0 for each in found["children"])
+    lines = shared_server.muster("show", array).stdout.splitlines()
+    listed = [line.split(maxsplit=3) for line in lines if line.split()[1:2] in (["FAILED"], ["SUCCEEDED"])]
+    assert [int(each[0]) for each in listed] == [1, 3, 5, 7, 0, 2, 4, 6, 8]
+    assert listed[3][3] == "main node: rank 0 exited with code 7" and listed[0][2].startswith("0:00:0")
+
+
 def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -> None:
     assert "muster" not in (REPOSITORY / "job_specs" / "all_reduce.py").read_text().lower()
     done = shared_server.muster("run", "job_specs/all-reduce.yaml")
