@@ -128,7 +128,7 @@ def ran(time: RunTime | None) -> dict[str, Any]:
     return {"ranSeconds": time and time.seconds, "runsSince": time and time.since}
 
 
-def children_of(session: Session, array: Job) -> list[dict[str, Any]]:
+def children_of(reconciler: Reconciler, session: Session, array: Job) -> list[dict[str, Any]]:
     """The children of an array: those that failed first, then those that run, wait and succeeded; at most 100."""
     order = case({str(status): place for place, status in enumerate(_FAILED_FIRST)}, value=Job.status)
     query = select(Job).where(Job.parent == array.id).order_by(order, Job.array_index).limit(_CHILDREN)
@@ -137,7 +137,7 @@ def children_of(session: Session, array: Job) -> list[dict[str, Any]]:
             "index": child.array_index,
             "id": child.id,
             "status": child.status,
-            "statusReason": child.reason.words or None,
+            "statusReason": reconciler.admission.reason(child).words or None,
             **ran(child.run_time),
         }
         for child in session.scalars(query.options(selectinload(Job.attempts)))

@@ -176,7 +176,7 @@ def job_detail(
                 "stoppedAt": job.stopped_at,
                 **job_list.ran(job.run_time),
                 "phase": _phase(attempts, gang.main) if job.status == Status.RUNNING else None,
-                "children": job_list.children_of(session, job) if job.kind == "array" else None,
+                "children": job_list.children_of(reconciler, session, job) if job.kind == "array" else None,
                 "nodes": len(gang.nodes),
                 "attempts": attempts,
                 "attemptsAllowed": job.attempts_allowed,
