@@ -324,7 +324,7 @@ class _Lines(_Display):
         if record:
             self.eta(record)
             self._latest, self.iteration = record, record["iteration"]
-        if self.enter(job) and self._phase:
+        if self.enter(job) and self.doing:
             self._flush()
             echo(self._phase)
         if time.monotonic() - self._printed >= _PLAIN_INTERVAL:

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import pytest
 from rich.table import Table
 
 from orchestrator.cli.show import _gpus
-from orchestrator.cli.terminal import print_cut
+from orchestrator.cli.terminal import print_cut, print_rows, print_wrapped
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.definitions import container, single
 from tests.support.orchestrator.jobs import FOREVER, refusal
@@ -191,6 +192,22 @@ def test_for_another_program_long_reasons_are_whole_and_no_column_is_lost(capsys
     assert row.split()[:3] == ["0123abcd", "a-job", "FAILED"] and row.count("story") == 120
 
 
+@pytest.mark.parametrize("printing", [print_cut, print_wrapped, print_rows])
+def test_for_another_program_a_long_row_of_any_table_pads_no_other(
+    printing: Callable[[Table], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    printing(table(("0123abcd", "a-job", "FAILED", "a long story " * 2000), ("4567abcd", "b", "RUNNABLE", "")))
+    header, long, short = capsys.readouterr().out.splitlines()
+    assert header.split() == ["JOB", "NAME", "STATUS", "REASON"] and long.count("story") == 2000
+    assert short == "4567abcd  b      RUNNABLE" and not any(each.endswith(" ") for each in (header, long, short))
+
+
+def test_no_table_that_is_read_by_another_program_ends_in_spaces(shared_server: Serving) -> None:
+    for command in (["list"], ["queues"], ["queues", "default"], ["tracks", "list"], ["league", "list"]):
+        done = shared_server.muster(*command)
+        assert done.returncode == 0 and not [each for each in done.stdout.splitlines() if each.endswith(" ")], command
+
+
 def test_an_empty_selection_of_a_log_says_so(shared_server: Serving) -> None:
     job = shared_server.gang("print('here')", name="brief")
     shared_server.wait(job)
@@ -281,6 +298,47 @@ def test_who_follows_a_command_that_waits_is_told_why(server: Serving) -> None:
     server.client.batch("TerminateJob", jobId=full, reason="enough")
     for each in following:
         assert each.communicate(timeout=60 * PATIENCE)[1].count("RUNNABLE") == 0 and each.returncode == 0
+
+
+def test_who_follows_a_log_is_told_again_when_the_reason_changes(server: Serving, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    script = f"import os, signal, time\nsignal.signal(15, signal.SIG_IGN)\nwhile not os.path.exists({str(gate)!r}): time.sleep(0.05)"
+    server.wait(full := server.gang(script, cpus="4"), "RUNNING")
+    waiting = server.gang("print('at last')", cpus="4", name="next")
+    wait_for(lambda: "waits for job" in server.detail(waiting)["statusReason"], 30, "its reason")
+    command = [MUSTER, "logs", "next", "-f"]
+    env = {**os.environ, "MUSTER_HOME": str(server.home)}
+    followed = subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert followed.stderr is not None
+    assert f": waits for job test ({full[:8]}) to end: 4 of 4 CPUs short" in followed.stderr.readline()
+    server.client.batch("TerminateJob", jobId=full, reason="enough")
+    assert f": waits for job test ({full[:8]}) to stop: 4 of 4 CPUs short" in followed.stderr.readline()
+    gate.touch()
+    assert "at last" in followed.communicate(timeout=60 * PATIENCE)[0] and followed.returncode == 0
+
+
+RESUMED = """name: twice
+resources: {cpus: 0.1, memory: 64MiB}
+command: [sh, -c, 'test -e "$GATE" || exit 3; echo through']
+environment: {GATE: "%s"}
+retry: {attempts: 1}
+"""
+
+
+def test_resume_is_the_controller_itself_where_none_is_running(tmp_path: Path) -> None:
+    gate, spec, home = tmp_path / "gate", tmp_path / "job.yaml", tmp_path / "home"
+    spec.write_text(RESUMED % gate)
+    ran = call_muster("run", str(spec), home=home)
+    assert ran.returncode == 1 and "exited with code 3" in ran.stdout, ran.stdout + ran.stderr
+    [run] = [each.name for each in (home / "store" / "runs").iterdir()]
+    again = call_muster("resume", run, home=home)
+    assert again.returncode == 1 and f"resumed {run} as job " in again.stdout and "follow it with" not in again.stdout
+    assert "this command is the controller until the job ends" in again.stderr
+    gate.touch()
+    through = call_muster("resume", run, "--set", "name=thrice", home=home)
+    assert through.returncode == 0 and "through" in through.stdout and "SUCCEEDED  thrice (" in through.stdout
+    assert not (home / "controller.json").exists() and len(list((home / "store" / "runs").iterdir())) == 1
+    refused(["resume", "nosuch"], home, 2, "run nosuch does not exist in")
 
 
 @pytest.mark.parametrize(
