@@ -39,6 +39,11 @@ def local_url() -> str | None:
     return str(found["url"]) if found else None
 
 
+def local_region() -> str:
+    """The AWS region in the ARNs of this home directory's controller; the default one where it does not run."""
+    return str((_published() or {}).get("region") or "us-east-1")
+
+
 def is_temporary() -> bool:
     """Whether the controller of this home directory goes away with the command that started it."""
     return bool((_published() or {}).get("temporary"))
@@ -49,7 +54,7 @@ def _published() -> dict[str, Any] | None:
     try:
         found = json.loads((muster_home() / "controller.json").read_text())
         os.kill(int(found["pid"]), 0)
-        return {"url": found["url"], "temporary": found.get("temporary")}
+        return {"url": found["url"], "temporary": found.get("temporary"), "region": found.get("region")}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -124,10 +129,13 @@ class HomeLock:
                 f"{home}: already served by {holder}; use that one, stop it, or set MUSTER_HOME to another directory"
             ) from None
 
-    def publish(self, url: str, temporary: bool) -> None:
-        """Tell commands on this machine where the controller listens, and whether it goes away with the command that started it."""
+    def publish(self, url: str, temporary: bool, region: str) -> None:
+        """Tell commands on this machine where the controller listens, whether it goes away with the command that started it, and its AWS
+        region.
+        """
+        told = {"pid": os.getpid(), "url": url, "temporary": temporary, "region": region}
         try:
-            self.path.write_text(json.dumps({"pid": os.getpid(), "url": url, "temporary": temporary}))
+            self.path.write_text(json.dumps(told))
         except OSError as error:
             log.warning("%s can't be written (%s); commands need MUSTER_URL=%s", self.path, error.strerror, url)
 

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import uvicorn
 
+from orchestrator.api import arns
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
 from orchestrator.api.http.auth import is_loopback
@@ -23,6 +24,7 @@ from orchestrator.api.http.connections import Connection, Connections, Seldom, S
 from orchestrator.api.http.limits import RATE, RateLimit
 from orchestrator.api.native.automatic import AutomaticEvaluations
 from orchestrator.console import add_console
+from orchestrator.control.account import recognise as recognise_account
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments, in_order
 from orchestrator.control.deliveries import Deliveries
@@ -79,6 +81,8 @@ class Server:
         min_free: MinFree = DEFAULT,
         lost_after: float = LOST_AFTER,
         webhooks: str | None = None,
+        account: str | None = None,
+        region: str | None = None,
     ) -> None:
         """Take the lock, the port, the engines, the store and the database, in this order; nothing runs until :meth:`start`.
 
@@ -87,6 +91,7 @@ class Server:
         the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of jobs is kept;
         None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
         first, or to the one whose jobs in it are not over.
+        ``account``, ``region``: of all ARNs (:mod:`orchestrator.control.account`); None: as before.
         ``adopt_store``: take what is at the store's path, although the database knows another store.
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
@@ -119,6 +124,7 @@ class Server:
                 stack.callback(found.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
+                    arns.settle(recognise_account(session, account, region))
                     identity = recognise(session, self.store, adopt_store)
                     nodes.arrange(in_order(session, nodes.names))
                     ensure_compute_environments(session, nodes.names)
@@ -187,7 +193,7 @@ class Server:
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
-        self._lock.publish(self.url, temporary)
+        self._lock.publish(self.url, temporary, arns.here().region)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""

@@ -13,7 +13,7 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,11 +109,18 @@ def versions(store: Store, name: str) -> list[Model]:
     return [Model(folder / str(n), name, n) for n in sorted(int(each) for each in entries if _VERSION.fullmatch(each))]
 
 
-def find(store: Store, name: str, version: int | None = None) -> Model:
-    """A version of a model, by default the newest. Raises UnknownModel with the nearest name, or the existing versions."""
+def _all(_: Model) -> bool:
+    return True
+
+
+def find(store: Store, name: str, version: int | None = None, visible: Callable[[Model], bool] = _all) -> Model:
+    """A version of a model, by default the newest. Raises UnknownModel with the nearest name, or the existing versions.
+
+    ``visible``: whether the caller may see the model with this newest version; others are as if they did not exist.
+    """
     found = versions(store, name)
-    if not found:
-        known = model_names(store)
+    if not found or not visible(found[-1]):
+        known = [each for each in model_names(store) if visible(versions(store, each)[-1])]
         hint = nearest(name, known, "" if known else "no model is registered yet")
         raise UnknownModel(f"model {name} does not exist; {hint}")
     if version is None:

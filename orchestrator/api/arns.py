@@ -5,35 +5,60 @@ from __future__ import annotations
 import re
 
 from orchestrator.api.errors import ClientError
+from orchestrator.control.account import DEFAULT, Account
 
-REGION, ACCOUNT = "us-east-1", "000000000000"
-PREFIX = f"arn:aws:batch:{REGION}:{ACCOUNT}:"
+_here = DEFAULT
+
+
+def here() -> Account:
+    """The account and region of the controller."""
+    return _here
+
+
+def settle(account: Account) -> None:
+    """Make all ARNs those of this account from now on: a process has one controller."""
+    global _here
+    _here = account
+
+
+def _prefix(service: str = "batch") -> str:
+    return f"arn:{_here.partition}:{service}:{_here.region}:{_here.id}:"
 
 
 def job_arn(job_id: str) -> str:
-    return f"{PREFIX}job/{job_id}"
+    return f"{_prefix()}job/{job_id}"
 
 
 def definition_arn(name: str, revision: int) -> str:
-    return f"{PREFIX}job-definition/{name}:{revision}"
+    return f"{_prefix()}job-definition/{name}:{revision}"
 
 
 def queue_arn(name: str) -> str:
-    return f"{PREFIX}job-queue/{name}"
+    return f"{_prefix()}job-queue/{name}"
 
 
 def compute_environment_arn(name: str) -> str:
-    return f"{PREFIX}compute-environment/{name}"
+    return f"{_prefix()}compute-environment/{name}"
 
 
 def policy_arn(name: str) -> str:
-    return f"{PREFIX}scheduling-policy/{name}"
+    return f"{_prefix()}scheduling-policy/{name}"
 
 
 def ecs_arn(kind: str, environment: str, name: str = "") -> str:
     """ARN of the ECS ``cluster`` that a compute environment would have, or with ``name`` that of an object in it (``task`` …)."""
     below = f"/{name}" if name else ""
-    return f"arn:aws:ecs:{REGION}:{ACCOUNT}:{kind}/AWSBatch-{environment}{below}"
+    return f"{_prefix('ecs')}{kind}/AWSBatch-{environment}{below}"
+
+
+def iam_arn(name: str) -> str:
+    """ARN of the account's ``role/…`` or ``instance-profile/…``."""
+    return f"arn:{_here.partition}:iam::{_here.id}:{name}"
+
+
+def log_group_arn(name: str) -> str:
+    """ARN of a log group, without the ``:*`` that AWS shows behind some."""
+    return f"{_prefix('logs')}log-group:{name}"
 
 
 def plain_name(reference: str, kind: str) -> str:
@@ -58,7 +83,7 @@ def split_reference(reference: str) -> tuple[str, int | None]:
 
 def split_arn(arn: str) -> tuple[str, str]:
     """Kind (``job-queue``, ``job`` …) and name of one of our ARNs. Raises ClientError for any other."""
-    kind, slash, name = arn.removeprefix(PREFIX).partition("/")
-    if not arn.startswith(PREFIX) or not slash or not kind or not name:
+    kind, slash, name = arn.removeprefix(_prefix()).partition("/")
+    if not arn.startswith(_prefix()) or not slash or not kind or not name:
         raise ClientError(f"{arn[:300]!r} is not an ARN of this controller; its ARNs look like {queue_arn('default')}")
     return kind, name

@@ -166,36 +166,44 @@ def queue_names(session: Session) -> list[str]:
 
 def find_run(reconciler: Reconciler, name: str) -> Run:
     """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run; StoreSilent."""
-    try:
-        run = reconciler.store.run(name)
-    except StoreError as error:
-        raise ClientError(str(error)) from None
+    run = _run(reconciler, name)
     if run.description() is None:
-        reconciler.check_store()
-        with reconciler.database.session() as session:
-            query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
-            job = session.scalars(query.limit(1)).first()
-            if job is not None and is_visible(job):
-                over = Status(job.status).is_terminal
-                what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
-                raise ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
-            named = find_job(session, name, visible_queues())
-            if named is not None and is_visible(named):
-                raise ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
-        runs = [each.name for each in visible_runs(reconciler, most=_COMPARED)]
-        others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
-        hint = nearest(name, runs, others, cutoff=0.3)
-        raise ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
+        raise _absent(reconciler, name)
     return run
 
 
-def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:
-    """The run called ``name``, where the caller may do this to it; nothing of another's is read. Raises ClientError."""
+def _run(reconciler: Reconciler, name: str) -> Run:
     try:
-        owner = owner_of_run(reconciler, reconciler.store.run(name))
+        return reconciler.store.run(name)
     except StoreError as error:
         raise ClientError(str(error)) from None
+
+
+def _absent(reconciler: Reconciler, name: str) -> ClientError:
+    """The caller sees no run called ``name``; what it may see is named. Raises StoreSilent."""
+    reconciler.check_store()
+    with reconciler.database.session() as session:
+        query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
+        job = session.scalars(query.limit(1)).first()
+        if job is not None and is_visible(job):
+            over = Status(job.status).is_terminal
+            what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
+            return ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
+        named = find_job(session, name, visible_queues())
+        if named is not None:
+            return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
+    runs = [each.name for each in visible_runs(reconciler, most=_COMPARED)]
+    others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
+    hint = nearest(name, runs, others, cutoff=0.3)
+    return ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
+
+
+def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:
+    """The run called ``name``, where the caller may do this to it; another's is as if it did not exist. Raises ClientError."""
+    owner = owner_of_run(reconciler, _run(reconciler, name))
     if owner is not None:
+        if not is_visible(owner):
+            raise _absent(reconciler, name)
         check(operation, owner)
     return find_run(reconciler, name)
 

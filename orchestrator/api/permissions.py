@@ -1,7 +1,7 @@
 """Permissions: every operation of the API is decided here, for every kind of key and every object.
 
 A key either writes or only reads (``--read-only``), and either has all queues or some (``--queue``). An object belongs to a queue
-(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that made it (a job definition, a league), or to all queues (a
+(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that made it (a job definition, a league, a log group), or to all queues (a
 queue itself, a compute environment, a scheduling policy).
 
 ================================  ===========================  ============================================================
@@ -14,6 +14,7 @@ job definition of its own         reads, writes, submits       reads, writes, su
 another's, tagged for its queue   reads, writes, submits       reads, submits
 another's                         reads, writes, submits       reads, without the values of environment variables
 league                            reads, writes                reads, creates its own; disqualifies in its own
+log group                         reads, writes                reads, creates its own; changes its own
 what all queues share             reads, writes                reads
 ================================  ===========================  ============================================================
 
@@ -35,6 +36,7 @@ from orchestrator.persistence.models import (
     Job,
     JobDefinition,
     JobQueue,
+    LogGroup,
     RunRecord,
     SchedulingPolicy,
 )
@@ -101,6 +103,12 @@ class Operation(StrEnum):
     FILTER_LOG_EVENTS = "FilterLogEvents"
     DESCRIBE_LOG_STREAMS = "DescribeLogStreams"
     DESCRIBE_LOG_GROUPS = "DescribeLogGroups"
+    CREATE_LOG_GROUP = "CreateLogGroup"
+    DELETE_LOG_GROUP = "DeleteLogGroup"
+    PUT_RETENTION_POLICY = "PutRetentionPolicy"
+    DELETE_RETENTION_POLICY = "DeleteRetentionPolicy"
+    CREATE_LOG_STREAM = "CreateLogStream"
+    DELETE_LOG_STREAM = "DeleteLogStream"
     START_LIVE_TAIL = "StartLiveTail"
     READ_HEALTH = "GET /healthz"
     READ_DOCUMENTATION = "GET /api/docs"
@@ -170,7 +178,8 @@ class Shared:
     """Something of all queues that has no row yet."""
 
 
-Object = Job | RunRecord | JobsOf | JobDefinition | JobQueue | ComputeEnvironment | SchedulingPolicy | LeagueOf | Shared
+_OfQueues = Job | RunRecord | JobsOf | JobDefinition | LeagueOf | LogGroup
+Object = _OfQueues | JobQueue | ComputeEnvironment | SchedulingPolicy | Shared
 
 
 def check(operation: Operation, *objects: Object) -> None:
@@ -240,7 +249,7 @@ def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
     match thing:
         case Job() | RunRecord() | JobsOf():
             return thing.queue in queues
-        case LeagueOf():
+        case LeagueOf() | LogGroup():
             return thing.owner == identity.name or operation.reads
         case JobDefinition():
             shared = thing.tags.get(QUEUES_TAG, "").split()
@@ -260,6 +269,8 @@ def _whose(thing: Object) -> str:
             return f"it concerns job queue {thing.queue}"
         case LeagueOf():
             return f"league {thing.name} was created by {thing.owner}"
+        case LogGroup():
+            return f"log group {thing.name[:200]} was created by {thing.owner or 'the controller'}"
         case JobDefinition():
             return (
                 f"job definition {thing.name} was registered by {thing.owner or 'an unknown key'}; register one under another "

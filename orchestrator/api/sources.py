@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from orchestrator.api import permissions
-from orchestrator.api.context import Context, find_run, release
+from orchestrator.api.context import Context, permitted_run, release
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
@@ -72,12 +72,14 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
             continue
         if not is_waiting:
             try:
-                context.read(("find", source.run), partial(find_run, context.reconciler, source.run))
+                found = partial(permitted_run, context.reconciler, source.run, Operation.SUBMIT_JOB)
+                context.read(("find", source.run), found)
             except ClientError as error:
                 raise ClientError(f"{source.key}: {error}" if is_teacher else str(error), error.status) from None
         if permissions.visible_queues() is not None:
-            nobodys = RunRecord(name=source.run, queue="")
-            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.found(source.run)) or nobodys)
+            owner = owner_of(context.session, context.found(source.run))
+            if owner is None or not permissions.is_visible(owner):  # another's is as one that does not exist yet
+                permissions.check(Operation.SUBMIT_JOB, RunRecord(name=source.run, queue=""))
         if source.key in ("evaluate", "race") and not is_waiting:
             evaluated = partial(check_evaluation, store, context.run(source.run), spec or {}, source.key)
             context.read((source.key, source.run), evaluated)

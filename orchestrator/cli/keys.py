@@ -12,7 +12,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json, print_rows
 from orchestrator.client import EXAMPLE_URL
-from orchestrator.home import local_url, muster_home
+from orchestrator.home import local_region, local_url, muster_home
 from orchestrator.keys import KeyStore
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the key: its user or program.")]
@@ -49,7 +49,7 @@ def create(
 AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(profile_name="{key.name}")):
   aws configure set aws_access_key_id {key.access_key_id} --profile {key.name}
   aws configure set aws_secret_access_key {key.secret} --profile {key.name}
-  aws configure set region us-east-1 --profile {key.name}
+  aws configure set region {local_region()} --profile {key.name}
   aws configure set endpoint_url {url} --profile {key.name}
 
 muster, and 'Authorization: Bearer …' elsewhere:

@@ -119,7 +119,7 @@ def render(
         try:
             section = Render.model_validate({**values, "format": output.suffix[1:]})
         except ValueError:
-            raise UsageError(f"--size {size}: each side is from 64 to 4096 pixels") from None
+            raise UsageError(f"--size {size}: each side is from 64 to 4096 pixels, and even for an .mp4") from None
         _fetch(client, run, Spec(**_common(run, "render"), render=section), output)
 
 

@@ -147,6 +147,20 @@ def serve(
             help="Send a message when jobs end: a JSON file of URLs and secrets; see `muster webhooks --help`."
         ),
     ] = None,
+    account_id: Annotated[
+        str | None,
+        typer.Option(
+            help="AWS account in all ARNs, 12 digits; 000000000000 by default. The first start settles it.",
+            show_default=False,
+        ),
+    ] = None,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            help="AWS region in all ARNs; us-east-1 by default. The first start settles it. Nothing runs there.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Run the controller as a server. Running jobs outlive it; the next controller finds them."""
     from orchestrator.server import Server  # imports dependencies of the controller only
@@ -173,6 +187,8 @@ def serve(
         min_free=_min_free(min_free),
         lost_after=_lost_after(lost_after),
         webhooks=webhooks,
+        account=account_id,
+        region=region,
     )
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

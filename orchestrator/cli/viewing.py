@@ -42,7 +42,7 @@ def view(
         typer.Option(
             min=1,
             max=65535,
-            help="Port of the page; by default 9090, or a free one if it is in use.",
+            help="Port of the page and its stream; by default the first free one of 9090 to 9099.",
             show_default=False,
         ),
     ] = None,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from fastapi import Depends, Request, Response
 
+from orchestrator.api.arns import here
 from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
 from orchestrator.api.permissions import current_identity
@@ -66,7 +67,7 @@ def create(request: Request, form: Form = Depends(sent_form)) -> Response:
         text = "From now on everybody needs a key, you too: copy its secret from the next page, and log in with it."
         form.confirm(Question(f"Make the first key, {name}?", text, "Make it"))
     key = create_key(request, name, tuple(form.every("queue")), form.one("read_only") == "yes")
-    return render(request, "key.html", key=key, url=str(request.base_url).rstrip("/"))
+    return render(request, "key.html", key=key, url=str(request.base_url).rstrip("/"), region=here().region)
 
 
 @router.post("/keys/delete")

@@ -62,6 +62,7 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status, Verdict
 from orchestrator.engines.api import CannotStart, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.log_groups import record_logs
 from orchestrator.persistence.models import Attempt, Job, JobQueue, SchedulingPolicy, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
@@ -132,6 +133,7 @@ class Attempts:
             created_at=now(),
         )
         attempt.held_since = self.clock.now()
+        record_logs(session, job, nodes)
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {self._state(job, attempt).terms.size}")
         session.commit()

@@ -56,6 +56,10 @@ class Shape:
         return sum(self.nodes[: self.minimum], Resources())
 
 
+LOG_GROUP = "/aws/batch/job"
+"""The log group of containers that name none."""
+
+
 @dataclass(frozen=True)
 class NodeSpec:
     """The command and the resources of one node."""
@@ -69,6 +73,21 @@ class NodeSpec:
     """``containerProperties`` unchanged, from which engines read volumes, limits and the like."""
     ecs: str | None = None
     """Name of the container where the definition gave ``ecsProperties``; None where it gave ``container``."""
+
+    @property
+    def log_group(self) -> str | None:
+        """Its log group; None: :data:`LOG_GROUP`."""
+        named = self._log_options.get("awslogs-group")
+        return None if named == LOG_GROUP else named
+
+    @property
+    def log_prefix(self) -> str | None:
+        """The beginning of its stream's name; None: the name of the job."""
+        return self._log_options.get("awslogs-stream-prefix") or None
+
+    @property
+    def _log_options(self) -> Mapping[str, str]:
+        return (self.container.get("logConfiguration") or {}).get("options") or {}
 
     @cached_property
     def spec(self) -> Mapping[str, Any] | None:
@@ -95,6 +114,11 @@ class GangSpec:
     def shape(self) -> Shape:
         """The part that the scheduler needs."""
         return Shape(tuple(node.resources for node in self.nodes), self.minimum, self.main)
+
+    @property
+    def log_groups(self) -> set[str]:
+        """The log groups of its nodes, but for :data:`LOG_GROUP`."""
+        return {node.log_group for node in self.nodes if node.log_group}
 
     @property
     def spec(self) -> Mapping[str, Any] | None:

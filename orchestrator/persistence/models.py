@@ -404,6 +404,10 @@ class Node(Base):
     """AWS's status reason for a node that ended by itself."""
     met: Mapped[bool] = mapped_column(default=False)
     """Whether it has connected to the bus."""
+    log_group: Mapped[str | None] = mapped_column(default=None, index=True)
+    """Of its log stream; None: ``/aws/batch/job``; empty: the group was deleted."""
+    log_prefix: Mapped[str | None] = mapped_column(default=None)
+    """The stream's name begins with it; None: with the name of the job."""
 
     @validates("reason", "error", "status_reason")
     def _storable(self, _key: str, text: str | None) -> str | None:
@@ -452,6 +456,37 @@ class KnownStore(Base):
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     identity: Mapped[str]
     """As its ``store.json`` has it."""
+
+
+class KnownAccount(Base):
+    """The one row of the account in the ARNs (:mod:`orchestrator.control.account`)."""
+
+    __tablename__ = "account"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    account: Mapped[str]
+    region: Mapped[str]
+
+
+class LogGroup(Base):
+    """A log group of a user's own; ``/aws/batch/job``, which always exists, has a row once it has a setting or a tag."""
+
+    __tablename__ = "log_groups"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Whose key created it, or submitted the first job that logs there."""
+    retention: Mapped[int | None] = mapped_column(default=None)
+    """``retentionInDays``, which is shown and deletes nothing."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class LogStream(Base):
+    """An empty stream that a client created; the streams of jobs are known by their nodes."""
+
+    __tablename__ = "log_streams"
+    log_group: Mapped[str] = mapped_column(ForeignKey("log_groups.name", ondelete="CASCADE"), primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    created_at: Mapped[int] = mapped_column(default=now)
 
 
 class ShareUsage(Base):

@@ -39,12 +39,12 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
 
     ``REFERENCE:3`` is the child with index 3 of the array that REFERENCE names.
 
-    ``queues``: only jobs of these are looked for by name or by the start of an id; None: all jobs.
+    ``queues``: only jobs of these are found; None: all jobs.
     Raises RequestError where several ids start so.
     """
     job = session.get(Job, reference)
     if job:
-        return job
+        return job if queues is None or job.queue in queues else None
     array, colon, index = reference.rpartition(":")
     if colon:
         parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None

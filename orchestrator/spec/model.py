@@ -191,6 +191,15 @@ class Render(_OfCheckpoint):
     width: int = Field(default=640, ge=64, le=4096, description="of a frame [px]")
     height: int = Field(default=360, ge=64, le=4096, description="of a frame [px]")
 
+    @model_validator(mode="after")
+    def _has_even_sides(self) -> Render:
+        if self.format == "mp4" and (self.width % 2 or self.height % 2):
+            raise ValueError(
+                f"an .mp4 has even sides: width {self.width // 2 * 2} and height {self.height // 2 * 2}, say, not "
+                f"{self.width} and {self.height}"
+            )
+        return self
+
 
 class Spec(Section):
     """One job."""

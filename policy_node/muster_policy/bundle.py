@@ -11,6 +11,7 @@ from typing import Any
 
 from muster_policy.contract import Contract, read
 from muster_policy.errors import Refused
+from muster_policy.weights import lie_elsewhere
 
 FORMAT = 1
 """The newest version of the manifest that the node reads."""
@@ -69,6 +70,11 @@ def open_bundle(path: Path) -> Bundle:
     for name in ("contract.json", "policy.onnx", "parity.npz"):
         if name not in content:
             raise Refused(f"{path}: {MANIFEST} lists no {name}; export the policy again")
+    try:
+        if lie_elsewhere(content["policy.onnx"]):
+            raise Refused(f"{path}: policy.onnx has weights in another file (external_data); export the policy again")
+    except ValueError:
+        raise Refused(f"{path}: policy.onnx is no ONNX file; export the policy again") from None
     contract = read(content["contract.json"], f"{path}: contract.json")
     return Bundle(path, manifest, contract, content["policy.onnx"], content["parity.npz"])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from worker.evaluation.statistics import Sample, difference, share
 from worker.evaluation.table import write_table
 from worker.learning.algorithm import Policy
 from worker.learning.report import shown_of
+from worker.tasks.tables import as_json
 
 if TYPE_CHECKING:
     from worker.evaluation.race import Race
@@ -43,6 +44,7 @@ class Evaluation:
         seed: Of the worlds.
         seconds: How long it took, by the clock [s].
         shown: Unit of each metric that the task wants to be seen, such as ``{"metric_progress": "%"}``.
+        config: The task's whole configuration, as JSON.
     """
 
     checkpoint: str
@@ -53,6 +55,7 @@ class Evaluation:
     seed: int | None
     seconds: float
     shown: Mapping[str, str]
+    config: str
 
     @property
     def episodes(self) -> int:
@@ -129,11 +132,13 @@ class Evaluation:
             each for each in earlier if ("race" in each) == (race is not None) and _rewards(each) == _rewards(summary)
         ]
         if earlier:
-            summary["compared"] = self._compared(run, earlier[-1], summary)
+            summary["compared"] = self._compared(run, _partner(earlier, summary), summary)
         summary = _finite(summary)
         if race is not None:
             race.write_sim_traces(run.evaluations / name)
-        write_table(run.evaluations / summary["table"], self.played, self.seed, race.columns() if race else None)
+        known = {"run": run.name, "checkpoint": self.checkpoint, "task": self.task, "config": self.config}
+        further = race.columns() if race else None
+        write_table(run.evaluations / summary["table"], self.played, self.seed, known, further)
         write_json(run.evaluations / f"{name}.json", summary)
         return summary
 
@@ -183,6 +188,7 @@ def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, s
         played=played,
         max_length=task.max_episode_length,
         weights=getattr(task.config, "rewards", {}),
+        config=as_json(task.config),
         seed=seed,
         seconds=time.perf_counter() - started,
         shown=task.shown_metrics,
@@ -202,6 +208,12 @@ def best_words(run: Run) -> str:
     return (
         f"best of {len(evaluated)} checkpoints that are evaluated: {run.name}@{best.iteration}, mean return {mean:.2f}"
     )
+
+
+def _partner(earlier: Sequence[dict[str, Any]], new: Mapping[str, Any]) -> dict[str, Any]:
+    """The evaluation to compare with: the newest of another checkpoint in the same episodes, else the newest of all."""
+    paired = [each for each in earlier if are_paired(new, each) and each["checkpoint"] != new["checkpoint"]]
+    return (paired or earlier)[-1]
 
 
 def _rewards(summary: Mapping[str, Any]) -> list[Any]:

@@ -12,7 +12,11 @@ from worker.evaluation.episodes import Episodes
 
 
 def write_table(
-    path: Path, played: Episodes, seed: int | None, further: Mapping[str, Sequence[Any]] | None = None
+    path: Path,
+    played: Episodes,
+    seed: int | None,
+    facts: Mapping[str, str],
+    further: Mapping[str, Sequence[Any]] | None = None,
 ) -> None:
     """Write the episodes, whole or not at all. The same episodes are the same bytes. Raises OSError.
 
@@ -23,6 +27,7 @@ def write_table(
         path: Of the file.
         played: The episodes.
         seed: Of the worlds.
+        facts: What was evaluated, for the key-value metadata of the file: ``run``, ``checkpoint``, ``task``, ``config`` (JSON).
         further: Columns of further facts, by name; numbers are float64 unless all are whole.
     """
     import pyarrow as arrow
@@ -45,7 +50,7 @@ def write_table(
         text = all(isinstance(value, str) for value in values)
         columns[name] = arrow.array(values, arrow.string() if text else arrow.int64() if whole else arrow.float64())
     buffer = io.BytesIO()
-    pyarrow.parquet.write_table(arrow.table(columns), buffer)
+    pyarrow.parquet.write_table(arrow.table(columns).replace_schema_metadata(dict(facts)), buffer)
     for left in path.parent.glob(f".{path.name}.*.tmp"):  # of an evaluation that was killed
         left.unlink(missing_ok=True)
     write_atomic(path, buffer.getvalue())

@@ -71,7 +71,7 @@ def tables(plan: Plan) -> dict[str, list[Row]]:
         {"name": name, "value by iteration": ", ".join(f"{iteration:g}: {value:g}" for iteration, value in points)}
         for name, points in plan.config.curriculum.items()
     ]
-    found["configuration"] = [{"name": path, "value": _as_json(value)} for path, value in _settings_of(plan.config)]
+    found["configuration"] = [{"name": path, "value": as_json(value)} for path, value in _settings_of(plan.config)]
     return {section: rows for section, rows in found.items() if rows}
 
 
@@ -106,8 +106,8 @@ def _settings_of(config: Any) -> Iterator[tuple[str, Any]]:
             yield item.name, value
 
 
-def _as_json(value: Any) -> str:
-    """A value as a job's YAML may have it."""
+def as_json(value: Any) -> str:
+    """A value of a configuration, or a whole one, as a job's YAML may have it."""
     return json.dumps(value, default=_plain)
 
 

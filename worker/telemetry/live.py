@@ -21,7 +21,8 @@ from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.progress import Activity, loading
-from worker.telemetry.recording import Recording, recover
+from worker.telemetry.recording import Recording
+from worker.telemetry.recovering import recover
 from worker.telemetry.rows import Rows
 from worker.telemetry.segment import Segment
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patience: float = PATIENCE) -> Recording:
     """Record a running training until each world has ended so many episodes, the training ends, or SIGINT comes.
 
+    Where the training dies, the recording goes on with its next attempt on this machine.
+
     Args:
         run: The run.
         job: The job that trains, for its log.
@@ -41,7 +44,7 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         patience: Seconds after which a training that does not answer is given up.
 
     Raises:
-        UserError: It can't be recorded; one line says why.
+        UserError: It can't be recorded, or it died and does not go on: then the file is whole, but shorter; one line says which.
     """
     stop: list[int] = []
     activity = Activity()
@@ -49,30 +52,38 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
     asking = Asking(run, worlds, f"record its newest checkpoint: muster record {run.name} -o FILE.mcap")
     try:
         segment = asking.attach(patience, stop, activity)
-    except UserError:
-        signal.signal(signal.SIGINT, before)
-        activity.end()
-        raise
-    there = asking.worlds
-    try:
-        activity.say(loading(run, there))
-        recording = _open(run, there, output, {"job": job})
-        if there < worlds:
-            print(f"note: the training has {counted(there, 'world')} on its main rank", flush=True)
+        activity.say(loading(run, asking.worlds))
+        recording = _open(run, asking.worlds, output, {"job": job})
+        if asking.worlds < worlds:
+            print(f"note: the training has {counted(asking.worlds, 'world')} on its main rank", flush=True)
         if asking.note:
             print(f"note: {asking.note}", flush=True)
         log = LogFollower(run, job)
         for _ in log.drain():
-            pass  # what was said before the recording began
+            pass  # older than the recording
         segment.skip()
-        for rows in _rows(segment, asking, stop):
-            recording.write(rows)
-            activity.count("recording: episode", recording.ended(episodes), episodes * there)
-            for line in log.poll():
-                recording.say(line.text, name=f"rank {line.rank}" if line.rank is not None else f"node {line.node}")
-            if recording.complete(episodes):
+        wanted = episodes * asking.worlds
+        while True:
+            for rows in _rows(segment, asking, stop, since=recording.steps):
+                recording.write(rows)
+                activity.count("recording: episode", recording.ended(episodes), wanted)
+                for line in log.poll():
+                    recording.say(line.text, name=f"rank {line.rank}" if line.rank is not None else f"node {line.node}")
+                if recording.complete(episodes):
+                    break
+            if stop or recording.complete(episodes) or segment.closed:
                 break
-        recording.finish()
+            recording.interrupt("the training died; the recording goes on with its next attempt")
+            activity.say(f"the training of run {run.name} died; waiting for its next attempt on this machine …")
+            try:
+                segment = asking.attach(patience, stop, activity)
+            except UserError as error:
+                path, ended = recording.finish(), recording.ended(episodes)
+                raise UserError(f"{error}; {path} has {ended} of {counted(wanted, 'episode')}") from None
+        path, ended = recording.finish(), recording.ended(episodes)
+        if ended < wanted:
+            why = "it was interrupted" if stop else "the training ended"
+            print(f"note: {why} after {ended} of {counted(wanted, 'episode')}", flush=True)
         return recording
     finally:
         activity.end()
@@ -80,14 +91,14 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         asking.withdraw()
 
 
-def _rows(segment: Segment, asking: Asking, stop: list[int]) -> Iterator[Rows]:
-    """The rows of the first worlds as they come, numbered from 0, until the training ends or is killed."""
+def _rows(segment: Segment, asking: Asking, stop: list[int], since: int) -> Iterator[Rows]:
+    """The rows of the first worlds as they come, numbered from ``since``, until the training ends or is killed."""
     first: int | None = None
     worlds = asking.worlds
     while not stop:
         over = segment.closed or asking.is_answered_by_nobody
         for rows in segment.take():
-            first = rows.first if first is None else first
+            first = rows.first - since if first is None else first
             yield rows.of_worlds(worlds, since=first)
         if over:
             return
@@ -141,8 +152,9 @@ def main() -> int:
             if made is None:
                 print(f"{given.recover}: it is whole already; nothing had to be recovered", flush=True)
                 return 0
-            path, count = made
-            print(f"recovered: {counted(count, 'message')}; written: {path}", flush=True)
+            print(f"recovered: {counted(made.messages, 'message')}; written: {made.path}", flush=True)
+            if made.losses:
+                raise UserError(f"{given.recover}: {made.losses}; the rest is in {made.path.name}")
             return 0
         done = record(Run(given.run), given.job, given.worlds, given.episodes, given.output)
         lost = f", {counted(done.lost, 'step')} lost" if done.lost else ""

@@ -6,6 +6,7 @@ served from here, with a Content-Security-Policy that lets the browser reach not
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import re
@@ -30,8 +31,10 @@ from shared_store.tied import tied
 from worker.errors import UserError
 
 LOOPBACK = "127.0.0.1"
-PORT = 9090
-"""Of the page, where it is free and no other one is asked for."""
+PORTS = range(9090, 9100)
+"""Of the page: the first free one, where no other is asked for."""
+_RELAYED = ("Accept", "Content-Type", "X-Grpc-Web", "X-User-Agent", "Grpc-Timeout")
+"""Headers of a request for the stream that Rerun's server gets."""
 _STARTED_WITHIN = 30.0
 """Seconds in which Rerun's server answers."""
 _ASSETS = {
@@ -40,6 +43,8 @@ _ASSETS = {
     "/favicon.ico": "image/x-icon",
     "/apple-touch-icon.png": "image/png",
 }
+_LARGEST_REQUEST = 1 << 20
+"""Bytes; a page asks, and sends nothing of a recording."""
 _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Asks this machine, whatever proxy the environment names."""
 _ELSEWHERE = re.compile(r"<link\b[^>]*https://[^>]*>")
@@ -58,14 +63,14 @@ class Page:
     """Rerun's server and web viewer, until :meth:`close`.
 
     Args:
-        port: Of the page; None: 9090, or a free one.
+        port: Of the page and its stream; None: the first free one of 9090 to 9099.
         memory: What Rerun's server may keep for pages that are opened later, such as ``"256MB"``; then the oldest goes.
         file: An .rrd file to be served as it is.
         framed_by: Origins whose pages may show this one in a frame, such as ``"http://127.0.0.1:8080"``.
 
     Attributes:
         url: Of the page, for people.
-        server: Of Rerun's server, for the SDK and for viewers.
+        server: Of Rerun's server, for the SDK.
 
     Raises:
         UserError: Rerun is missing or does not start, or the port is taken.
@@ -96,10 +101,7 @@ class Page:
             stderr=self._log,
         )
         self._http.__dict__.update(
-            assets=f"http://{own}:{assets}",
-            stream=f"http://{own}:{stream}",
-            query=self._query(),
-            frames=" ".join(["'self'", *framed_by]),
+            assets=f"http://{own}:{assets}", stream=(own, stream), frames=" ".join(["'self'", *framed_by])
         )
         try:
             self._wait(own, stream, assets)
@@ -133,9 +135,6 @@ class Page:
         self._http.shutdown()
         self.close()
 
-    def _query(self) -> str:
-        return urlencode({"url": self.server, "hide_welcome_screen": "1", "persist": "0", "theme": "dark"})
-
     def _wait(self, address: str, *ports: int) -> None:
         until = time.monotonic() + _STARTED_WITHIN
         for port in ports:
@@ -153,14 +152,17 @@ class Page:
 
 def _listen(port: int | None) -> ThreadingHTTPServer:
     """The page's server. Raises UserError where a port that was asked for can't be had."""
-    try:
-        return ThreadingHTTPServer((LOOPBACK, PORT if port is None else port), _Handler)
-    except OSError as error:
-        if port is None:
-            return ThreadingHTTPServer((LOOPBACK, 0), _Handler)
+    ports = PORTS if port is None else (port,)
+    for each in ports:
+        try:
+            return ThreadingHTTPServer((LOOPBACK, each), _Handler)
+        except OSError as error:
+            why = error.strerror or error
+    if port is None:
         raise UserError(
-            f"--port {port}: the page can't be served there ({error.strerror or error}); leave --port out for a free one"
-        ) from error
+            f"the page can't be served on any port of {PORTS[0]} to {PORTS[-1]} ({why}); choose one by --port"
+        )
+    raise UserError(f"--port {port}: the page can't be served there ({why}); leave --port out for a free one")
 
 
 def _free_port(address: str) -> int:
@@ -192,15 +194,20 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """One of the page's files; ``/`` leads to the page with the view in it."""
         own = self.server.__dict__
-        name, _, port = (self.headers.get("Host") or "").partition(":")
-        if name not in (LOOPBACK, "localhost") or (port or "80") != str(self.server.server_port):
-            self.send_error(403, "this page is served to this machine alone")
+        if not self._is_ours():
             return
+        host = self.headers["Host"]
         asked = urlsplit(self.path)
         try:
             if asked.path == "/" and "url=" not in asked.query:
                 self.send_response(302)
-                self.send_header("Location", f"http://{LOOPBACK}:{self.server.server_port}/?{own['query']}")
+                query = {
+                    "url": f"rerun+http://{host}/proxy",
+                    "hide_welcome_screen": "1",
+                    "persist": "0",
+                    "theme": "dark",
+                }
+                self.send_header("Location", f"http://{host}/?{urlencode(query)}")
                 self.send_header("Content-Length", "0")
                 self.end_headers()
             elif asked.path == "/":
@@ -219,12 +226,50 @@ class _Handler(BaseHTTPRequestHandler):
         except (BrokenPipeError, ConnectionResetError):
             pass  # the page was closed meanwhile
 
+    def do_POST(self) -> None:
+        """A request for the stream (gRPC-web), which Rerun's server answers: so page and stream share one port, for tunnels."""
+        if not self._is_ours():
+            return
+        if not self.path.startswith("/rerun."):
+            self.send_error(404)
+            return
+        own = http.client.HTTPConnection(*self.server.__dict__["stream"])
+        try:
+            body = self.rfile.read(min(int(self.headers.get("Content-Length") or 0), _LARGEST_REQUEST))
+            headers = {name: self.headers[name] for name in _RELAYED if name in self.headers}
+            own.request("POST", self.path, body, headers)
+            answer = own.getresponse()
+            self.send_response(answer.status)
+            for name, value in answer.getheaders():
+                if name.lower() in ("content-type", "grpc-status", "grpc-message", "grpc-encoding"):
+                    self.send_header(name, value)
+            self.end_headers()
+            while part := answer.read1(1 << 16):
+                self.wfile.write(part)
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # the page was closed meanwhile
+        except (OSError, ValueError, http.client.HTTPException):
+            self.close_connection = True  # the viewer's server is gone
+        finally:
+            own.close()
+
+    def _is_ours(self) -> bool:
+        """Whether the request names this machine, and comes from no page of another origin; else it is refused.
+
+        The port is that of a tunnel's other end, perhaps. A page of another name (DNS rebinding) names itself.
+        """
+        host = self.headers.get("Host") or ""
+        ours = host.partition(":")[0] in (LOOPBACK, "localhost")
+        if ours and self.headers.get("Origin") in (None, f"http://{host}"):
+            return True
+        self.send_error(403, "this page is served to this machine alone")
+        return False
+
     def _begin(self, kind: str, size: str | None) -> None:
-        stream = self.server.__dict__["stream"]
         allowed = {
             "default-src": "'self' 'unsafe-inline' blob: data:",
             "script-src": "'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
-            "connect-src": f"'self' {stream} blob: data:",
+            "connect-src": "'self' blob: data:",
             "frame-ancestors": self.server.__dict__["frames"],
         }
         self.send_response(200)

@@ -225,13 +225,13 @@ def _film(buffer: io.BytesIO, pictures: Sequence[np.ndarray], rate: float) -> No
 
     import av
 
-    height, width = (side - side % 2 for side in pictures[0].shape[:2])  # H.264 halves the colours
+    height, width = pictures[0].shape[:2]
     with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": "20", "preset": "veryfast"}
         for picture in pictures:
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,12 +20,17 @@ from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.rows import Rows
+from worker.telemetry.sound import CHANNELS, CHECKSUM, checksum
 
 if TYPE_CHECKING:
+    from mcap.writer import Writer
+
     from worker.telemetry.stage import Stage
 
-_CHUNK = 256 << 10
-"""Bytes after which a chunk is closed and compressed."""
+CHUNK = 256 << 10
+"""Bytes of messages after which a chunk is closed and compressed."""
+_FAR = 1 << 20
+"""Bytes of a chunk from which on equal parts are looked for all over it."""
 _FLUSH_SECONDS = 1.0
 """Between two chunks that are closed for the sake of what a kill would lose [s]."""
 PARTIAL = ".partial"
@@ -42,6 +47,25 @@ def check_target(path: Path, *suffixes: str) -> None:
         raise UserError(f"{path}: the directory {path.absolute().parent} does not exist; create it, or name another")
     if not os.access(path.absolute().parent, os.W_OK):
         raise UserError(f"{path}: {path.absolute().parent} can't be written to; name another directory")
+
+
+def writer_to(file: IO[bytes]) -> Writer:
+    """A writer of chunks that its caller ends with ``flush``. What stands in a chunk several times, such as each world's copy of the
+    robot's meshes, takes space once.
+    """
+    from mcap import writer
+
+    def compress(data: bytes) -> bytes:
+        if len(data) < _FAR:
+            return zstandard.compress(data)
+        # by itself zstd looks back 2 MiB; decoders take windows of up to 2^27 bytes
+        options = zstandard.ZstdCompressionParameters.from_level(3, window_log=27, enable_ldm=True)
+        return zstandard.ZstdCompressor(compression_params=options).compress(data)
+
+    import zstandard
+
+    setattr(writer, "zstandard", SimpleNamespace(compress=compress))  # noqa: B010 (mcap has no parameter for it)
+    return writer.Writer(file, chunk_size=1 << 40, enable_data_crcs=True)
 
 
 class Recording:
@@ -64,12 +88,15 @@ class Recording:
         facts: Mapping[str, str],
         attachments: Mapping[str, bytes],
     ) -> None:
-        from mcap.writer import CompressionType, Writer
-
         self.path, self._stage, self._facts = path, stage, dict(facts)
         self.partial = path.with_name(path.name + PARTIAL)
         self._began = time.time_ns()
         self._channels: dict[str, int] = {}
+        self._table: list[dict[str, Any]] = []
+        self._size = 0
+        """Bytes of messages in the running chunk."""
+        self._repeated = 0
+        """How many channels of the table the file repeats in an attachment."""
         self._schemas: dict[str, int] = {}
         self._sums = np.zeros((stage.worlds, 2))
         """Return and steps of each running episode."""
@@ -81,7 +108,7 @@ class Recording:
         """Whether each running episode was recorded from its first step on, without a gap."""
         try:
             self._file = self.partial.open("wb")
-            self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
+            self._writer = writer_to(self._file)
             self._writer.start("ros2", "muster")
             self._attach(attachments)
             self._begin()
@@ -97,8 +124,8 @@ class Recording:
                 self._whole[:] = self._just_ended[:] = False
             for step in range(len(rows)):
                 self._write_step(rows, step)
-            if time.monotonic() - self._flushed > _FLUSH_SECONDS:
-                self._flush()
+                if self._size > CHUNK or time.monotonic() - self._flushed > _FLUSH_SECONDS:
+                    self._flush()
         except OSError as error:
             raise self._full(error) from error
 
@@ -110,8 +137,14 @@ class Recording:
         """Number of episodes that have ended, at most ``episodes`` for each world."""
         return int(np.minimum(self._ended, episodes).sum())
 
+    def interrupt(self, text: str) -> None:
+        """The worlds begin anew, as after a crash: the episodes that were running have no end. ``text`` is for the log."""
+        self._sums[:] = 0.0
+        self._whole[:] = self._just_ended[:] = False
+        self.say(text, level=30)
+
     def say(self, text: str, level: int = 20, name: str = "muster") -> None:
-        """Add a line of the job's log, at the time of the last step."""
+        """Add a line of the job's log, at the time of the newest step."""
         now = self._time(self.steps, self._rate)
         self._add("/rosout", "rcl_interfaces/msg/Log", now, messages.log(now, level, name, text))
 
@@ -165,8 +198,8 @@ class Recording:
 
     def _write_step(self, rows: Rows, step: int) -> None:
         stage, layout = self._stage, rows.layout
-        self._rate, number = layout.control_hz, rows.first + step + 1
-        now = self._time(number, layout.control_hz)
+        self._rate, self.steps = layout.control_hz, rows.first + step + 1
+        now = self._time(self.steps, layout.control_hz)
         frames = [
             (f"world_{world}", f"world_{world}/{link}", pose)
             for world, poses in enumerate(stage.pose(rows.coordinates[step]))
@@ -185,7 +218,6 @@ class Recording:
             for world, image in enumerate(seen):
                 data = messages.picture(now, f"world_{world}", image)
                 self._add(f"/world_{world}/{camera}/image/compressed", "sensor_msgs/msg/CompressedImage", now, data)
-        self.steps = number
 
     def _write_world(self, rows: Rows, step: int, world: int, now: int) -> None:
         layout, frame = rows.layout, f"world_{world}"
@@ -228,7 +260,7 @@ class Recording:
             "end": cause,
             "complete": "true" if self._whole[world] else "false",
         }
-        self._writer.add_metadata("episode", known)
+        self._writer.add_metadata("episode", {**known, CHECKSUM: checksum(known)})
         self.say(
             f"world {world}: episode {fields['episode']} ended by {cause} after {counted(int(steps), 'step')}, return {total:.4g}"
         )
@@ -238,11 +270,18 @@ class Recording:
             if kind not in self._schemas:
                 text = messages.definition(kind).encode()
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], _qos(topic))
+            schema, quality = self._schemas[kind], _qos(topic)
+            number = self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, quality)
+            self._table.append({"id": number, "topic": topic, "schema_id": schema, "type": kind, "metadata": quality})
         self._writer.add_message(self._channels[topic], now, data, now)
+        self._size += len(data)
 
     def _flush(self) -> None:
         self._writer.flush()
+        self._size = 0
+        if self._repeated < len(self._table):
+            self._repeated = len(self._table)
+            self._attach({CHANNELS: json.dumps(self._table).encode()})
         self._file.flush()
         self._flushed = time.monotonic()
 
@@ -265,71 +304,3 @@ _LATCHED = {
 def _qos(topic: str) -> dict[str, str]:
     latched = topic in ("/tf_static", "/robot_description", "/ground") or topic.endswith("/scene")
     return {"offered_qos_profiles": json.dumps([_LATCHED])} if latched else {}
-
-
-def recover(partial: Path) -> tuple[Path, int] | None:
-    """Make a readable file of one that was cut short, beside it; returns its path and how many messages it has.
-
-    All chunks that were written whole are kept. The cut file stays as it is. Of a file that is whole nothing is made: None.
-
-    Raises:
-        UserError: There is no such file, or no control step in it can be read.
-    """
-    from mcap.exceptions import McapError
-    from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata, Schema
-    from mcap.stream_reader import StreamReader
-    from mcap.writer import CompressionType, Writer
-
-    if not partial.is_file():
-        raise UserError(f"{partial}: there is no such file; a recording that was cut short ends on .mcap{PARTIAL}")
-    name = partial.name.removesuffix(PARTIAL)
-    target = partial.with_name(name if name != partial.name else f"{partial.stem}-recovered{partial.suffix}")
-    hidden = target.with_name(f".{target.name}.tmp")
-    schemas: dict[int, int] = {0: 0}
-    channels: dict[int, int] = {}
-    stepping: set[int] = set()
-    count = steps = 0
-    whole = False
-    try:
-        with partial.open("rb") as source, hidden.open("wb") as made:
-            writer = Writer(made, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
-            started = False
-            try:
-                for record in StreamReader(source, emit_chunks=False).records:
-                    if isinstance(record, Header):
-                        writer.start(record.profile, record.library)
-                        started = True
-                    elif isinstance(record, Schema) and record.id not in schemas:
-                        schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-                    elif isinstance(record, Channel) and record.id not in channels:
-                        own = record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
-                        channels[record.id] = writer.register_channel(*own)
-                        stepping |= {record.id} if record.topic.endswith("/rl/step") else set()
-                    elif isinstance(record, Message):
-                        where = channels[record.channel_id], record.log_time, record.data, record.publish_time
-                        writer.add_message(*where, record.sequence)
-                        count, steps = count + 1, steps + (record.channel_id in stepping)
-                    elif isinstance(record, Attachment):
-                        told = record.create_time, record.log_time, record.name, record.media_type, record.data
-                        writer.add_attachment(*told)
-                    elif isinstance(record, Metadata):
-                        writer.add_metadata(record.name, record.metadata)
-                    elif isinstance(record, Footer):
-                        whole = True
-            except (McapError, EOFError, ValueError, KeyError, struct.error):
-                pass  # here it was cut
-            if not started:
-                raise UserError(f"{partial}: it does not begin as an MCAP file does; nothing can be recovered")
-            if whole:
-                return None
-            if not steps:
-                raise UserError(f"{partial}: it ends before the first control step; there is nothing to recover")
-            writer.finish()
-        if target.exists():
-            raise UserError(f"{target}: it exists already; move it away first")
-        os.replace(hidden, target)
-    except OSError as error:
-        raise UserError(f"{target}: it can't be written ({error.strerror or error})") from error
-    finally:
-        hidden.unlink(missing_ok=True)
-    return target, count

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import struct
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from worker.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.recording import PARTIAL
 from worker.telemetry.screen import Look
+from worker.telemetry.sound import SoundRecords
 
 BATCH = 256
 """Control steps that are handed out together."""
@@ -66,6 +66,7 @@ class Replay:
     Attributes:
         look: What is seen.
         cut: Whether the file ends before its end; known once all :meth:`parts` were read.
+        losses: What a damaged file has lost, in words; known then, too.
         count: Control steps that were read.
 
     Raises:
@@ -73,7 +74,7 @@ class Replay:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.cut, self.count = path, False, 0
+        self.path, self.cut, self.losses, self.count = path, False, "", 0
         if not path.is_file():
             raise UserError(f"{path}: there is no such file")
         shapes: dict[str, bytes] = {}
@@ -152,32 +153,24 @@ class Replay:
 
     def _messages(self) -> Iterator[tuple[str, str, int, bytes]]:
         """Type, topic, time [ns] and content, as they were written. Sets :attr:`cut`. Raises UserError where it is no MCAP file."""
-        from mcap.exceptions import McapError
-        from mcap.records import Channel, DataEnd, Message, Schema
-        from mcap.stream_reader import StreamReader
+        from mcap.records import Channel, Message, Schema
 
         kinds: dict[int, str] = {}
         channels: dict[int, tuple[str, str]] = {}
+        records = SoundRecords(self.path)
         self.cut = True
-        begun = False
         try:
-            with self.path.open("rb") as file:
-                for record in StreamReader(file, emit_chunks=False).records:
-                    begun = True
-                    if isinstance(record, Schema):
-                        kinds[record.id] = record.name
-                    elif isinstance(record, Channel):
-                        channels[record.id] = kinds.get(record.schema_id, ""), record.topic
-                    elif isinstance(record, Message):
-                        yield *channels[record.channel_id], record.log_time, record.data
-                    elif isinstance(record, DataEnd):
-                        self.cut = False
-                        return
+            for record in records:
+                if isinstance(record, Schema):
+                    kinds[record.id] = record.name
+                elif isinstance(record, Channel):
+                    channels[record.id] = kinds.get(record.schema_id, ""), record.topic
+                elif isinstance(record, Message):
+                    yield *channels[record.channel_id], record.log_time, record.data
         except OSError as error:
             raise UserError(f"{self.path}: it can't be read ({error.strerror or error})") from error
-        except (McapError, EOFError, ValueError, KeyError, struct.error):
-            pass  # here it was cut
-        if not begun:
+        self.cut, self.losses = not records.whole and not records.damaged, records.losses()
+        if not records.found:
             raise UserError(
                 f"{self.path}: it does not begin as an MCAP file does; give an .mcap, .mcap{PARTIAL} or .rrd file"
             )

@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import argparse
+import getpass
 import os
 import signal
+import socket
 import sys
 import time
 import webbrowser
@@ -263,6 +265,8 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int],
             screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
             if stop:
                 return
+        if replay.losses:
+            print(f"note: {path.name} is {replay.losses}; the rest is shown", flush=True)
         if replay.cut:
             print(f"note: {path.name} was cut short; it is shown up to control step {replay.count}", flush=True)
         print(
@@ -310,6 +314,10 @@ def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | No
         page = Page(given.port, given.memory, file, given.framed_by)
         activity.end()
         print(f"the view is at {page.url}", flush=True)
+        if "SSH_CONNECTION" in os.environ:
+            port = page.url.rpartition(":")[2]
+            there = f"{getpass.getuser()}@{socket.gethostname()}"
+            print(f"on your own machine, for a browser there: ssh -N -L {port}:127.0.0.1:{port} {there}", flush=True)
         if given.browser:
             webbrowser.open(page.url)
         return page

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api import permissions
-from orchestrator.api.arns import ACCOUNT, compute_environment_arn, ecs_arn, plain_name, policy_arn
+from orchestrator.api.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
@@ -239,7 +239,7 @@ def _describe(context: Context, compute_environment: ComputeEnvironment) -> dict
         "tags": compute_environment.tags,
     }
     if document["type"] == "MANAGED":
-        document.setdefault("serviceRole", f"arn:aws:iam::{ACCOUNT}:role{_SERVICE_ROLE}")
+        document.setdefault("serviceRole", iam_arn(f"role{_SERVICE_ROLE}"))
         document.setdefault("updatePolicy", {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30})
     if is_built_in(compute_environment):
         document["computeResources"] = {
@@ -263,6 +263,6 @@ def _own_resources(context: Context, compute_environment: ComputeEnvironment) ->
         "instanceTypes": ["optimal"],
         "subnets": [],
         "securityGroupIds": [],
-        "instanceRole": f"arn:aws:iam::{ACCOUNT}:instance-profile/muster",
+        "instanceRole": iam_arn("instance-profile/muster"),
         "tags": {},
     }

@@ -180,9 +180,12 @@ def node_status(job: Job, node: int) -> str:
     return job.status
 
 
-def stream_name(job: Job, attempt: int, node: int) -> str:
-    """Name of the log stream of one node and attempt; AWS allows no colon in it, which the ids of array children have."""
-    return f"{job.name}/{job.id.replace(':', '.')}/{attempt}/node-{node}"
+def stream_name(job: Job, attempt: int, node: int, prefix: str | None = None) -> str:
+    """Name of the log stream of one node and attempt; AWS allows no colon in it, which the ids of array children have.
+
+    ``prefix``: of its container's ``logConfiguration``, where that has one.
+    """
+    return f"{prefix or job.name}/{job.id.replace(':', '.')}/{attempt}/node-{node}"
 
 
 def _common(job: Job, reason: str | None) -> dict[str, Any]:
@@ -225,7 +228,9 @@ def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
     detail = {
         "exitCode": record.exit_code if record else None,
         "reason": record.reason[:255] if record and record.reason else None,
-        "logStreamName": stream_name(job, attempt.number, node) if attempt.started_at else None,
+        "logStreamName": stream_name(job, attempt.number, node, record.log_prefix if record else None)
+        if attempt.started_at
+        else None,
         "containerInstanceArn": ecs_arn("container-instance", attempt.environment, record.host) if record else None,
         "taskArn": ecs_arn(
             "task", attempt.environment, uuid.uuid5(uuid.NAMESPACE_OID, f"{job.id}/{attempt.number}/{node}").hex

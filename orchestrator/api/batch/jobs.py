@@ -21,8 +21,6 @@ from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
 
-_BEFORE_NAME = len(definition_arn("", 1)) - 1
-"""Position of the name in a definition's ARN, from 1."""
 _EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
 
 
@@ -143,10 +141,11 @@ def _by_definition(value: str) -> Any:
     if value.startswith("arn:"):
         return Job.definition == value
     name, _, revision = value.partition(":")
+    place = len(definition_arn("", 1)) - 1  # of the name in an ARN, from 1
     if revision and not value.endswith("*"):
-        return func.substr(Job.definition, _BEFORE_NAME) == value
+        return func.substr(Job.definition, place) == value
     start = value[:-1] if value.endswith("*") else f"{name}:"
-    return func.substr(Job.definition, _BEFORE_NAME, len(start)) == start  # LIKE would not heed the case in SQLite
+    return func.substr(Job.definition, place, len(start)) == start  # LIKE would not heed the case in SQLite
 
 
 def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:

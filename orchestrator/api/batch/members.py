@@ -22,13 +22,14 @@ _REFUSED = {
 }
 """Members of ``containerProperties`` that a definition can't have, with what to do. False and empty values say nothing."""
 _LOG_OPTIONS = (
-    *("awslogs-region", "awslogs-create-group", "awslogs-stream-prefix", "awslogs-endpoint", "mode"),
-    "max-buffer-size",
+    *("awslogs-group", "awslogs-stream-prefix", "awslogs-region", "awslogs-create-group", "awslogs-datetime-format"),
+    *("awslogs-multiline-pattern", "awslogs-endpoint", "mode", "max-buffer-size"),
 )
-"""Options of the driver ``awslogs`` that change nothing in what can be read here."""
+"""Options of the driver ``awslogs``; all but the first two change nothing here."""
+_STREAM_PREFIX = re.compile(r"[^:*]{1,256}")
 _USER = re.compile(r"[a-z0-9_][a-z0-9_-]{0,30}(:[a-z0-9_][a-z0-9_-]{0,30})?")
 _VOLUME_KINDS = ("host", "efsVolumeConfiguration", "s3filesVolumeConfiguration")
-LOG_GROUP = "/aws/batch/job"
+_GROUP = re.compile(r"(?!aws/)[.\-_/#A-Za-z0-9]{1,512}")
 
 
 def check_consumables(request: Mapping[str, Any], where: str) -> None:
@@ -64,7 +65,7 @@ def check_members(container: Mapping[str, Any], where: str) -> None:
 
 
 def _check_log(log: Mapping[str, Any], where: str) -> None:
-    """Logs are kept in the store and read as CloudWatch Logs; nothing else can be configured."""
+    """Logs are kept in the store and read as CloudWatch Logs, in the group and with the prefix that are named here."""
     if not log:
         return
     if log["logDriver"] != "awslogs":
@@ -74,12 +75,22 @@ def _check_log(log: Mapping[str, Any], where: str) -> None:
     if log.get("secretOptions"):
         raise ClientError(f"{where}: logConfiguration secretOptions is not supported; leave it out")
     for name, value in (log.get("options") or {}).items():
-        if name == "awslogs-group" and value != LOG_GROUP:
-            raise ClientError(
-                f"{where}: logConfiguration awslogs-group {value[:200]!r}: all logs are in {LOG_GROUP}; name that, or leave it out"
-            )
-        if name not in (*_LOG_OPTIONS, "awslogs-group"):
+        if name not in _LOG_OPTIONS:
             raise ClientError(f"{where}: logConfiguration option {name[:100]!r} is not supported; leave it out")
+        if name == "awslogs-group":
+            check_log_group(f"{where}: logConfiguration awslogs-group", value)
+        if name == "awslogs-stream-prefix" and not _STREAM_PREFIX.fullmatch(value):
+            raise ClientError(
+                f"{where}: logConfiguration awslogs-stream-prefix {value[:200]!r}: 1 to 256 characters without ':' and '*'"
+            )
+
+
+def check_log_group(where: str, name: str) -> None:
+    """Raises ClientError for a name that no log group can have on AWS."""
+    if not _GROUP.fullmatch(name):
+        raise ClientError(
+            f"{where} {name[:200]!r}: 1 to 512 letters, digits and the characters . - _ / #, not beginning with aws/"
+        )
 
 
 def _check_secrets(container: Mapping[str, Any], where: str) -> None:

@@ -24,6 +24,7 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
+from orchestrator.persistence import log_groups
 from orchestrator.persistence.gangs import gangs
 from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.persistence.ownership import owner_of
@@ -65,6 +66,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         if teacher:
             hold_teacher(context, job.run, teacher)
     context.session.add(job)
+    log_groups.add_missing(context.session, gang.log_groups, job.owner)
     return answer(job)
 
 
@@ -131,6 +133,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     properties = rules.substitute(_properties(document, request), parameters)
     gang = rules.check_nodes(properties, document["type"], complete=True)
     _check_secrets(context, queue, gang)
+    log_groups.check_room(context.session, gang.log_groups)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     copy = context.making or context.teacher
@@ -202,6 +205,8 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
         raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
+    if holder and not permissions.is_visible(holder):
+        raise ClientError(f"run {run} is being written by another job; choose another name")
     if holder:
         raise ClientError(
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"

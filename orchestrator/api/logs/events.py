@@ -249,6 +249,14 @@ def first_and_last(path: Path) -> tuple[int, int, int] | None:
     return first, max(first, _milliseconds(max(tail, default=b""))), sum(sizes)
 
 
+def stored_bytes(path: Path) -> int:
+    """Size of a log [bytes]; 0 where it has no file. Raises OSError."""
+    try:
+        return sum(os.stat(segment.path).st_size for segment in segments_of(path))
+    except FileNotFoundError:  # deleted since it was listed
+        return 0
+
+
 def _milliseconds(stamp: bytes) -> int:
     """Unix time [ms] of a line's stamp; 0 for none."""
     return _seconds(stamp[:19]) * 1000 + int(stamp[20:23]) if stamp else 0

@@ -8,7 +8,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Collection, Iterator
 from typing import Any
 
 from orchestrator.api.http.following import looked, pause
@@ -43,13 +43,18 @@ log = logging.getLogger("muster.api")
 class LiveTail:
     """Follows streams from the moment of its construction. Not for more than one thread at a time."""
 
-    def __init__(self, reconciler: Reconciler, wanted: Callable[[str], bool], matches: Matcher) -> None:
+    def __init__(
+        self, reconciler: Reconciler, groups: Collection[str], wanted: Callable[[str], bool], matches: Matcher
+    ) -> None:
         """Args:
         controller: Whose jobs' logs are followed.
+        groups: Names of the log groups.
         wanted: Whether a stream is asked for, by its name.
         matches: Whether a line is asked for.
         """
-        self._reconciler, self._wanted, self._matches = reconciler, wanted, matches
+        self._reconciler, self._groups, self._wanted, self._matches = reconciler, groups, wanted, matches
+        self.group_of: dict[str, str] = {}
+        """Group of each stream that was followed."""
         self.calls = reconciler.followed
         self._started = self._asked = now()
         self._next_refresh = 0.0
@@ -95,20 +100,23 @@ class LiveTail:
         asked = now()
         with self._reconciler.database.session() as session:
             since = max(self._started, self._asked - _OVERLAP)
-            streams = newest_streams(session, self._reconciler.store, since=since)
+            streams = newest_streams(session, self._reconciler.store, self._groups, since=since)
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
         found = [stream for stream in streams if stream.name not in self._over and self._wanted(stream.name)]
         self._open.update({stream.name: stream.file for stream in found})
+        self.group_of.update({stream.name: stream.group for stream in found})
         return [stream.name for stream in found if not stream.live]
 
 
-async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: threading.Event) -> AsyncIterator[bytes]:
+async def messages(
+    tail: LiveTail, start: dict[str, Any], account: str, closing: threading.Event
+) -> AsyncIterator[bytes]:
     """The session as event-stream messages, until ``closing``, or three hours are over.
 
     Args:
         tail: The session, which has begun already: the client may write as soon as it sees the first message.
         start: The request, which ``sessionStart`` repeats.
-        group: Log group of the events, with the account.
+        account: Of the log groups.
         closing: Set when the server ends.
     """
     identity = {"requestId": str(uuid.uuid4()), "sessionId": str(uuid.uuid4())}
@@ -133,19 +141,20 @@ async def messages(tail: LiveTail, start: dict[str, Any], group: str, closing: t
             yield eventstream.exception("SessionTimeoutException", "the session was open for three hours")
             return
         if events or current >= beat:
-            for update in _updates(events, group, sampled):
+            identified = [(event, f"{account}:{tail.group_of[event.stream]}") for event in events]
+            for update in _updates(identified, sampled):
                 yield update
             beat = current + 1.0
         await asyncio.sleep(max(pause(_POLL), 4 * (current - before)))
 
 
-def _updates(events: list[Event], group: str, sampled: bool) -> Iterator[bytes]:
-    """One sessionUpdate for every MOST_EVENTS events; an empty one where there are none."""
+def _updates(events: list[tuple[Event, str]], sampled: bool) -> Iterator[bytes]:
+    """One sessionUpdate for every MOST_EVENTS events, each with its group; an empty one where there are none."""
     batches = [events[first : first + MOST_EVENTS] for first in range(0, len(events), MOST_EVENTS)] or [[]]
-    return (_update(batch, group, sampled) for batch in batches)
+    return (_update(batch, sampled) for batch in batches)
 
 
-def _update(events: list[Event], group: str, sampled: bool) -> bytes:
+def _update(events: list[tuple[Event, str]], sampled: bool) -> bytes:
     results = [
         {
             "logStreamName": event.stream,
@@ -154,6 +163,6 @@ def _update(events: list[Event], group: str, sampled: bool) -> bytes:
             "timestamp": event.time,
             "ingestionTime": event.time,
         }
-        for event in events
+        for event, group in events
     ]
     return eventstream.event("sessionUpdate", {"sessionMetadata": {"sampled": sampled}, "sessionResults": results})

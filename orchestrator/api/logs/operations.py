@@ -1,7 +1,7 @@
 """CloudWatch Logs over the logs in the store: JSON 1.1 on ``POST /``, the operation in ``X-Amz-Target``.
 
-There is one group, ``/aws/batch/job``, and in it a stream for every node of every attempt. Nothing is stored for this API:
-positions are bytes in the log files, and tokens carry all that is needed to continue, also after a restart.
+A stream for every node of every attempt is in ``/aws/batch/job``, or in the group that its container names. Positions are bytes in
+the log files, and tokens carry all that is needed to continue, also after a restart.
 """
 
 from __future__ import annotations
@@ -17,26 +17,24 @@ from itertools import chain, islice
 from typing import Any
 
 from botocore.validate import ParamValidator
-from sqlalchemy import func, select
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
-from orchestrator.api.arns import ACCOUNT, REGION
-from orchestrator.api.batch.members import LOG_GROUP
+from orchestrator.api.arns import here, log_group_arn
 from orchestrator.api.batch.service_model import service_model
-from orchestrator.api.errors import ClientError
-from orchestrator.api.http.auth import error_response
 from orchestrator.api.http.following import Following
 from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
+from orchestrator.api.logs import groups
+from orchestrator.api.logs.errors import JSON, LogsError, absent, invalid
 from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
-from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
+from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
 from orchestrator.api.permissions import Operation, Refusal, check
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.errors import Unavailable
-from orchestrator.persistence.models import Job, now
+from orchestrator.domain.errors import RequestError, Unavailable
+from orchestrator.persistence.models import now
 
-GROUP_ARN = f"arn:aws:logs:{REGION}:{ACCOUNT}:log-group:{LOG_GROUP}"
 SETTLE = 500
 """Milliseconds for which FilterLogEvents keeps back the newest lines of running gangs.
 
@@ -55,22 +53,6 @@ younger than its attempt's end."""
 _STREAM_TOKEN = re.compile(r"([fb])/(0|[1-9][0-9]{0,17})")
 _SEARCH_TOKEN = re.compile(r"([fb])([0-9]{14})([0-9]{24})([0-9]{18})")
 _LIST_TOKEN = re.compile(r"([0-9]{1,15})/(.+)")
-_JSON = "application/x-amz-json-1.1"
-
-
-class LogsError(Exception):
-    """A refusal, as one of the exceptions in AWS's model."""
-
-    def __init__(self, kind: str, message: str, status: int = 400) -> None:
-        super().__init__(message)
-        self.kind, self.status = kind, status
-
-    def response(self) -> JSONResponse:
-        return error_response(str(self), self.status, self.kind, _JSON)
-
-
-def invalid(message: str) -> LogsError:
-    return LogsError("InvalidParameterException", message)
 
 
 async def answer(
@@ -86,21 +68,25 @@ async def answer(
     """
     try:
         operation = target.partition(".")[2] if target.startswith("Logs_20140328.") else ""
-        if operation not in (*OPERATIONS, "StartLiveTail"):
-            names = ", ".join([*OPERATIONS, "StartLiveTail"])
-            raise invalid(f"{operation or f'X-Amz-Target {target!r}'} is not supported; supported are {names}")
+        if operation not in NAMES:
+            names = f"supported are {', '.join(NAMES)}"
+            instead = next((use for part, use in _INSTEAD.items() if part in operation), names)
+            raise invalid(f"{operation or f'X-Amz-Target {target!r}'} is not supported; {instead}")
         check(Operation(operation))
         request = validate(operation, await body())
         if operation == "StartLiveTail":
             return await reconciler.calls.answer(partial(start_live_tail, reconciler, closing, request))
+        if operation in groups.WRITES:
+            await run_in_threadpool(groups.write, reconciler, operation, request)
+            return JSONResponse({}, media_type=JSON)
         return await reconciler.calls.answer(
-            lambda: JSONResponse(OPERATIONS[operation](reconciler, request), media_type=_JSON)
+            lambda: JSONResponse(OPERATIONS[operation](reconciler, request), media_type=JSON)
         )
     except LogsError as error:
         return error.response()
     except Refusal as error:
         return LogsError(error.kind, str(error), error.status).response()
-    except ClientError as error:
+    except RequestError as error:
         return LogsError("InvalidParameterException", str(error), error.status).response()
     except Unavailable as error:
         return LogsError("ServiceUnavailableException", str(error), 503).response()
@@ -136,9 +122,9 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 
 def get_log_events(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
     """GetLogEvents: a page of one stream, from either end or from a token. Tokens are positions: they never expire."""
-    _check_group(request)
     with reconciler.database.session() as session:
-        stream = _named(reconciler, session, request["logStreamName"], Operation.GET_LOG_EVENTS)
+        group = groups.named_by(session, request)
+        stream = _named(reconciler, session, group, request["logStreamName"], Operation.GET_LOG_EVENTS)
     view = stream.file.look()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
@@ -167,7 +153,6 @@ def filter_log_events(reconciler: Reconciler, request: dict[str, Any]) -> dict[s
 
     A page ends after ``limit`` events, 1 MiB, or two seconds of search. Its token is the id of the last event that was looked at.
     """
-    _check_group(request)
     newest = now() - SETTLE  # before anything is looked at
     matches = _pattern(request.get("filterPattern", ""))
     token = _SEARCH_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
@@ -212,7 +197,6 @@ def filter_log_events(reconciler: Reconciler, request: dict[str, Any]) -> dict[s
 
 def describe_log_streams(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeLogStreams: by name or by the time of the last event, of the newest 1,000 streams that fit."""
-    _check_group(request)
     by_time = request.get("orderBy", "LogStreamName") == "LastEventTime"
     if request.get("orderBy", "LogStreamName") not in ("LogStreamName", "LastEventTime"):
         raise invalid(f"orderBy {request['orderBy']!r}: it is LogStreamName or LastEventTime")
@@ -223,7 +207,8 @@ def describe_log_streams(reconciler: Reconciler, request: dict[str, Any]) -> dic
     if given and not token:
         raise invalid("The specified nextToken is invalid.")
     with reconciler.database.session() as session:
-        streams = newest_streams(session, reconciler.store, prefix)
+        group = groups.named_by(session, request)
+        streams = newest_streams(session, reconciler.store, (group,), prefix) + created_streams(session, group, prefix)
     times = {stream.name: first_and_last(stream.path) for stream in streams} if by_time else {}
     keyed = [((known[1] if (known := times.get(s.name)) else 0, s.name), s) for s in streams]
     descending = request.get("descending", False)
@@ -239,52 +224,48 @@ def describe_log_streams(reconciler: Reconciler, request: dict[str, Any]) -> dic
     return response
 
 
-def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
-    """DescribeLogGroups: the one group, where it fits the request."""
-    prefix, pattern = request.get("logGroupNamePrefix"), request.get("logGroupNamePattern")
-    if prefix is not None and pattern is not None:
-        raise invalid("logGroupNamePrefix and logGroupNamePattern are mutually exclusive.")
-    if request.get("nextToken"):
-        raise invalid("The specified nextToken is invalid.")
-    wanted = LOG_GROUP.startswith(prefix or "") and (pattern or "") in LOG_GROUP
-    if identifiers := request.get("logGroupIdentifiers"):
-        wanted = wanted and any(_is_group(identifier) for identifier in identifiers)
-    if not wanted or request.get("logGroupClass", "STANDARD") != "STANDARD":
-        return {"logGroups": []}
-    with reconciler.database.session() as session:
-        created = session.scalar(select(func.min(Job.created_at))) or 0
-    group: dict[str, Any] = {"logGroupName": LOG_GROUP, "creationTime": created, "arn": f"{GROUP_ARN}:*"}
-    if pattern is None:
-        group |= {"metricFilterCount": 0, "storedBytes": 0, "logGroupClass": "STANDARD", "logGroupArn": GROUP_ARN}
-    return {"logGroups": [group]}
-
-
 OPERATIONS: dict[str, Callable[[Reconciler, dict[str, Any]], dict[str, Any]]] = {
     "GetLogEvents": get_log_events,
     "FilterLogEvents": filter_log_events,
     "DescribeLogStreams": describe_log_streams,
-    "DescribeLogGroups": describe_log_groups,
+    "DescribeLogGroups": groups.describe_log_groups,
+    "ListTagsForResource": groups.list_tags_for_resource,
 }
+NAMES = (*OPERATIONS, *groups.WRITES, "StartLiveTail")
+_INSTEAD = {
+    "Quer": "search with FilterLogEvents, whose patterns take terms, phrases and regular expressions",
+    "PutLogEvents": "streams hold what jobs print",
+    "ListLogGroups": "use DescribeLogGroups",
+    "ListTagsLogGroup": "use ListTagsForResource",
+    "TagLogGroup": "use TagResource",
+    "UntagLogGroup": "use UntagResource",
+    "MetricFilter": "read GET /metrics, or poll FilterLogEvents",
+    "SubscriptionFilter": "follow with StartLiveTail",
+    "ExportTask": "read with FilterLogEvents, or copy the files of the run from the store",
+}
+"""Substitutes for unsupported operations, by a part of their names."""
 
 
 def start_live_tail(reconciler: Reconciler, closing: threading.Event, request: dict[str, Any]) -> Response:
     """StartLiveTail: an event stream of the lines that are written from now on. Streams need not exist yet."""
-    for identifier in request["logGroupIdentifiers"]:
-        if not _is_group(identifier):
-            raise _no_group(identifier)
+    with reconciler.database.session() as session:
+        tailed = [groups.existing(session, identifier) for identifier in request["logGroupIdentifiers"]]
     names, prefixes = request.get("logStreamNames"), request.get("logStreamNamePrefixes")
     if names and prefixes:
         raise invalid("logStreamNames and logStreamNamePrefixes can't be used together.")
+    if (names or prefixes) and len(tailed) > 1:
+        raise invalid("logStreamNames and logStreamNamePrefixes need exactly one log group in logGroupIdentifiers.")
     matches = _pattern(request.get("logEventFilterPattern", ""))
     wanted = set(names or ())
 
     def asked_for(name: str) -> bool:
         return name in wanted if names else not prefixes or name.startswith(tuple(prefixes))
 
-    start = {"logGroupIdentifiers": [GROUP_ARN], "logEventFilterPattern": request.get("logEventFilterPattern", "")}
+    start = {"logGroupIdentifiers": [log_group_arn(name) for name in tailed]}
+    start |= {"logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
-    tail = LiveTail(reconciler, asked_for, matches)
-    stream = messages(tail, start, f"{ACCOUNT}:{LOG_GROUP}", closing)
+    tail = LiveTail(reconciler, tailed, asked_for, matches)
+    stream = messages(tail, start, here().id, closing)
     return _Session(stream, media_type="application/vnd.amazon.eventstream")
 
 
@@ -296,28 +277,10 @@ class _Session(Following):
 # -- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _is_group(reference: str) -> bool:
-    return reference in (LOG_GROUP, GROUP_ARN, f"{GROUP_ARN}:*")
-
-
-def _no_group(reference: str) -> LogsError:
-    return LogsError(
-        "ResourceNotFoundException", f"The specified log group does not exist: {reference}; there is {LOG_GROUP}"
-    )
-
-
-def _check_group(request: dict[str, Any]) -> None:
-    given = [request[key] for key in ("logGroupName", "logGroupIdentifier") if key in request]
-    if len(given) != 1:
-        raise invalid("Exactly one of logGroupName and logGroupIdentifier is needed.")
-    if not _is_group(given[0]):
-        raise _no_group(given[0])
-
-
-def _named(reconciler: Reconciler, session: Any, name: str, operation: Operation) -> Stream:
-    stream = find_stream(session, reconciler.store, name, operation)
+def _named(reconciler: Reconciler, session: Any, group: str, name: str, operation: Operation) -> Stream:
+    stream = find_stream(session, reconciler.store, group, name, operation)
     if stream is None:
-        raise LogsError("ResourceNotFoundException", f"The specified log stream does not exist: {name}")
+        raise absent("log stream", name)
     return stream
 
 
@@ -327,9 +290,10 @@ def _searched(reconciler: Reconciler, request: dict[str, Any], since: int) -> li
     if names and prefix:
         raise invalid("Only one of logStreamNames and logStreamNamePrefix can be used.")
     with reconciler.database.session() as session:
+        group, operation = groups.named_by(session, request), Operation.FILTER_LOG_EVENTS
         if names:
-            return [_named(reconciler, session, name, Operation.FILTER_LOG_EVENTS) for name in dict.fromkeys(names)]
-        return newest_streams(session, reconciler.store, prefix or "", since - _LATE)
+            return [_named(reconciler, session, group, name, operation) for name in dict.fromkeys(names)]
+        return newest_streams(session, reconciler.store, (group,), prefix or "", since - _LATE)
 
 
 def _pattern(text: str) -> log_filter.Matcher:
@@ -384,7 +348,7 @@ def _describe(stream: Stream) -> dict[str, Any]:
         "logStreamName": stream.name,
         "creationTime": stream.created,
         "uploadSequenceToken": f"{stream.file.source:056d}",
-        "arn": f"{GROUP_ARN}:log-stream:{stream.name}",
+        "arn": f"{log_group_arn(stream.group)}:log-stream:{stream.name}",
         "storedBytes": 0,
     }
     if known := first_and_last(stream.path):

@@ -20,7 +20,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.http.callers import user_name
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native.continuing import submit
-from orchestrator.api.native.model_routes import find_model, owner_of_model
+from orchestrator.api.native.model_routes import entered_model, find_model, owner_of_model
 from orchestrator.api.permissions import LeagueOf, Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
@@ -170,7 +170,7 @@ def read_entry(request: Request, name: str, number: int) -> Any:
     found: dict[str, Any] = {"entry": number}
     try:
         found = stored.entry(number)
-        model = find_model(reconciler, found["model"]["name"], found["model"]["version"])
+        model = entered_model(reconciler, found)
         _verify(model)
         _check_digest(model, found)
     except UnknownLeague as error:
@@ -218,7 +218,7 @@ def rerun(
         entry = stored.entry(number)
     except LeagueError as error:
         raise _refused(error) from None
-    model = find_model(reconciler, entry["model"]["name"], entry["model"]["version"])
+    model = entered_model(reconciler, entry)
     permissions.check(Operation.RERUN_ENTRY, owner_of_model(model))
     _check_digest(model, entry)
     return _submit(reconciler, league, model, body.directory, idempotency_key)

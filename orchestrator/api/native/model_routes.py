@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from fastapi import APIRouter, Query, Request
@@ -94,11 +95,22 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
 
 
 def find_model(reconciler: Reconciler, name: str, version: int | None) -> Model:
-    """A version of a model, the newest where none is named. Raises ClientError."""
+    """A version of a model that the caller may see, the newest where none is named. Raises ClientError."""
     try:
-        return models.find(reconciler.store, name, version)
+        return models.find(reconciler.store, name, version, lambda model: permissions.is_visible(owner_of_model(model)))
     except UnknownModel as error:
         raise ClientError(str(error), 404) from None
+    except (ModelError, DamagedFile) as error:
+        raise ClientError(str(error)) from None
+
+
+def entered_model(reconciler: Reconciler, entry: Mapping[str, Any]) -> Model:
+    """The model of a league's entry, which every key may see with its league. Raises ClientError."""
+    name, version = entry["model"]["name"], entry["model"]["version"]
+    try:
+        return next(model for model in models.versions(reconciler.store, name) if model.version == version)
+    except StopIteration:
+        raise ClientError(f"model {name}@{version} is not in the store any more", 404) from None
     except (ModelError, DamagedFile) as error:
         raise ClientError(str(error)) from None
 

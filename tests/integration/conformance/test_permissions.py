@@ -10,14 +10,15 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from orchestrator.api.batch import members
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.app import create_app
 from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
 from orchestrator.api.permissions import HIDDEN, Operation
 from orchestrator.domain.errors import ApiError
+from tests.support.conformance.fuzz_requests import GROUP_ARN
 from tests.support.conformance.permissions_world import KEYS, MARK, SECRET, TOKEN, World, definition
+from tests.support.conformance.streams import GROUP
 
 OWN_WRITE = "+ + + - - - -"
 """What belongs to the queue robots is changed: ``+`` is carried out, ``-`` is refused."""
@@ -25,14 +26,18 @@ OWN_WRITES = "+ + + e - - -"
 """Several at once: ``e`` is an answer with an error for each that is not its own."""
 OWN_READ = "+ + + - h h -"
 """It is read: ``h`` without the values of environment variables."""
+NAMED_READ = "+ + + n h h n"
+"""It is found by its name: ``n`` answers as if it did not exist."""
+NAMED_WRITE = "+ + + n - - -"
+"""The same where it is changed; a read-only key is refused before anything is looked for."""
 OWN_LIST = "+ + + o h h o"
 """It is listed: ``o`` is an answer without it."""
 SHARED_WRITE = "+ + - - - - -"
 SHARED_READ = "+ + + + + + +"
 ALL_READ = "+ + - - + - -"
 """It tells of all queues at once."""
-OWN_LEAGUE = "+ + + + - - -"
-"""A league of one's own is created."""
+OWN_MADE = "+ + + + - - -"
+"""A league or a log group is created, which then is the caller's."""
 DEFINITION_READ = "+ + + h h h h"
 """Names and commands of definitions are everybody's to see, values only of one's own."""
 
@@ -42,17 +47,19 @@ TABLE = {
     for row, operations in {
         OWN_WRITE: (
             *(OF.REGISTER_JOB_DEFINITION, OF.DEREGISTER_JOB_DEFINITION, OF.SUBMIT_JOB, OF.TERMINATE_JOB),
-            *(OF.CANCEL_JOB, OF.TAG_RESOURCE, OF.UNTAG_RESOURCE, OF.PLAN, OF.FIT, OF.CHECKPOINT_JOB, OF.RESUME_RUN),
-            *(OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.RERUN_ENTRY, OF.ENTER_LEAGUE, OF.DISQUALIFY),
+            *(OF.CANCEL_JOB, OF.TAG_RESOURCE, OF.UNTAG_RESOURCE, OF.PLAN, OF.FIT, OF.RERUN_ENTRY, OF.DISQUALIFY),
+            *(OF.DELETE_LOG_GROUP, OF.PUT_RETENTION_POLICY, OF.DELETE_RETENTION_POLICY, OF.CREATE_LOG_STREAM),
+            OF.DELETE_LOG_STREAM,
         ),
+        NAMED_WRITE: (OF.CHECKPOINT_JOB, OF.RESUME_RUN, OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.ENTER_LEAGUE),
         DEFINITION_READ: (OF.DESCRIBE_JOB_DEFINITIONS,),
         OWN_LIST: (
             *(OF.DESCRIBE_JOBS, OF.FILTER_LOG_EVENTS, OF.DESCRIBE_LOG_STREAMS, OF.START_LIVE_TAIL, OF.READ_QUEUES),
             *(OF.FIND_JOBS, OF.LIST_RUNS, OF.LIST_MODELS),
         ),
-        OWN_READ: (
-            *(OF.LIST_JOBS, OF.GET_JOB_QUEUE_SNAPSHOT, OF.LIST_TAGS_FOR_RESOURCE, OF.GET_LOG_EVENTS, OF.READ_JOB),
-            *(OF.READ_JOB_LOGS, OF.READ_JOB_STACKS, OF.READ_RUN, OF.READ_CHECKPOINTS, OF.READ_METRICS),
+        OWN_READ: (OF.LIST_JOBS, OF.GET_JOB_QUEUE_SNAPSHOT, OF.LIST_TAGS_FOR_RESOURCE, OF.GET_LOG_EVENTS),
+        NAMED_READ: (
+            *(OF.READ_JOB, OF.READ_JOB_LOGS, OF.READ_JOB_STACKS, OF.READ_RUN, OF.READ_CHECKPOINTS, OF.READ_METRICS),
             *(OF.READ_EVALUATIONS, OF.READ_MODEL),
         ),
         OWN_WRITES: (OF.TERMINATE_JOBS, OF.CANCEL_JOBS),
@@ -68,7 +75,7 @@ TABLE = {
             *(OF.READ_CAPACITY, OF.LIST_LEAGUES, OF.READ_LEAGUE, OF.READ_LEAGUE_TABLE, OF.READ_ENTRY, OF.LIST_TRACKS),
         ),
         ALL_READ: (OF.READ_MONITORING, OF.READ_KEYS, OF.READ_WEBHOOKS),
-        OWN_LEAGUE: (OF.CREATE_LEAGUE,),
+        OWN_MADE: (OF.CREATE_LEAGUE, OF.CREATE_LOG_GROUP),
     }.items()
     for operation in operations
 }
@@ -100,7 +107,13 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
     def policy() -> str:
         return world.made("CreateSchedulingPolicy", "name", fairsharePolicy={})
 
-    group = {"logGroupName": members.LOG_GROUP}
+    def own_group() -> str:
+        """A new log group of the key ``robots``."""
+        name = f"/{world.fresh()}"
+        assert world.send("robots", "CreateLogGroup", logGroupName=name).status_code == 200
+        return name
+
+    group = {"logGroupName": GROUP}
     queue = {"priority": 1, "computeEnvironmentOrder": [{"order": 1, "computeEnvironment": "local"}]}
     job = {"jobName": "x", "jobQueue": "robots", "jobDefinition": world.definition}
     disabled = {"type": "UNMANAGED", "state": "DISABLED"}
@@ -141,6 +154,12 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of.FILTER_LOG_EVENTS: dict(**group, filterPattern='"robots line"'),
         of.DESCRIBE_LOG_STREAMS: dict(**group),
         of.DESCRIBE_LOG_GROUPS: {},
+        of.CREATE_LOG_GROUP: dict(logGroupName=world.fresh),
+        of.DELETE_LOG_GROUP: dict(logGroupName=own_group),
+        of.PUT_RETENTION_POLICY: dict(logGroupName=own_group, retentionInDays=7),
+        of.DELETE_RETENTION_POLICY: dict(logGroupName=own_group),
+        of.CREATE_LOG_STREAM: dict(logGroupName=own_group, logStreamName="made"),
+        of.DELETE_LOG_STREAM: dict(logGroupName=own_group, logStreamName="made"),
     }
     others: dict[Operation, Callable[[str], httpx.Response]] = {
         of.START_LIVE_TAIL: lambda key: live_tail(world, key),
@@ -173,9 +192,7 @@ def live_tail(world: World, key: str) -> httpx.Response:
     own = key.removesuffix("-reader")
     wanted = [f"{queue} line".encode() for queue in ("robots", "lab") if own not in ("robots", "lab") or own == queue]
     body = b""
-    with world.http.stream(
-        "POST", world.url, json={"logGroupIdentifiers": [logs.GROUP_ARN]}, headers=headers
-    ) as answer:
+    with world.http.stream("POST", world.url, json={"logGroupIdentifiers": [GROUP_ARN]}, headers=headers) as answer:
         for chunk in answer.iter_bytes():
             body += chunk
             if all(body.count(line) >= 3 for line in wanted):
@@ -186,7 +203,7 @@ def live_tail(world: World, key: str) -> httpx.Response:
 @pytest.fixture
 def printing(world: World) -> Iterator[None]:
     """A job in each queue prints a line again and again."""
-    gate = world.server.home / "gate"
+    gate = world.server.home / f"gate-{world.fresh()}"  # another one each time: lines of a second try go on
     ids = []
     for queue in ("robots", "lab"):
         command = ["sh", "-c", f"until [ -e {gate} ]; do echo {queue} line; sleep 0.05; done"]
@@ -214,6 +231,10 @@ def test_every_operation_is_allowed_or_refused_as_the_table_says(world: World, p
             if expected == "-":
                 refusal_of(answer, key)
                 continue
+            if expected == "n":
+                assert answer.status_code == 404 and "does not exist" in answer.text, (operation, key, answer.text)
+                assert "robots" not in answer.text, (operation, key, answer.text)
+                continue
             assert answer.status_code in (200, 307, 400, 409), (operation, key, answer.text)  # 400, 409: of its state
             assert ('"AccessDenied"' in answer.text) is (expected == "e"), (operation, key, answer.text)
             if not operation.reads or operation.value.endswith("/stacks"):
@@ -234,15 +255,15 @@ def test_every_operation_of_the_product_stands_in_the_table() -> None:
     for route in [*app.routes, *native.router.routes]:
         if isinstance(route, APIRoute) and not route.path.startswith("/v1/") and route.name != "cloudwatch_logs":
             routes |= {f"{method} {route.path}" for method in route.methods}
-    offered = {*batch.OPERATIONS, *logs.OPERATIONS, "StartLiveTail", *routes}
+    offered = {*batch.OPERATIONS, *logs.NAMES, *routes}
     assert {operation.value for operation in Operation} == offered
     assert set(TABLE) == set(Operation)
 
 
-def refused(text: str, call: Callable[..., Any], *arguments: Any, **request: Any) -> None:
+def refused(text: str, call: Callable[..., Any], *arguments: Any, status: int = 403, **request: Any) -> None:
     with pytest.raises(ApiError, match=text) as caught:
         call(*arguments, **request)
-    assert caught.value.status == 403, caught.value
+    assert caught.value.status == status, caught.value
 
 
 def submission(name: str, queue: str, **environment: str) -> dict[str, Any]:
@@ -258,7 +279,7 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
         world.server.wait(each["id"])
     before = epoch.read_bytes()
     own = world.register("lab", "labs")
-    foreign = f"run {world.run} belongs to job queue robots"
+    foreign, absent = f"run {world.run} belongs to job queue robots", f"run {world.run} does not exist"
     refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_RUN=world.run))
     named = definition("named")
     container = named["nodeProperties"]["nodeRangeProperties"][0]["container"]
@@ -268,15 +289,16 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
     lab.batch("RegisterJobDefinition", jobDefinitionName="single", type="container", containerProperties=container)
     refused(foreign, lab.batch, "SubmitJob", jobName="x", jobQueue="lab", jobDefinition="single")
     for change in ("name=labs2", "queue=lab"):
-        refused(foreign, lab.post, f"/api/runs/{world.run}/resume", {"set": [change, "queue=lab"]})
+        refused(absent, lab.post, f"/api/runs/{world.run}/resume", {"set": [change, "queue=lab"]}, status=404)
     waits = lab.batch("SubmitJob", jobName="x", jobQueue="lab", jobDefinition=own)["jobId"]
-    refused(foreign, lab.post, f"/api/runs/{world.run}/clone", {"name": "labs-own", "set": ["queue=lab"]})
+    clone = {"name": "labs-own", "set": ["queue=lab"]}
+    refused(absent, lab.post, f"/api/runs/{world.run}/clone", clone, status=404)
     teacher = {"train": {"task": "Cartpole", "rsl_rl": {"teacher_checkpoint": f"{world.run}@3"}}}
     for section in ({"evaluate": {"run": world.run}}, {"export": {"run": world.run}}, teacher):
         spec = json.dumps({"name": "x", **section})
-        refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_SPEC=spec))
+        refused(absent, lab.batch, "SubmitJob", status=404, **submission(own, "lab", MUSTER_SPEC=spec))
         later = {**submission(own, "lab", MUSTER_SPEC=spec), "dependsOn": [{"jobId": waits}]}
-        refused(foreign, lab.batch, "SubmitJob", **later)
+        refused(f"run {world.run} belongs to no known job queue", lab.batch, "SubmitJob", **later)
     train = {"train": {"task": "Cartpole", "worlds": 4, "iterations": 9}, "evaluation": {"every": 1, "queue": "robots"}}
     elsewhere = submission(own, "lab", MUSTER_SPEC=json.dumps({"name": "x", **train}))
     refused("it concerns job queue robots", lab.batch, "SubmitJob", **elsewhere)
@@ -321,6 +343,37 @@ def test_names_of_others_are_not_told_by_errors_and_not_found_by_name(world: Wor
         assert {queue["jobQueueName"] for queue in shown} >= names and ("robots" in str(shown)) is (key == "admin")
 
 
+def test_a_job_of_another_queue_that_writes_a_run_of_one_s_own_is_not_named(world: World) -> None:
+    lab, admin = world.clients["lab"], world.clients["admin"]
+    job, run = world.native("lab", "lab")
+    world.server.wait(job)
+    waits = submission(world.definition, "robots", MUSTER_RUN=run)
+    needs = [{"type": "VCPU", "value": "1000"}]
+    waits["nodeOverrides"]["nodePropertyOverrides"][0]["containerOverrides"]["resourceRequirements"] = needs
+    holder = admin.batch("SubmitJob", **{**waits, "jobName": "secretive"})["jobId"]
+    with pytest.raises(ApiError, match=f"run {run} is being written by another job; choose another name") as caught:
+        lab.batch("SubmitJob", **submission(world.register("lab", "labs-waiting"), "lab", MUSTER_RUN=run))
+    assert "secretive" not in str(caught.value)
+    admin.batch("TerminateJob", jobId=holder, reason="x")
+
+
+@pytest.mark.parametrize("kind", ["models", "runs", "jobs"])
+def test_what_a_key_may_not_see_answers_as_what_does_not_exist(world: World, kind: str) -> None:
+    """No answer tells which names exist, nor do hints name what is another queue's (T7)."""
+    taken = world.job if kind == "jobs" else world.run
+    for key in ("lab", "lab-reader"):
+        answers = []
+        for name in (taken, "z" + taken[1:]):
+            with pytest.raises(ApiError) as caught:
+                world.clients[key].get(f"/api/{kind}/{name}")
+            assert "robots" not in str(caught.value)
+            answers.append((caught.value.status, str(caught.value).replace(name, "NAME")))
+        assert answers[0] == answers[1]
+    near = f"{world.run}x"
+    with pytest.raises(ApiError, match="did you mean" if kind != "jobs" else "does not exist"):
+        world.clients["robots"].get(f"/api/{kind}/{near}")
+
+
 def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> None:
     """As after the database was lost, or in a store that came from elsewhere."""
     described = json.loads((world.server.home / "store" / "runs" / world.run / "run.json").read_text())
@@ -331,7 +384,7 @@ def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> N
         facts = {**described, "run": name, "queue": queue, "owner": None}
         (path / "run.json").write_text(json.dumps({key: value for key, value in facts.items() if value}))
     assert world.clients["robots"].get("/api/runs/moved")["queue"] == "robots"
-    refused("run moved belongs to job queue robots", world.clients["lab"].get, "/api/runs/moved")
+    refused("run moved does not exist", world.clients["lab"].get, "/api/runs/moved", status=404)
     own = world.register("robots", "continuing")
     older = submission(own, "robots", MUSTER_RUN="older")
     refused("no known job queue", world.clients["robots"].batch, "SubmitJob", **older)

@@ -125,8 +125,8 @@ def test_the_newest_version_of_each_model_is_listed(console: Console, fast: Mode
     assert "second@9" in page.text and "100.00" in page.text
     lab = console.visitor("lab").page("/models")
     assert "theirs" in lab.text and "fast" not in lab.text
-    refused = console.visitor("lab").page("/models/fast", 403)
-    assert "may use job queue lab only" in refused.text and "second" not in refused.text
+    refused = console.visitor("lab").page("/models/fast", 404)
+    assert "model fast does not exist" in refused.text and "second" not in refused.text
 
 
 def test_a_model_has_its_lineage_as_a_graph_its_evaluations_and_its_job(console: Console, fast: Model) -> None:

@@ -145,7 +145,7 @@ def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
     visitor = console.visitor("lab")
     assert names(visitor.page("/runs")) == ["labs"]
     for path in ("/runs/fast", "/compare?run=labs&run=fast", "/compare/curves?run=fast", "/runs/fast/stream"):
-        assert "belongs to job queue default" in visitor.page(path, 403).text
+        assert "run fast does not exist" in visitor.page(path, 404).text
     assert "no run is called like fas*" in visitor.page("/compare?run=fas*", 404).text
     assert names(console.visitor("reader").page("/runs?search=sure")) == ["sure"]
 

@@ -80,7 +80,7 @@ def test_the_wizard_shows_the_yaml_that_it_submits(console: Console, visitor: Vi
     console.client.batch("TerminateJob", jobId=id_, reason="seen")
     again = visitor.http.get(f"/submit/yaml?job={id_}")
     assert again.status_code == 200 and "gamma: 0.9" in again.text
-    assert "gamma" not in console.visitor("lab").page(f"/submit/yaml?job={id_}", 403).text
+    assert "gamma" not in console.visitor("lab").page(f"/submit/yaml?job={id_}", 404).text
     back = Page(visitor.http.post("/submit/task/Cartpole", data=fields).text)
     assert inputs(back)["train.ppo.gamma"] == "0.9" and inputs(back)["nodes"] == "{min: 1, max: 2}"
 

@@ -15,9 +15,10 @@ from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, select, text
 from sqlalchemy.exc import IntegrityError
 
+from orchestrator.control.account import DEFAULT, recognise
 from orchestrator.control.usage import add_usage, charge, forget_before, resource_seconds, usage_at
 from orchestrator.control.work_queue import WorkQueue
-from orchestrator.domain.errors import ApiError, RequestError, ServerError
+from orchestrator.domain.errors import ApiError, RequestError, ServerError, UsageError
 from orchestrator.persistence.models import (
     Attempt,
     Base,
@@ -95,6 +96,9 @@ def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, ope
         assert [attempt.number for attempt in old.attempts] == [1]
         assert (old.name, old.attempts_allowed, old.kind) == ("old", 3, "multinode")
         assert (old.tags, old.evaluate_on_exit) == ({}, [])
+        assert recognise(session, None, None) == DEFAULT, "its clients know these ARNs"
+        with pytest.raises(UsageError, match="000000000000 in us-east-1 since its first start"):
+            recognise(session, "123456789012", None)
 
 
 def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, opened: Callable[[], Database]) -> None:

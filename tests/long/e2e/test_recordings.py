@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 from pathlib import Path
 
 import onnx
@@ -11,7 +13,8 @@ from PIL import Image
 
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
-from tests.conftest import Serving, call_muster, wait_for
+from tests.conftest import MUSTER, Serving, call_muster, wait_for
+from tests.support.processes import kill_rank
 
 SMALL = {
     "nodes": 1,
@@ -74,7 +77,7 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     contract, model = json.loads(told["contract.json"]), onnx.load_from_string(told["policy.onnx"])
     assert contract == used.manifest["contract"] and json.loads(told["job.json"])["train"]["task"] == "Cartpole"
     assert {each.key: each.value for each in model.metadata_props}["run_path"] == f"{run.name}/{used.name}"
-    assert set(told) == {"contract.json", "policy.onnx", "job.json", "robot.xml"}
+    assert set(told) == {"contract.json", "policy.onnx", "job.json", "robot.xml", "channels.json"}
     while_training = attachments(live)
     assert json.loads(while_training["contract.json"]) == contract and "policy.onnx" not in while_training
     held = {each.iteration: each.manifest["files"]["learner.pt"]["sha256"] for each in list_checkpoints(run)}
@@ -110,6 +113,14 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         ("record", run.name): "-o is missing: muster record",
         ("record", "--recover", str(tmp_path / "x.mcap.partial")): "there is no such file",
         ("render", run.name, "-o", "x.avi"): "unknown ending; use one of .gif, .mp4, .png",
+        (
+            "render",
+            run.name,
+            "-o",
+            "x.mp4",
+            "--size",
+            "161x121",
+        ): "each side is from 64 to 4096 pixels, and even for an .mp4",
         ("render", run.name, "-o", "x.gif", "--size", "big"): "expected WIDTHxHEIGHT, such as 640x360",
     }
     for arguments, words in refused.items():
@@ -122,3 +133,37 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         "render", job, "-o", str(picture), "--overwrite", *size[:-2], "--seconds", "0.2", timeout=300
     )
     assert done.returncode == 0 and picture.read_bytes() != kept[1], done.stderr
+
+
+def test_a_recording_of_a_training_that_dies_goes_on_with_its_next_attempt(server: Serving, tmp_path: Path) -> None:
+    options = [part for key, value in SMALL.items() for part in ("--set", f"{key}={json.dumps(value)}")]
+    job = json.loads(server.muster("submit", "job_specs/cartpole.yaml", "--json", *options).stdout)["jobId"]
+    run = Store(server.home / "store").run(server.detail(job)["run"])
+    wait_for(lambda: list_checkpoints(run), timeout=300, what="the first checkpoint")
+    file = tmp_path / "dies.mcap"
+    command = [str(MUSTER), "record", job, "-o", str(file), "--worlds", "1", "--episodes", "400"]
+    recording = subprocess.Popen(
+        command,
+        env={**os.environ, "MUSTER_HOME": str(server.home)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    partial = file.with_name("dies.mcap.partial")
+    wait_for(lambda: partial.exists() and partial.stat().st_size > 60_000, timeout=120, what="some steps")
+    kill_rank(job, 0)
+    wait_for(
+        lambda: server.detail(job)["attempts"] and server.detail(job)["status"] == "RUNNING",
+        timeout=120,
+        what="attempt 2",
+    )
+    _, err = recording.communicate(timeout=400)
+    assert recording.returncode == 0, err
+    assert "died; waiting for its next attempt on this machine" in err
+    known = episodes(file)
+    assert len(known) >= 400 and {each["run"] for each in known} == {run.name}
+    assert all(each["length"] == "30" for each in known if each["complete"] == "true" and each["end"] == "time_out")
+    with file.open("rb") as opened:
+        lines = [message.data for _, _, message in make_reader(opened).iter_messages("/rosout")]
+    assert sum(b"the training died; the recording goes on with its next attempt" in line for line in lines) == 1
+    assert server.muster_process("stop", job, timeout=180).returncode == 0

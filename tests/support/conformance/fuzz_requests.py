@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from orchestrator.api.arns import PREFIX
 from orchestrator.api.batch import paging
-from orchestrator.api.logs import operations as logs
 
+PREFIX = "arn:aws:batch:us-east-1:000000000000:"
+GROUP_ARN = "arn:aws:logs:us-east-1:000000000000:log-group:/aws/batch/job"
 ODD_TEXTS = (
     *("", " ", "\0", "a\0b", "\n", "\r\n", "\x1b[0m", "\u202e", "é", "Ω" * 64, "😀", "\ud800", "a\udfffb", "\ufeff"),
     *("x" * 128, "x" * 129, "x" * 256, "x" * 1025, "x" * 20_000, "../..", "..", "/", "%2F", "%00", "#", "#0", ":"),
@@ -35,7 +35,7 @@ _QUEUES = ("fuzz", "default", "fair", f"{PREFIX}job-queue/fair", "spare", "made"
 _DEFINITIONS = ("gang", "gang:1", "single", f"{PREFIX}job-definition/gang", f"{PREFIX}job-definition/single:1", "made")
 _POOLS = ("fuzz", "local", f"{PREFIX}compute-environment/fuzz", "spare", "made")
 STREAMS = ("gang/<gang>/1/node-0", "gang/<gang>/1/node-1", "single/<single>/1/node-0", "gang/", "gang/<gang>/2/node-0")
-_GROUPS = ("/aws/batch/job", f"{logs.GROUP_ARN}", f"{logs.GROUP_ARN}:*", "/aws", "other")
+_GROUPS = ("/aws/batch/job", GROUP_ARN, f"{GROUP_ARN}:*", "/aws", "/made")
 TARGETS = ("0:", "0", "0:0", "1:", "0:1", ":1", "1", ":", "5:1", "999999", "0:999999")
 _POSITIONS: tuple[list[Any], ...] = ([], [0], ["a"], ["a", 1], [1, "a"], ["a", "b"], [2**63, "a"])
 _POSITIONS += (["\ud800", 1], ["a\0", 1], ["\ud800"], [-1], [None, {}])
@@ -184,14 +184,20 @@ GOOD: dict[str, tuple[dict[str, Any], ...]] = {
     ),
     "FilterLogEvents": (
         {"logGroupName": "/aws/batch/job", "filterPattern": "line", "limit": 1, "nextToken": f"f{'0' * 56}"},
-        {"logGroupIdentifier": logs.GROUP_ARN, "logStreamNamePrefix": "gang/", "interleaved": True},
+        {"logGroupIdentifier": GROUP_ARN, "logStreamNamePrefix": "gang/", "interleaved": True},
     ),
     "DescribeLogStreams": tuple(
         {"logGroupName": "/aws/batch/job", **more}
         for more in ({"orderBy": "LastEventTime", "descending": True}, {"logStreamNamePrefix": "gang/", "limit": 1})
     ),
     "DescribeLogGroups": ({"logGroupNamePrefix": "/aws"}, {"logGroupNamePattern": "batch"}),
-    "StartLiveTail": ({"logGroupIdentifiers": [logs.GROUP_ARN], "logEventFilterPattern": "line"},),
+    "CreateLogGroup": ({"logGroupName": "/made", "tags": {"k": "v"}}, {"logGroupName": "<new>"}),
+    "DeleteLogGroup": ({"logGroupName": "/made"},),
+    "PutRetentionPolicy": ({"logGroupName": "/made", "retentionInDays": 7},),
+    "DeleteRetentionPolicy": ({"logGroupName": "/aws/batch/job"},),
+    "CreateLogStream": ({"logGroupName": "/aws/batch/job", "logStreamName": "made"},),
+    "DeleteLogStream": ({"logGroupName": "/aws/batch/job", "logStreamName": "made"},),
+    "StartLiveTail": ({"logGroupIdentifiers": [GROUP_ARN], "logEventFilterPattern": "line"},),
 }
 CHANGES = (
     *("name=other", "command=[echo]", "nodes=3", "nodes={min: 1, max: 2}", "train.iterations=5"),

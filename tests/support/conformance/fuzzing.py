@@ -13,14 +13,13 @@ from urllib.parse import quote
 import botocore.session
 from hypothesis import strategies as st
 
-from orchestrator.api.arns import PREFIX
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.logs import operations as logs
-from tests.support.conformance.fuzz_requests import ARRAYS, CHANGES, GOOD, KNOWN, NUMBERS, ODD_TEXTS
+from tests.support.conformance.fuzz_requests import ARRAYS, CHANGES, GOOD, KNOWN, NUMBERS, ODD_TEXTS, PREFIX
 
 TAGS = ("TagResource", "UntagResource", "ListTagsForResource")
 BATCH = tuple(name for name in batch.OPERATIONS if name not in TAGS)
-LOGS = (*logs.OPERATIONS, "StartLiveTail")
+LOGS = tuple(name for name in logs.NAMES if name not in TAGS)
 DIGITS = "<digits>"
 """Becomes a number of 5,000 digits, which Python would refuse to write."""
 

@@ -107,7 +107,7 @@ class World:
             url = f"{self.url}/v1/tags/{request['resourceArn']}"
             content = {"tags": request["tags"]} if method == "POST" else None
             return self.http.request(method, url, json=content, params=query, headers=bearer)
-        if operation in logs.OPERATIONS:
+        if operation in logs.NAMES:
             bearer["X-Amz-Target"] = f"Logs_20140328.{operation}"
             return self.http.post(self.url, json=request, headers=bearer)
         return self.http.post(f"{self.url}/v1/{operation.lower()}", json=request, headers=bearer)

@@ -27,7 +27,8 @@ from worker.errors import UserError
 from worker.tasks.cartpole import Cartpole
 from worker.tasks.configs.cartpole import CartpoleConfig
 from worker.telemetry.live import main
-from worker.telemetry.recording import Recording, recover
+from worker.telemetry.recording import Recording
+from worker.telemetry.recovering import recover
 from worker.telemetry.rows import Rows
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Reading, Tap
@@ -241,7 +242,7 @@ def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_w
     assert "full.mcap.partial: it can't be written (File too large)" in said and "muster record --recover" in said
     assert "\n" not in said
     made = recover(tmp_path / "full.mcap.partial")
-    assert made is not None and made[0] == tmp_path / "full.mcap" and made[1] > 20
+    assert made is not None and made.path == tmp_path / "full.mcap" and made.messages > 20 and not made.losses
     assert not os.path.exists(tmp_path / ".full.mcap.tmp")
 
 

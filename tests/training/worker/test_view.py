@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import io
 import urllib.error
 import urllib.request
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+import rerun
 from PIL import Image
 
 from tests.support.refusals import refusal
@@ -125,7 +127,7 @@ def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
     with Page(None, "64MB") as page:
         with urllib.request.urlopen(f"{page.url}/") as answer:
             policy, text = answer.headers["Content-Security-Policy"], answer.read().decode()
-        assert f"connect-src 'self' {page.server.removeprefix('rerun+').removesuffix('/proxy')} " in policy
+        assert "connect-src 'self' blob: data:" in policy
         assert "fonts.googleapis.com" not in text and "re_viewer.js" in text
         request = urllib.request.Request(f"{page.url}/", headers={"Host": "evil.example"})
         for refused, code in ((request, 403), (f"{page.url}/etc/passwd", 404)):
@@ -140,6 +142,38 @@ def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
         with pytest.raises(UserError, match=r"the viewer's server ended \(signal 9\)"):
             page.check()
     assert not page._home.exists()
+
+
+def test_the_stream_comes_through_the_port_of_the_page_also_at_a_tunnel_s_other_end() -> None:
+    """As the viewer in a browser asks for it, by gRPC-web, and finds an address of this page alone."""
+    with Page(None, "64MB") as page:
+        stream = rerun.RecordingStream("tunnel")
+        stream.connect_grpc(page.server)
+        stream.log("number", rerun.Scalars(1.0))
+        stream.flush()
+        port = int(page.url.rpartition(":")[2])
+        assert port in range(9090, 9100)
+        read = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
+        headers = {
+            "Content-Type": "application/grpc-web+proto",
+            "Host": "localhost:1234",
+            "Origin": "http://localhost:1234",
+        }
+        for changed, code in (({}, 200), ({"Origin": "http://evil.example"}, 403), ({"Host": "evil.example"}, 403)):
+            asking = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+            asking.request("POST", read, b"\0\0\0\0\0", {**headers, **changed})
+            answer = asking.getresponse()
+            assert answer.status == code
+            if code == 200:
+                seen = b""
+                while b"number" not in seen:
+                    seen += answer.read1(1 << 16)
+            asking.close()
+        asking = http.client.HTTPConnection("127.0.0.1", port)
+        asking.request("GET", "/", headers={"Host": "localhost:1234"})
+        where = asking.getresponse().headers["Location"]
+        assert where.startswith("http://localhost:1234/?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A1234%2Fproxy&")
+        stream.disconnect()
 
 
 def test_without_the_extra_one_line_names_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:

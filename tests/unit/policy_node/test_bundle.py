@@ -8,12 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from muster_policy.bundle import open_bundle
 from muster_policy.cli import main
 from muster_policy.errors import Refused
 from muster_policy.policy import Policy
+from muster_policy.weights import EXTERNAL, PARTS
 from shared_store.bundles import seal
 from tests.support.policy_node import write_bundle
 from tests.support.refusals import refusal
@@ -145,8 +147,66 @@ def test_a_policy_of_other_inputs_than_the_contract_s_is_refused(bundle: Path, t
     with pytest.raises(Refused, match=r"policy\.onnx takes \{'obs': \(4,\)\}, contract\.json says \{'obs': \(2,\)\}"):
         Policy(open_bundle(bundle))
     resealed(bundle, lambda path: (path / "policy.onnx").write_bytes(b"no model") and None)
+    with pytest.raises(Refused, match=r"policy\.onnx is no ONNX file"):
+        open_bundle(bundle)
+    resealed(
+        bundle,
+        lambda path: (path / "policy.onnx").write_bytes(onnx.ModelProto(ir_version=8).SerializeToString()) and None,
+    )
     with pytest.raises(Refused, match=r"policy\.onnx can't be run by onnxruntime"):
         Policy(open_bundle(bundle))
+
+
+@pytest.mark.parametrize("location", ["../secret.bin", "/etc/hostname", "weights.bin"])
+@pytest.mark.parametrize("place", ["initializer", "constant", "subgraph"])
+def test_weights_in_another_file_are_refused_before_the_model_is_run(bundle: Path, place: str, location: str) -> None:
+    tensor = onnx.helper.make_tensor("w", onnx.TensorProto.FLOAT, [1], [1.0])
+    tensor.ClearField("float_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value=location)
+    output = onnx.helper.make_tensor_value_info("actions", onnx.TensorProto.FLOAT, [1])
+    constant = onnx.helper.make_node("Constant", [], ["actions"], value=tensor)
+    inner = onnx.helper.make_graph([constant], "inner", [], [output])
+    condition = onnx.helper.make_tensor("yes", onnx.TensorProto.BOOL, [], [True])
+    branches = onnx.helper.make_node("If", ["yes"], ["actions"], then_branch=inner, else_branch=inner)
+    identity = onnx.helper.make_node("Identity", ["w"], ["actions"])
+    nodes, weights = {
+        "initializer": ([identity], [tensor]),
+        "constant": ([constant], []),
+        "subgraph": ([branches], [condition]),
+    }[place]
+    model = onnx.helper.make_model(onnx.helper.make_graph(nodes, "policy", [], [output], weights))
+    resealed(bundle, lambda path: (path / "policy.onnx").write_bytes(model.SerializeToString()) and None)
+    with pytest.raises(Refused, match=r"policy\.onnx has weights in another file"):
+        open_bundle(bundle)
+
+
+def test_the_fields_in_which_tensors_are_looked_for_are_onnx_s() -> None:
+    holding = {"TensorProto"}
+    while True:  # the messages that may hold a tensor, from onnx's own description
+        types = [
+            kind.DESCRIPTOR for kind in vars(onnx).values() if isinstance(kind, type) and hasattr(kind, "DESCRIPTOR")
+        ]
+        more = {
+            kind.name
+            for kind in types
+            for each in kind.fields
+            if each.message_type and each.message_type.name in holding
+        } | holding
+        if more == holding:
+            break
+        holding = more
+    reached = {kind.name: kind for kind in types if kind.name in PARTS}
+    assert {
+        name: {
+            each.number: each.message_type.name
+            for each in kind.fields
+            if each.message_type and each.message_type.name in holding
+        }
+        for name, kind in reached.items()
+    } == PARTS
+    fields = onnx.TensorProto.DESCRIPTOR.fields_by_name
+    assert (fields["external_data"].number, fields["data_location"].number) == EXTERNAL
 
 
 MISUSE = {

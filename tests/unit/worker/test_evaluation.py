@@ -26,6 +26,7 @@ from worker.evaluation.episodes import Episodes, Stopped, play
 from worker.evaluation.evaluation import best_words, result_of
 from worker.evaluation.statistics import Sample, difference, share
 from worker.evaluation.table import write_table
+from worker.learning.randomness import held_out_seed
 from worker.tasks import terms
 from worker.tasks.cartpole import Cartpole
 from worker.tasks.configs.cartpole import CartpoleConfig
@@ -168,8 +169,8 @@ def played(task: Cartpole) -> Episodes:
 def test_the_table_has_a_row_an_episode_and_the_same_episodes_are_the_same_bytes(
     played: Episodes, tmp_path: Path
 ) -> None:
-    write_table(tmp_path / "one.parquet", played, 7)
-    write_table(tmp_path / "two.parquet", played, 7)
+    write_table(tmp_path / "one.parquet", played, 7, {"run": "taught"})
+    write_table(tmp_path / "two.parquet", played, 7, {"run": "taught"})
     assert (tmp_path / "one.parquet").read_bytes() == (tmp_path / "two.parquet").read_bytes()
     table = pyarrow.parquet.read_table(tmp_path / "one.parquet").to_pydict()
     assert list(table)[:6] == ["episode", "seed", "return", "length", "success", "cause"]
@@ -215,6 +216,36 @@ def test_returns_of_other_rewards_are_not_compared(task: Cartpole, played: Episo
     assert again["compared"]["name"] == "00000003-e1-own-job"
 
 
+def test_a_table_that_is_moved_says_what_it_is_of(task: Cartpole, played: Episodes, tmp_path: Path) -> None:
+    run = Run(tmp_path / "taught")
+    summary = result_of(task, played, "00000003-e1", 7, 0.0).write(run, "job", config={})
+    known = {
+        key.decode(): value.decode()
+        for key, value in pyarrow.parquet.read_schema(run.evaluations / summary["table"]).metadata.items()
+    }
+    assert (known["run"], known["checkpoint"], known["task"]) == ("taught", "00000003-e1", "Cartpole")
+    config = json.loads(known["config"])
+    assert config["control_hz"] == 60.0 and config["rewards"] == dict(task.config.rewards)
+
+
+def test_an_evaluation_is_compared_with_the_newest_in_the_same_episodes(
+    task: Cartpole, played: Episodes, tmp_path: Path
+) -> None:
+    run = Run(tmp_path / "taught")
+    summary: dict[str, Any] = {}
+    for job, iteration, seed in (("one", 20, 7), ("two", 20, 9), ("three", 40, 7), ("four", 40, 7)):
+        summary = result_of(task, played, f"{iteration:08d}-e1", seed, 0.0).write(run, job, config={})
+    compared = summary["compared"]
+    assert compared["name"] == "00000020-e1-one" and compared["return"]["method"] == "paired"
+    summary = result_of(task, played, "00000040-e1", 11, 0.0).write(run, "five", config={})
+    assert summary["compared"]["name"] == "00000040-e1-four", "without a partner, with the newest"
+
+
+def test_the_seed_of_an_evaluation_is_a_number_of_every_reader() -> None:
+    seeds = [held_out_seed(seed) for seed in range(1000)]
+    assert all(seed == int(float(seed)) < 2**53 for seed in seeds) and len({*seeds}) == 1000
+
+
 def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_its_leftovers(
     task: Cartpole, played: Episodes, tmp_path: Path
 ) -> None:
@@ -224,7 +255,7 @@ def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_it
     half.write_bytes(b"PAR1")
     pid = os.fork()
     if pid == 0:  # killed between the table and the summary
-        write_table(run.evaluations / "00000003-e1-job.parquet", played, 7)
+        write_table(run.evaluations / "00000003-e1-job.parquet", played, 7, {})
         os._exit(9)
     os.waitpid(pid, 0)
     assert not half.exists() and list(run.evaluations.glob("*.json")) == []

@@ -1,0 +1,42 @@
+"""Log groups of users: which nodes log there, and the rows of those that exist."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from orchestrator.domain.errors import RequestError
+from orchestrator.domain.gang import LOG_GROUP
+from orchestrator.persistence.models import Job, LogGroup, Node
+
+MOST = 1000
+"""Log groups of a controller."""
+
+
+def check_room(session: Session, names: Collection[str]) -> None:
+    """Raise RequestError where those of the groups that do not exist yet would be too many."""
+    if not (more := _missing(session, names)):
+        return
+    there = session.scalar(select(func.count()).select_from(LogGroup)) or 0
+    if there + len(more) > MOST:
+        raise RequestError(f"there are {there} log groups, and {MOST} at most; delete some, or log to {LOG_GROUP}")
+
+
+def add_missing(session: Session, names: Collection[str], owner: str | None) -> None:
+    """Create those of the groups that do not exist yet."""
+    session.add_all(LogGroup(name=name, owner=owner) for name in sorted(_missing(session, names)))
+
+
+def _missing(session: Session, names: Collection[str]) -> set[str]:
+    if not names:
+        return set()
+    return set(names) - set(session.scalars(select(LogGroup.name).where(LogGroup.name.in_(names))))
+
+
+def record_logs(session: Session, job: Job, nodes: Sequence[Node]) -> None:
+    """Record with the nodes of a new attempt where they log; a group that was deleted since the submission is created again."""
+    for node, spec in zip(nodes, job.gang.nodes, strict=False):  # an elastic gang may start with fewer
+        node.log_group, node.log_prefix = spec.log_group, spec.log_prefix
+    add_missing(session, {node.log_group for node in nodes if node.log_group}, job.owner)

@@ -1,0 +1,67 @@
+"""The account and the region in a controller's ARNs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orchestrator.api import arns
+from orchestrator.control.account import DEFAULT, Account, recognise
+from orchestrator.domain.errors import UsageError
+from orchestrator.persistence.session import Database
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    made = Database.at(tmp_path)
+    yield made
+    made.close()
+
+
+def start(database: Database, account: str | None = None, region: str | None = None) -> Account:
+    with database.session() as session:
+        return recognise(session, account, region)
+
+
+def test_the_first_start_settles_both(database: Database) -> None:
+    mine = start(database, "123456789012", "eu-central-1")
+    assert mine == Account("123456789012", "eu-central-1", "aws")
+    assert start(database) == start(database, "123456789012") == start(database, None, "eu-central-1") == mine
+    for account, region in ((None, "us-east-1"), ("000000000000", None), ("123456789012", "eu-west-1")):
+        with pytest.raises(UsageError, match=r"account 123456789012 in eu-central-1 since its first start.*begin anew"):
+            start(database, account, region)
+
+
+def test_without_options_the_arns_are_those_of_before(database: Database) -> None:
+    assert start(database) == DEFAULT == Account("000000000000", "us-east-1", "aws")
+    with pytest.raises(UsageError, match=r"--account-id 123456789012: .*000000000000 in us-east-1"):
+        start(database, "123456789012")
+
+
+@pytest.mark.parametrize("account", ["1", "12345678901a", "1234567890123", "１２３４５６７８９０１２"])
+def test_a_malformed_account_settles_nothing(database: Database, account: str) -> None:
+    with pytest.raises(UsageError, match="expected 12 digits"):
+        start(database, account)
+    assert start(database, "123456789012").id == "123456789012"
+
+
+def test_a_region_that_aws_does_not_have_settles_nothing(database: Database) -> None:
+    with pytest.raises(UsageError, match="expected a region of AWS"):
+        start(database, None, "middle-earth")
+    assert start(database) == DEFAULT
+
+
+def test_every_arn_has_the_account_the_region_and_its_partition() -> None:
+    try:
+        arns.settle(Account("123456789012", "cn-north-1", "aws-cn"))
+        batch = "arn:aws-cn:batch:cn-north-1:123456789012:"
+        assert arns.job_arn("j") == f"{batch}job/j" and arns.plain_name(f"{batch}job-queue/q", "job-queue") == "q"
+        assert arns.ecs_arn("cluster", "c") == "arn:aws-cn:ecs:cn-north-1:123456789012:cluster/AWSBatch-c"
+        assert arns.iam_arn("role/r") == "arn:aws-cn:iam::123456789012:role/r"
+        assert arns.log_group_arn("/g") == "arn:aws-cn:logs:cn-north-1:123456789012:log-group:/g"
+        with pytest.raises(arns.ClientError, match="not an ARN of this controller"):
+            arns.plain_name("arn:aws:batch:us-east-1:000000000000:job-queue/q", "job-queue")
+    finally:
+        arns.settle(DEFAULT)

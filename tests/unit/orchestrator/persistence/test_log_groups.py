@@ -1,0 +1,58 @@
+"""The rows of log groups: how many there may be, and where the nodes of an attempt log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.domain.errors import RequestError
+from orchestrator.persistence import log_groups
+from orchestrator.persistence.models import LogGroup, Node
+from orchestrator.persistence.session import Database
+from tests.support.definitions import container
+from tests.support.orchestrator.rows import job
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Iterator[Session]:
+    database = Database.at(tmp_path)
+    with database.session() as session:
+        yield session
+    database.close()
+
+
+def names(session: Session) -> list[str]:
+    return list(session.scalars(select(LogGroup.name).order_by(LogGroup.name)))
+
+
+def test_there_is_room_for_a_thousand_groups_and_for_those_that_are_there(session: Session) -> None:
+    log_groups.check_room(session, ["/a"])
+    session.add_all(LogGroup(name=f"/{number}") for number in range(log_groups.MOST))
+    log_groups.check_room(session, ["/1", "/2"])
+    log_groups.check_room(session, [])
+    with pytest.raises(RequestError, match="there are 1000 log groups, and 1000 at most"):
+        log_groups.check_room(session, ["/1", "/a"])
+
+
+def test_a_new_attempt_records_where_each_node_logs_and_makes_a_deleted_group_again(session: Session) -> None:
+    def part(target: str, **options: str) -> dict[str, Any]:
+        log = {"logDriver": "awslogs", "options": options}
+        return {"targetNodes": target, "container": {**container(["true"], "1", {}), "logConfiguration": log}}
+
+    ranges = [
+        part("0", **{"awslogs-group": "/aws/batch/job"}),
+        part("1", **{"awslogs-group": "/own", "awslogs-stream-prefix": "p"}),
+        part("2", **{"awslogs-stream-prefix": ""}),
+    ]
+    known = job("j", owner="alice", node_properties={"numNodes": 3, "mainNode": 0, "nodeRangeProperties": ranges})
+    nodes = [Node(index=index, host="h") for index in range(2)]  # an elastic gang may have fewer
+    log_groups.record_logs(session, known, nodes)
+    log_groups.record_logs(session, known, nodes)
+    assert [(node.log_group, node.log_prefix) for node in nodes] == [(None, None), ("/own", "p")]
+    assert names(session) == ["/own"] and session.get_one(LogGroup, "/own").owner == "alice"
+    assert known.gang.log_groups == {"/own"} and known.gang.nodes[2].log_prefix is None
