@@ -21,6 +21,7 @@ import httpx
 from orchestrator.domain.errors import ApiError, NotServing, NoUrl, Unreachable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.home import local_url, muster_home
+from shared_store.texts import digest_of
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
 
@@ -109,6 +110,10 @@ class Client:
         """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
         return self._request("POST", path, body, seconds=seconds)
 
+    def keep_text(self, text: str) -> None:
+        """Have the store keep a long text for a job that names it by its SHA-256; again does no harm. Raises ApiError, Unreachable."""
+        self._request("PUT", f"/api/texts/{digest_of(text)}", content=text.encode())
+
     def logs(self, job: str, **query: Any) -> Iterator[dict[str, Any]]:
         """The job's log lines. Raises ApiError, Unreachable.
 
@@ -170,13 +175,22 @@ class Client:
             raise _unnamable(job) from None
 
     def _request(
-        self, method: str, path: str, body: Any = None, query: dict[str, Any] | None = None, seconds: float = 30
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        query: dict[str, Any] | None = None,
+        seconds: float = 30,
+        content: bytes | None = None,
     ) -> Any:
+        """``body``: JSON; ``content``: a body as it is."""
         headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if path.endswith(_SUBMISSIONS) else {}
 
         def send() -> httpx.Response:
             for pause in _PAUSES:
-                answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
+                answer = self._http.request(
+                    method, path, json=body, content=content, params=query, timeout=seconds, headers=headers
+                )
                 if answer.status_code != 429 and not (answer.status_code == 503 and "retry-after" in answer.headers):
                     break
                 time.sleep(pause)  # refused before anything was done

@@ -19,8 +19,10 @@ class KeptFile:
     """Form of a file's content in a configuration.
 
     Attributes:
-        form: ``text``: a mapping of ``file``, its name, and ``text``; ``json``: the value in the file.
-        check: A module; ``python -m MODULE FILE`` exits with 0 for a valid file; otherwise its last line names the error.
+        form: ``text``: a mapping of ``file``, its name, and ``text``, or of ``file`` and ``sha256`` for a long text, which is kept
+            beside the job (:mod:`shared_store.texts`), and which the ranks get as ``text``; ``json``: the value in the file.
+        check: A module; ``python -m MODULE FILE`` exits with 0 for a valid file, and its standard error has notes for the user;
+            otherwise its last line names the error.
             Empty: the configuration's class checks enough.
         needs: Packages without which the check would refuse valid files: if the command lacks one, the node checks.
     """

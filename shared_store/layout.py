@@ -85,6 +85,10 @@ class Run:
     def tracking(self) -> Path:
         return self.path / "tracking"
 
+    @property
+    def texts(self) -> Path:
+        return self.path / "texts"
+
     def logs(self, job: str, attempt: int) -> Path:
         return self.path / "logs" / job / str(attempt)
 
@@ -104,6 +108,7 @@ class Run:
             "recordings",
             "telemetry",
             "tracking",
+            "texts",
             "logs",
             "outcomes",
             "parent",
@@ -252,6 +257,10 @@ class Store:
     @property
     def tracks(self) -> Path:
         return self.path / "tracks"
+
+    @property
+    def texts(self) -> Path:
+        return self.path / "texts"
 
     @property
     def leagues(self) -> Path:

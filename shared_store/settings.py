@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from shared_store.texts import is_file
+
 
 def setting_at(settings: Any, key: str) -> Any:
     """The setting ``key``, in which a dot leads into a section; None if it is missing or an empty section."""
@@ -41,9 +43,12 @@ def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> l
 
 
 def merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``settings`` with the changes: sections are merged key by key; other values, and sections that become empty, are replaced."""
+    """``settings`` with the changes: sections are merged key by key; other values, the contents of files, and sections that become empty,
+    are replaced."""
     result = dict(settings)
     for key, value in changes.items():
         old = result.get(key)
-        result[key] = merged(old, value) if value and isinstance(old, Mapping) and isinstance(value, Mapping) else value
+        if value and isinstance(old, Mapping) and isinstance(value, Mapping) and not is_file(value):
+            value = merged(old, value)
+        result[key] = value
     return result

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.outcomes import EX_TEMPFAIL
 from shared_store.races import NO_RACER, TRIALS, race_changes, rules_of
 from shared_store.settings import merged
+from shared_store.texts import keep, referring
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
 
@@ -97,7 +98,10 @@ def main(kind: str = "evaluate") -> int:
             print(result, flush=True)
         known = {"keep": job.section.get("keep", True), **_circumstances(facts)}
         driven = laps.race(played, rules_of(job.section), seed) if laps else None
-        summary = result.write(run, job.id, driven, iteration=checkpoint.iteration, config=changes, **known)
+        shown, texts = referring(changes, f"{kind}.config")
+        for text in texts.values():  # such as a reward function, which explains this evaluation later
+            keep(run.texts, text.encode())
+        summary = result.write(run, job.id, driven, iteration=checkpoint.iteration, config=shown, **known)
         print("\n".join(lines(summary)), flush=True)
         print(f"written: {run.evaluations / summary['table']} and .json", flush=True)
     gang.close()

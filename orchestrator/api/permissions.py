@@ -146,6 +146,8 @@ class Operation(StrEnum):
     DELETE_KEY = "DELETE /api/keys/{name}"
     LIST_TRACKS = "GET /api/tracks"
     MAKE_TRACK = "POST /api/tracks"
+    KEEP_TEXT = "PUT /api/texts/{sha256}"
+    READ_TEXT = "GET /api/runs/{name}/texts/{sha256}"
     READ_WEBHOOKS = "GET /api/webhooks"
     TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 

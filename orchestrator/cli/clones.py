@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue, tell_note
 from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
@@ -60,7 +60,12 @@ def clone(
             "checkpoint": checkpoint,
             "nodes": nodes,
             "set": [
-                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_),
+                *changes_with_files(
+                    lambda: client.get(f"/api/runs/{named(run)}")["spec"],
+                    set_,
+                    (lambda text: None) if dry_run else client.keep_text,
+                    tell_note,
+                ),
                 *on_queue(set_, elsewhere),
             ],
             "directory": os.getcwd(),

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec
+from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec, tell_note
 from orchestrator.cli.progress import summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
@@ -158,7 +158,8 @@ def _spec(
     worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
     source = f"{'race' if kind == 'race' else 'evaluation'} of {run}"
     changed = override(document, [*worlds, *elsewhere])
-    return validate(with_files(changed, source, task=(trained.get("train") or {}).get("task")), source)
+    task = (trained.get("train") or {}).get("task")
+    return validate(with_files(changed, source, task=task, note=tell_note), source)
 
 
 def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:

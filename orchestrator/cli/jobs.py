@@ -18,7 +18,7 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
 from orchestrator.spec import file as specfile
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
 from shared_store.wording import counted, nearest
@@ -72,6 +72,8 @@ def submit_spec(
         if spec.train and spec.resources.gpus:
             lower += "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly"
         raise SpecError(f"{source}: resources: {problem}; {lower}")
+    for text in long_texts(spec):
+        client.keep_text(text)
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
 
@@ -114,7 +116,12 @@ def submit(
 def tell(spec: Spec) -> None:
     """Print a spec's warnings on standard error."""
     for note in spec.notes:
-        echo(f"note: {one_line(note)}", err=True)
+        tell_note(note)
+
+
+def tell_note(note: str) -> None:
+    """Print a warning on standard error."""
+    echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue
+from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, tell_note
 from orchestrator.cli.progress import follow
 from orchestrator.cli.serving import CpusOption, StoreOption, found_or_own, see_through
 from orchestrator.cli.show import scored
@@ -51,7 +51,9 @@ def resume(
             "checkpoint": checkpoint,
             "nodes": nodes,
             "set": [
-                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_),
+                *changes_with_files(
+                    lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, client.keep_text, tell_note
+                ),
                 *elsewhere,
                 *accepted,
             ],

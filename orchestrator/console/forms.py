@@ -26,8 +26,8 @@ TOKEN = "form_token"
 """The field of a form that other web pages can't know."""
 _LARGE = 16 << 10
 """Bytes of a body that would keep the event loop busy for some milliseconds."""
-_LARGEST_JOB = 200 << 10
-"""Bytes of a form with a job: 64 KiB of YAML, of which each may take three, and the other fields."""
+_LARGEST_JOB = 600 << 10
+"""Bytes of a form with a job: 192 KiB of YAML, of which each may take three, and the other fields."""
 _MOST_FIELDS = 5000
 _Body = TypeVar("_Body", bound=BaseModel)
 _OPEN = "/login"

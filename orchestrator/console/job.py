@@ -14,6 +14,7 @@ from fastapi.responses import RedirectResponse
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import with_texts
 from orchestrator.api.native.routes import job_detail
 from orchestrator.api.permissions import Operation, current_identity
 from orchestrator.console.curves import columns
@@ -55,7 +56,7 @@ def job(request: Request, reference: str) -> Response:
     before, files, checkpoints = None, list[File](), dict[str, Any]()
     if detail["storeProblem"] is None:
         try:
-            before, files, checkpoints = reconciler.calls.call(partial(_read, reconciler, detail))
+            spec, before, files, checkpoints = reconciler.calls.call(partial(_read, reconciler, detail))
         except StoreSilent as error:
             detail["storeProblem"] = str(error)
     view = views.state(detail["id"])
@@ -103,10 +104,11 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 
 def _read(
     reconciler: Reconciler, detail: Mapping[str, Any]
-) -> tuple[tuple[str, str, Mapping[str, Any]] | None, list[File], dict[str, Any]]:
-    """What the page has from the store: the other side of the comparison, the run's files, and its checkpoints."""
+) -> tuple[Mapping[str, Any], tuple[str, str, Mapping[str, Any]] | None, list[File], dict[str, Any]]:
+    """What the page has from the store: the spec with its texts, the other side of the comparison, the run's files, and its checkpoints."""
+    spec = with_texts(reconciler, detail["run"], detail["spec"] or {})
     files = _files(reconciler, detail["run"]) if detail["results"] is not None else []
-    return before_it(reconciler, detail), files, _checkpoints(reconciler, detail)
+    return spec, before_it(reconciler, detail), files, _checkpoints(reconciler, detail)
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from orchestrator.api import permissions
 from orchestrator.api.context import permitted_run
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import with_texts
 from orchestrator.api.native import runs
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
@@ -92,6 +93,7 @@ def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, s
             with reading(earlier):
                 spec = earlier.gang.spec
             if spec:
+                spec = with_texts(reconciler, detail["run"], spec)
                 return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", permissions.shown(spec)
     parent = (detail["results"] or {}).get("parent") or {}
     name = parent.get("run")
@@ -103,4 +105,6 @@ def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, s
             spec = runs.spec_of(session, run)
     except (ClientError, DamagedFile, OSError):
         return None  # deleted, or another's
-    return (f"its parent {name}", f"/runs/{name}", permissions.shown(spec)) if spec else None
+    if not spec:
+        return None
+    return f"its parent {name}", f"/runs/{name}", permissions.shown(with_texts(reconciler, name, spec))

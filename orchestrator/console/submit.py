@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -14,6 +15,7 @@ from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import with_texts
 from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.api.native.plan_routes import PlanRequest
@@ -27,7 +29,7 @@ from orchestrator.console.submit_fields import Group, document, filled, groups, 
 from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
 from orchestrator.console.tracks import track_names
 from orchestrator.domain.errors import SpecError
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
 from shared_store.wording import nearest
@@ -44,8 +46,8 @@ train:
   worlds: 128
   iterations: 100
 """
-_LARGEST = 64 << 10
-"""Bytes of a form's YAML: that of a job's definition, which has 24 KiB, and room for comments."""
+_LARGEST = 192 << 10
+"""Bytes of a form's YAML: of a reward function, which has at most 140,000 characters, with its indentation, and of the rest of the job."""
 _sent = Recent(inf, 1000)
 """Id and name of the jobs of the last forms, by sender and the form's random name: a form that is sent again makes no second job."""
 _turns = Turns("other reward functions are being tried")
@@ -79,10 +81,10 @@ def plain(request: Request, job: str = Query(default="", max_length=200)) -> Res
     """The YAML editor; with ``job`` the spec of that job, to submit a changed one."""
     text = BEGINNING
     if job:
-        spec = routes.job_detail(request, job)["spec"]
-        if not spec:
+        detail, reconciler = routes.job_detail(request, job), reconciler_of(request)
+        if not detail["spec"]:
             raise ClientError(f"job {job} was not submitted with a job YAML")
-        text = written(spec)
+        text = written(reconciler.calls.call(partial(with_texts, reconciler, detail["run"], detail["spec"])))
     return _editor(request, text, None)
 
 
@@ -169,6 +171,8 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
     definition = compile_definition(spec, "")
     if unfit := _unfit(request, spec, PlanRequest(definition=definition, queue=spec.queue)):
         raise ClientError(unfit.message)
+    for text in long_texts(spec):
+        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
     registered = batch.call(reconciler, "RegisterJobDefinition", definition)
     answer = batch.call(reconciler, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
     return answer["jobId"], answer["jobName"]
@@ -192,8 +196,8 @@ def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
 def _checked(text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     """The spec of a text, or its problem.
 
-    A learner's code runs here only for keys with all queues, since its guard is no sandbox: for other keys the text of a reward
-    function is checked here, and the job's ranks try it.
+    A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys the text of a reward function
+    is checked here, and the job's ranks try it.
     """
     tries = whole and permissions.current_identity.get().queues is None
     try:
@@ -207,7 +211,9 @@ def _text(request: Request, form: Form) -> tuple[str, str]:
     """The YAML of a form, and the wizard's task; that is empty where the form has the YAML itself."""
     if not (task := form.one("task")):
         return _lines(form.one("yaml")), ""
-    return written(document(task, filled(form, _groups(request, task)))), task
+    found = filled(form, _groups(request, task))
+    with _checks.turn():
+        return written(document(task, found)), task
 
 
 def _lines(text: str) -> str:

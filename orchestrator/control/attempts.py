@@ -20,6 +20,7 @@ from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.compute_environments import engine_options
+from orchestrator.control.kept_texts import KeptTexts, references_of
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import CHECK_INTERVAL, Observer
 from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
@@ -105,12 +106,14 @@ class Attempts:
         monitoring: Monitoring,
         changed: Callable[[str], None],
         withdrawn: Callable[[str, str], None],
+        texts: KeptTexts,
     ) -> None:
         """``changed``: called, from any thread, with a job whose attempt should be looked at; ``withdrawn``: with one that can't start
-        now, and why.
+        now, and why. ``texts``: of which each run gets those that its job names.
         """
         self.engine, self.runs, self.bus = engine, runs, bus
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
+        self.texts = texts
         self._memories: dict[tuple[str, int], _Memory] = {}
         self._errands = Errands(machine.pool("store", _READERS), str(runs.store.path), changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
@@ -270,7 +273,8 @@ class Attempts:
             record = record_owner(session, run, job)
             description = first_description(run, job, record.owner, record.queue)
             claim = Claim(self.runs.peers.id, job.id, attempt.number)
-            taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim)
+            texts = [(each, self.texts.source(session, each)) for each in references_of(job.gang)]
+            taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim, texts)
             epoch = self._errands.result(key, "claim", taking, again=False)
         except StoreUnavailable as error:
             return PrepareDelayed(str(error))

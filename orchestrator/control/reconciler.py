@@ -21,6 +21,7 @@ from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.isolation import Isolation
+from orchestrator.control.kept_texts import KeptTexts
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
@@ -91,18 +92,21 @@ class Reconciler:
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
         self.clock = clock or Clock()
+        self.writing = threading.Lock()
+        """Held while something is registered, submitted or changed: checks must still hold at the commit."""
+        runs = runs or RunStore(store, peers, *([identity.check] if identity else []))
+        self.texts = KeptTexts(database, store, runs.peers.id, self.writing, lambda: self.disk.shortage("store"))
         self.monitoring, self.heartbeat = Monitoring(), Heartbeat()
         self.attempts = Attempts(
             engine,
-            runs or RunStore(store, peers, *([identity.check] if identity else [])),
+            runs,
             bus,
             self.clock,
             self.monitoring,
             self._gang_changed,
             self._withdrawn,
+            self.texts,
         )
-        self.writing = threading.Lock()
-        """Held while something is registered, submitted or changed: checks must still hold at the commit."""
         self.beginning: dict[str, WeightsCopy] = {}
         """Runs that get files before the database has their jobs, by name; nobody else may write them. Entered under :attr:`writing`."""
         self.submissions = GroupCommit(database, self.writing)
@@ -312,6 +316,7 @@ class Reconciler:
         try:
             self._swept = machine.monotonic()
             self._clear_away()
+            self.texts.sweep_when_due(self.calls.later)
         finally:
             self.writing.release()
 

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
+from pathlib import Path
 from typing import Any, TypeVar
 
 from orchestrator import machine
@@ -25,6 +26,7 @@ from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import Outcome, read_outcome
+from shared_store.texts import Reference, keep, read_either
 
 log = logging.getLogger("muster.controller")
 
@@ -101,12 +103,25 @@ class RunStore:
 
         return self._call(f"read run {name}", body)
 
-    def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
-        """Create the run, where it is missing, and give it to an attempt; returns the epoch, greater than ``after``. Raises RunRefused."""
+    def claim(
+        self,
+        name: str,
+        description: Mapping[str, Any],
+        after: int,
+        claim: Claim,
+        texts: Sequence[tuple[Reference, Path]] = (),
+    ) -> int:
+        """Create the run, where it is missing, and give it to an attempt; returns the epoch, greater than ``after``.
+
+        ``texts``: that the run gets a copy of, each with its folder. Raises RunRefused, also where one is missing or altered.
+        """
 
         def body() -> int:
             run = self.store.run(name)
+            found = [read_either(run.texts, source, reference) for reference, source in texts]
             run.create(dict(description))
+            for text in found:
+                keep(run.texts, text.encode())
             return take_epoch(run, after, claim)
 
         return self._call(f"prepare run {name}", body)

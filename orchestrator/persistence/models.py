@@ -458,6 +458,22 @@ class KnownStore(Base):
     """As its ``store.json`` has it."""
 
 
+class KeptText(Base):
+    """A long text of jobs, which lies in the store (:mod:`orchestrator.control.kept_texts`)."""
+
+    __tablename__ = "kept_texts"
+    sha256: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str]
+    """The one who has uploaded it last."""
+    folder: Mapped[str]
+    """That of the controller which keeps it."""
+    size: Mapped[int]
+    """Bytes."""
+    uploaded_at: Mapped[int]
+    used_at: Mapped[int]
+    """When it was uploaded, or a definition or a job that names it was registered, last."""
+
+
 class KnownAccount(Base):
     """The one row of the account in the ARNs (:mod:`orchestrator.control.account`)."""
 

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from orchestrator.spec.model import Spec
+from shared_store.texts import beside
 
 _MODULES = {kind: f"worker.{kind}" for kind in ("train", "evaluate", "race", "export", "record", "render")}
 
 
 def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
-    """The ``RegisterJobDefinition`` request of a spec.
+    """The ``RegisterJobDefinition`` request of a spec, in which the digests of long texts stand (:func:`long_texts`).
 
     Args:
         spec: The job.
@@ -20,8 +21,9 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
     """
     module = _MODULES.get(spec.kind)
     command = ["python", "-P", "-m", module] if module else list(spec.command or [])
+    document, _ = beside(spec.document())
     ours = {
-        "MUSTER_SPEC": json.dumps(spec.model_dump(mode="json", exclude_none=True), separators=(",", ":")),
+        "MUSTER_SPEC": json.dumps(document, separators=(",", ":")),
         "MUSTER_ON_CHILD_FAILURE": spec.on_child_failure,
         "MUSTER_RANKS_PER_NODE": str(spec.ranks_per_node),
         "MUSTER_MIN_NODES": str(spec.nodes.min),
@@ -60,6 +62,11 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
     if spec.timeout is not None:
         request["timeout"] = {"attemptDurationSeconds": int(spec.timeout)}
     return request
+
+
+def long_texts(spec: Spec) -> list[str]:
+    """The texts of a spec that the store has to keep before its definition is registered (:mod:`shared_store.texts`)."""
+    return list(beside(spec.document())[1].values())
 
 
 def compile_submission(

@@ -27,9 +27,10 @@ def load(path: str, assignments: list[str] | None = None) -> Spec:
         # what --set changed stands on no line of the file
         lines = {key: line for key, line in lines.items() if not any(key[: len(each)] == each for each in changed)}
         lines |= dict.fromkeys(changed, 0)
+    notes: list[str] = []
     if isinstance(document, dict):
-        document = with_files(document, path, lines)
-    return validate(_with_hyperparameters(document, path, lines), path, lines)
+        document = with_files(document, path, lines, note=notes.append)
+    return validate(_with_hyperparameters(document, path, lines), path, lines).with_notes(notes)
 
 
 def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
@@ -47,10 +48,10 @@ def from_text(text: str, source: str, *, whole: bool = True) -> Spec:
     if isinstance(document, dict):
         refuse_paths(document, source, lines)
         check_sizes(document, source, lines)
-    spec = validate(document, source, lines)
+    spec, notes = validate(document, source, lines), list[str]()
     if whole:
-        check_texts(document, source, lines)
-    return spec
+        check_texts(document, source, lines, notes.append)
+    return spec.with_notes(notes)
 
 
 def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.Path, int]) -> Any:

@@ -1,4 +1,7 @@
-"""Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted."""
+"""Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted.
+
+A text that is too long for the job's definition is kept beside it (:mod:`shared_store.texts`).
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,11 @@ from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import place_of
 from shared_store.file_fields import KeptFile, kept_files
 from shared_store.settings import setting_at
+from shared_store.texts import IN_DEFINITION, LARGEST, beside, size_in_definition
 
-MOST = 20 << 10
-"""Bytes that a file may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
 _SECTIONS = ("train", "evaluate", "race")
+Note = Callable[[str], object]
+"""Is called with a line for the user."""
 
 
 def with_files(
@@ -30,6 +34,7 @@ def with_files(
     lines: Mapping[tuple[str | int, ...], int] | None = None,
     *,
     task: str | None = None,
+    note: Note | None = None,
 ) -> dict[str, Any]:
     """A job's document with the content of the files that its task's configuration names in the place of their paths.
 
@@ -40,6 +45,7 @@ def with_files(
         source: Its name in errors.
         lines: Line of each key path in the file, for errors.
         task: Name of the task, where the document does not say it.
+        note: Called with each line that a check has for the user.
 
     Raises:
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
@@ -48,7 +54,7 @@ def with_files(
     for section, field, value, how in _fields(document, task):
         if isinstance(value, str):
             try:
-                content = _content(value, how)
+                content = _content(value, how, note)
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
             values = result[section]
@@ -73,14 +79,19 @@ def refuse_paths(document: Mapping[str, Any], source: str, lines: Mapping[tuple[
 
 def check_sizes(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
     """Refuse a file's content that is too large, before anything else is done with it. Arguments as :func:`with_files`. Raises SpecError."""
-    for section, field, value, _ in _fields(document):
+    for section, field, value, how in _fields(document):
         try:
-            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value)
+            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value, how)
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
 
-def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
+def check_texts(
+    document: Mapping[str, Any],
+    source: str,
+    lines: Mapping[tuple[str | int, ...], int],
+    note: Note | None = None,
+) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     for section, field, value, how in _fields(document):
         text = value.get("text") if isinstance(value, Mapping) else None
@@ -91,7 +102,7 @@ def check_texts(document: Mapping[str, Any], source: str, lines: Mapping[tuple[s
             with TemporaryDirectory() as folder:
                 path = Path(folder) / "text"
                 path.write_text(text, encoding="utf-8")
-                _check(str(path), how, name)
+                _check(str(path), how, note, name)
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
@@ -110,10 +121,16 @@ def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tu
                 yield section, field, config[field], how
 
 
-def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], changes: Sequence[str] | None) -> list[str]:
+def changes_with_files(
+    spec_of_run: Callable[[], Mapping[str, Any] | None],
+    changes: Sequence[str] | None,
+    keep: Callable[[str], object],
+    note: Note | None = None,
+) -> list[str]:
     """``--set`` assignments for a run that is resumed or cloned, with the content of files as :func:`with_files`.
 
-    ``spec_of_run`` is called where its task has to be known.
+    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``note`` as of
+    :func:`with_files`.
 
     Raises:
         SpecError: As :func:`with_files`.
@@ -123,15 +140,17 @@ def changes_with_files(spec_of_run: Callable[[], Mapping[str, Any] | None], chan
         return given
     trained = (spec_of_run() or {}).get("train") or {}
     task = setting_at(override({"train": {"task": trained.get("task")}}, given), "train.task")
-    return [_embedded(each, task) for each in given]
+    return [_embedded(each, task, keep, note) for each in given]
 
 
-def _embedded(assignment: str, task: Any) -> str:
+def _embedded(assignment: str, task: Any, keep: Callable[[str], object], note: Note | None) -> str:
     key = assignment.partition("=")[0]
     change = override({}, [assignment])
-    whole = with_files(change, "", {tuple(key.split(".")): 0}, task=task)
+    whole, texts = beside(with_files(change, "", {tuple(key.split(".")): 0}, task=task, note=note))
     if whole == change:
         return assignment
+    for text in texts.values():
+        keep(text)
     # as YAML reads it: what JSON writes in two halves beyond 16 bits is one character there
     text = re.sub(
         r"\\u(d[89ab]..)\\u(d[c-f]..)",
@@ -141,11 +160,13 @@ def _embedded(assignment: str, task: Any) -> str:
     return f"{key}={text}"
 
 
-def _content(path: str, how: KeptFile) -> Any:
+def _content(path: str, how: KeptFile, note: Note | None) -> Any:
     """The value in the configuration. Raises SpecError."""
     try:
         with Path(path).open("rb") as stream:
-            data = stream.read((1 << 20) + 1)
+            data = stream.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise SpecError(f"{path}: it has more than {LARGEST:,} bytes; shorten it")
         text = data.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not a text file (UTF-8)"
@@ -159,24 +180,31 @@ def _content(path: str, how: KeptFile) -> Any:
             raise SpecError(f"{path}{where}: it is not JSON ({getattr(error, 'msg', 'nested too deeply')})") from None
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
-    _check_size(path, value)
-    _check(path, how)
+    _check_size(path, value, how)
+    _check(path, how, note)
     return value
 
 
-def _check_size(name: str, value: Any) -> None:
+def _check_size(name: str, value: Any, how: KeptFile) -> None:
     """Raises SpecError."""
-    # the job's spec is JSON in a text of JSON
-    if (size := len(json.dumps(json.dumps(value)))) > MOST:
-        raise SpecError(f"{name}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
+    text = value.get("text") if how.form == "text" and isinstance(value, Mapping) else None
+    if isinstance(text, str):
+        if len(text.encode(errors="replace")) > LARGEST:
+            raise SpecError(f"{name}: it has more than {LARGEST:,} bytes; shorten it")
+    elif (size := size_in_definition(value)) > IN_DEFINITION:
+        words = f"it takes {size:,} bytes of the job's definition, and may take {IN_DEFINITION:,}"
+        raise SpecError(f"{name}: {words}; shorten it")
 
 
-def _check(path: str, how: KeptFile, name: str = "") -> None:
+def _check(path: str, how: KeptFile, note: Note | None, name: str = "") -> None:
     """Have another process check the file, since the parts of tasks belong to the worker. Raises SpecError, in which ``name`` stands for the path."""
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [line.replace(path, name or path, 1) for line in checked.stderr.strip().splitlines()]
     if checked.returncode:
-        said = checked.stderr.strip().splitlines() or [f"{how.check} ended with exit code {checked.returncode}"]
-        raise SpecError(said[-1].replace(path, name or path, 1))
+        raise SpecError(said[-1] if said else f"{how.check} ended with exit code {checked.returncode}")
+    if note is not None:
+        for line in said:
+            note(line)

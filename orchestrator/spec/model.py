@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -40,6 +40,7 @@ from orchestrator.spec.values import (
     place_of,
 )
 from shared_store.races import DEFAULTS, TRIALS
+from shared_store.texts import beside
 from shared_store.wording import Refused, explain, kind_of, nearest, path_of, shown
 
 KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
@@ -282,7 +283,21 @@ class Spec(Section):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the submitter."""
-        return self._notes
+        _, texts = beside(self.document())
+        kept = (
+            f"{each.key}: {each.file}: {len(text.encode()):,} bytes: kept beside the job"
+            for each, text in texts.items()
+        )
+        return (*self._notes, *kept)
+
+    def document(self) -> dict[str, Any]:
+        """It as JSON."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def with_notes(self, notes: Iterable[str]) -> Spec:
+        """This spec, with further notes."""
+        self._notes += tuple(notes)
+        return self
 
     @property
     def kind(self) -> str:
@@ -333,8 +348,7 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
-    spec._notes = tuple(notes)
-    return spec
+    return spec.with_notes(notes)
 
 
 def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

@@ -21,6 +21,7 @@ from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.epoch import StaleEpoch
 from shared_store.faults import fault_in
 from shared_store.layout import Run, Store, StoreError
+from shared_store.texts import TextError, resolved
 from shared_store.wording import kind_of
 from worker.accepting import CHANGED_ROBOTS
 from worker.errors import GangError, TrainingError, UserError
@@ -123,6 +124,7 @@ class Job:
         _check_kinds(spec, kind)
         store = Store(env["MUSTER_STORE"])
         run = store.run(env["MUSTER_RUN"])
+        section = with_texts(section, run, kind)
         # a new training has no policy that another robot could have trained
         continues = kind != "train" or bool(list_checkpoints(run))
         CHANGED_ROBOTS.set(continues and bool(section.get("accept_changed_robot")))
@@ -153,6 +155,16 @@ def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
     for where, given in {**places, "checkpoint": spec.get("checkpoint")}.items():
         if not isinstance(given, dict | None):
             raise UserError(f"{where}: expected a mapping, found {kind_of(given)}")
+
+
+def with_texts(section: Mapping[str, Any], run: Run, kind: str) -> dict[str, Any]:
+    """A section of the job YAML, ``kind``, with the texts that its run keeps in the place of their digests. Raises UserError."""
+    if not (config := section.get("config")):
+        return dict(section)
+    try:
+        return {**section, "config": resolved(config, run.texts, f"{kind}.config")}
+    except TextError as error:
+        raise UserError(str(error)) from error
 
 
 def configure(task: type[Task], section: Mapping[str, Any], kind: str = "train") -> TaskConfig:

@@ -178,6 +178,7 @@ class RewardInputs:
     function: Any
     reason: str
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
     arrays_type: ClassVar[Any] = RaceArrays
 
     @classmethod
@@ -187,10 +188,11 @@ class RewardInputs:
         Raises:
             ValueError: The guard refuses it.
         """
-        if device and (problem := checked(reward.text, reward.file)):
+        problem, warnings = checked(reward.text, reward.file) if device else (None, ())
+        if problem:
             raise ValueError(f"config.reward_function: {problem}")
         function, _, reason, notes = compiled_function(reward.text, reward.file, device)
-        return cls(circuit, reward, front, function, reason, notes)
+        return cls(circuit, reward, front, function, reason, notes, warnings)
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """None: a term that reads it is called once."""

@@ -104,6 +104,7 @@ class Racer(DeclaredTask):
         notes = [*super().notes()]
         if self.race is None:
             return notes
+        notes += self.race.warnings
         if not self.race.reason:
             return [*notes, f"{self.race.reward.file}: compiled to the device", *self.race.notes]
         graph = "; a step is no part of a CUDA graph" if self.device.startswith("cuda") else ""

@@ -122,7 +122,7 @@ def stage_of(run: Run, worlds: int) -> tuple[Stage, dict[str, Any]]:
     """The stage of a run's training worlds, and the ``train`` section of its job. Raises UserError."""
     import warp
 
-    from worker.learning.job import configure, user_errors
+    from worker.learning.job import configure, user_errors, with_texts
     from worker.tasks import find_task
     from worker.telemetry.stage import Stage
 
@@ -131,6 +131,7 @@ def stage_of(run: Run, worlds: int) -> tuple[Stage, dict[str, Any]]:
     train = spec.get("train")
     if not isinstance(train, dict) or not isinstance(train.get("task"), str):
         raise UserError(f"run {run.name}: its description names no task")
+    train = with_texts(train, run, "train")
     with user_errors():
         task_type = find_task(train["task"])
         return Stage(task_type, configure(task_type, train), worlds), train

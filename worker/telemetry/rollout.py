@@ -13,6 +13,7 @@ import warp
 
 from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Run
+from shared_store.texts import resolved_spec
 from worker.learning.job import configure, user_errors
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.setup import begin_as_trained, check_contract, observed
@@ -150,9 +151,9 @@ def facts_of(run: Run, known: Mapping[str, Any]) -> dict[str, str]:
 
 
 def job_attachment(run: Run) -> dict[str, bytes]:
-    """The YAML of the run's job as JSON; nothing where it had none."""
+    """The YAML of the run's job as JSON, with its long texts; nothing where it had none."""
     spec = (run.description() or {}).get("spec")
-    return {"job.json": as_json(spec)} if spec else {}
+    return {"job.json": as_json(resolved_spec(spec, run.texts))} if spec else {}
 
 
 def as_json(value: object) -> bytes:

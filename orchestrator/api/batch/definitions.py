@@ -13,6 +13,7 @@ from orchestrator.api.batch.describe import ecs_with_defaults, node_ranges, retr
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import JobDefinition
@@ -42,6 +43,7 @@ def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any],
         raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
     gang = rules.check_nodes(rules.node_properties(request), kind)
     _check_owner(context, name, Operation.REGISTER_JOB_DEFINITION)
+    check_texts(context, gang)
     query = select(JobDefinition.revision, JobDefinition.owner).where(JobDefinition.name == name)
     newest = context.session.execute(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
     revision = newest.revision + 1 if newest else 1

@@ -12,7 +12,6 @@ from typing import Any
 
 from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions
 from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
@@ -103,8 +102,9 @@ def call(reconciler: Reconciler, operation: str, request: object, idempotency_ke
             answer: dict[str, Any] = permissions.shown(handler(Context(session, reconciler), checked))
             return answer
 
-    def carry_out(session: Session) -> dict[str, Any]:
-        return handler(Context(session, reconciler, idempotency_key), checked)
+    def carry_out(known: Known) -> dict[str, Any]:
+        with reconciler.writing, reconciler.database.session() as session:
+            return handler(Context(session, reconciler, idempotency_key, known=known), checked)
 
     def submit(teacher: TeacherCopy | None) -> dict[str, Any]:
         def call(known: Known) -> dict[str, Any]:
@@ -117,11 +117,8 @@ def call(reconciler: Reconciler, operation: str, request: object, idempotency_ke
 
     reconciler.check_writable(adds=operation.startswith(_ADDING))
     try:
-        if operation == "SubmitJob":
-            response = with_teacher(reconciler, submit)
-        else:
-            with reconciler.writing, reconciler.database.session() as session:
-                response = carry_out(session)
+        is_submission = operation == "SubmitJob"
+        response = with_teacher(reconciler, submit) if is_submission else with_store(reconciler, carry_out)
     except IntegrityError as error:  # two calls at the same instant
         raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
     reconciler.wake()

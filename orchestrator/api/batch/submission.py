@@ -17,6 +17,7 @@ from orchestrator.api.batch import rules
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import check_sources, hold_teacher
 from orchestrator.control.compute_environments import queue_engines
@@ -55,6 +56,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     job, gang = _job(context, request, queue, definition)
     _check_automatic(context, request, gang)
     is_array, is_waiting = bool(request.get("arrayProperties")), bool(request.get("dependsOn"))
+    check_texts(context, gang)
     teacher = check_sources(context, gang, is_waiting)
     job.idempotency_key = _scoped(context.idempotency_key)
     if is_array:

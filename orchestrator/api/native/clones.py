@@ -18,6 +18,7 @@ from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
 from orchestrator.api.context import Context, Known, release, with_store
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import keep_again
 from orchestrator.api.native.continuing import Changes, answered, check, submit
 from orchestrator.api.native.runs import spec_of
 from orchestrator.api.sources import with_teacher
@@ -88,6 +89,7 @@ def _clone(
     new = reconciler.store.run(name)
     _check_submission(reconciler, spec, changes, name)  # before the copy: not for who may not submit it
     reconciler.check_writable(adds=True)
+    keep_again(reconciler, source, spec.document())
     if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
     making = NewRun(reconciler.store, reconciler.peers.id, source.name, chosen)

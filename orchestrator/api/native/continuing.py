@@ -69,7 +69,7 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
     permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(context.queue(spec.queue).name))
-    check_tracks(context.reconciler.store, spec.model_dump(mode="json", exclude_none=True), context.read)
+    check_tracks(context.reconciler.store, spec.document(), context.read)
     limits.check_document("RegisterJobDefinition", definition)
     return definition
 

@@ -31,6 +31,7 @@ from orchestrator.api.native import (
     queue_overview,
     run_routes,
     runs,
+    text_routes,
     track_routes,
     webhook_routes,
 )
@@ -57,6 +58,7 @@ router = APIRouter(prefix="/api")
 router.include_router(job_list.router)
 router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
+router.include_router(text_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
 router.include_router(track_routes.router)

@@ -16,6 +16,7 @@ from orchestrator.api.checkpoints import CONFLICT, choose, refusal
 from orchestrator.api.context import Context, Known, visible_runs, with_store
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
+from orchestrator.api.kept_texts import keep_again
 from orchestrator.api.native.continuing import Changes, answered, submit
 from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
@@ -175,6 +176,8 @@ def _resume(
     with reconciler.database.session() as session:
         if earlier := _answered(Context(session, reconciler, idempotency_key), found, checkpoints):
             return earlier
+        document = spec_of(session, found)
+    keep_again(reconciler, run, document)
     chosen = choose(run, changes.checkpoint)
     if chosen is not None:
         with suppress(DamagedCheckpoint):

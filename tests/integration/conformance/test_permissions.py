@@ -37,7 +37,7 @@ SHARED_READ = "+ + + + + + +"
 ALL_READ = "+ + - - + - -"
 """It tells of all queues at once."""
 OWN_MADE = "+ + + + - - -"
-"""A league or a log group is created, which then is the caller's."""
+"""A league, a log group or a text is created, which then is the caller's."""
 DEFINITION_READ = "+ + + h h h h"
 """Names and commands of definitions are everybody's to see, values only of one's own."""
 
@@ -60,7 +60,7 @@ TABLE = {
         OWN_READ: (OF.LIST_JOBS, OF.GET_JOB_QUEUE_SNAPSHOT, OF.LIST_TAGS_FOR_RESOURCE, OF.GET_LOG_EVENTS),
         NAMED_READ: (
             *(OF.READ_JOB, OF.READ_JOB_LOGS, OF.READ_JOB_STACKS, OF.READ_RUN, OF.READ_CHECKPOINTS, OF.READ_METRICS),
-            *(OF.READ_EVALUATIONS, OF.READ_MODEL),
+            *(OF.READ_EVALUATIONS, OF.READ_MODEL, OF.READ_TEXT),
         ),
         OWN_WRITES: (OF.TERMINATE_JOBS, OF.CANCEL_JOBS),
         SHARED_WRITE: (
@@ -75,7 +75,7 @@ TABLE = {
             *(OF.READ_CAPACITY, OF.LIST_LEAGUES, OF.READ_LEAGUE, OF.READ_LEAGUE_TABLE, OF.READ_ENTRY, OF.LIST_TRACKS),
         ),
         ALL_READ: (OF.READ_MONITORING, OF.READ_KEYS, OF.READ_WEBHOOKS),
-        OWN_MADE: (OF.CREATE_LEAGUE, OF.CREATE_LOG_GROUP),
+        OWN_MADE: (OF.CREATE_LEAGUE, OF.CREATE_LOG_GROUP, OF.KEEP_TEXT),
     }.items()
     for operation in operations
 }
@@ -168,6 +168,8 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         ),
         of.CREATE_KEY: lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
         of.DELETE_KEY: world.delete_key,
+        of.KEEP_TEXT: lambda key: world.text_call(key, of.KEEP_TEXT, MARK),
+        of.READ_TEXT: lambda key: world.text_call(key, of.READ_TEXT, MARK),
         of.MAKE_TRACK: lambda key: world.native_call(key, of.MAKE_TRACK, {"name": world.fresh(), "seed": 7}),
     }
     bodies: dict[Operation, dict[str, Any]] = {

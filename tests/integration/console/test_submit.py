@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -240,21 +241,69 @@ def test_a_read_only_key_and_a_key_of_another_queue_submit_nothing(console: Cons
     assert stolen.status_code == 403 and "load the page again" in stolen.text
 
 
-def test_a_reward_function_that_is_too_large_is_refused_before_anything_reads_it(console: Console) -> None:
+def test_checks_of_the_longest_reward_functions_take_turns_and_leave_the_server_to_others(console: Console) -> None:
     visitor = console.visitor("lab")
     code = "def reward_function(params):\n    return 1.0\nx = 1" + "<1" * 60_000
-    text = f"name: a\nqueue: lab\ntrain:\n  task: Racer\n  config:\n    reward_function: {json.dumps({'file': 'r.py', 'text': code})}\n"
+    begins = (
+        "name: a\nqueue: lab\ntrain:\n  task: Racer\n  worlds: 1\n  iterations: 1\n  config:\n    reward_function: "
+    )
+    text = f"{begins}{json.dumps({'file': 'r.py', 'text': code})}\n"
     token = visitor.page("/").form_token
     sent = {"form_token": token, "yaml": text, "whole": "yes"}
 
     def check(_: int) -> httpx.Response:
-        return visitor.http.post("/submit/check", data=sent, headers={"Accept": "application/json"})
+        return visitor.http.post("/submit/check", data=sent, headers={"Accept": "application/json"}, timeout=60)
 
     with ThreadPoolExecutor(12) as threads:
         answers = threads.map(check, range(12))
         for _ in range(20):
             assert visitor.http.get("/healthz").status_code == 200
-        assert {answer.status_code for answer in answers} <= {413, 429}
-    shorter = text.replace("<1" * 60_000, "<1" * 12_000)
-    found = checked(visitor, {"yaml": shorter}, whole="yes")
-    assert "may take 20,480; shorten it" in found["problem"]["message"]
+        assert {answer.status_code for answer in answers} <= {200, 429}
+    longer = checked(visitor, {"yaml": text.replace("<1" * 60_000, "<1" * 71_000)}, whole="yes")
+    assert "140000 characters" in longer["problem"]["message"]
+    token = visitor.page("/").form_token
+    refused = visitor.http.post("/submit/check", data={"form_token": token, "yaml": text + "#" * 80_000})
+    assert refused.status_code == 413
+
+
+def test_a_reward_function_that_is_tried_tells_nothing_of_the_server(console: Console) -> None:
+    """It passes the guard's look at the text; the files are there, and the server can read them."""
+    visitor = console.visitor()
+    for path in (console.server.home / "keys.json", Path("/etc/passwd"), Path("/proc/self/environ")):
+        assert path.read_bytes()
+        code = "import numpy as np\n\n\ndef reward_function(params):\n"
+        code += f"    lines = np.ma.core.inspect.linecache.getlines({str(path)!r})\n    raise ValueError(lines)\n"
+        train = {
+            "task": "Racer",
+            "worlds": 1,
+            "iterations": 1,
+            "config": {"reward_function": {"file": "r.py", "text": code}},
+        }
+        problem = checked(visitor, {"yaml": json.dumps({"name": "a", "queue": "lab", "train": train})}, whole="yes")[
+            "problem"
+        ]
+        assert problem["message"].endswith("r.py:6: TEST_FAILURE: the sample 'start': ValueError: []")
+
+
+def test_a_long_reward_function_is_kept_beside_the_job_and_shown_with_it(console: Console) -> None:
+    visitor, name = console.visitor("lab"), "train.config.reward_function"
+    code = f"{REWARD}LINE = {[[round(0.001 * number, 3)] * 3 for number in range(1500)]!r}\r\n"
+    fields = {**filled(visitor, "Racer"), "queue": "lab", "resources.cpus": "1", name: code}
+    found = checked(visitor, fields)
+    size = len(code.replace("\r\n", "\n"))
+    assert (found["problem"], found["notes"]) == (
+        None,
+        [f"{name}: reward_function.py: {size:,} bytes: kept beside the job"],
+    )
+    review = visitor.http.post("/submit/review", data=fields)
+    assert review.status_code == 200 and f"{size:,} bytes: kept beside the job" in Page(review.text).text
+    job = visitor.submit("/submit", yaml=yaml_of(Page(review.text))).json()["location"].rpartition("/")[2]
+    try:
+        spec = console.client.get(f"/api/jobs/{job}")["spec"]
+        assert spec["train"]["config"]["reward_function"].keys() == {"file", "sha256"}
+        line = "LINE = [[0.0, 0.0, 0.0], [0.001, 0.001, 0.001]"
+        assert line in visitor.page(f"/jobs/{job}").text
+        again = visitor.page(f"/submit/yaml?job={job}")
+        assert line in again.text and "sha256" not in again.text
+    finally:
+        console.client.batch("TerminateJob", jobId=job, reason="seen")

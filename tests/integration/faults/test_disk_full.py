@@ -151,3 +151,27 @@ def test_metrics_wait_for_room_and_none_is_lost(tmp_path: Path) -> None:
         writer.write({"iteration": 400})
         assert [each["iteration"] for each in read_metrics(run)] == list(range(1, 401))
         writer.close()
+
+
+def test_a_full_store_keeps_no_text_nor_a_part_of_it_and_takes_it_with_room(volume: Path, tmp_path: Path) -> None:
+    text = "half of it would fit\n" * 40_000
+    with Serving(tmp_path / "home", "--store", str(volume / "store")) as server:
+        filler = fill(volume)
+        with pytest.raises(
+            ApiError, match=r"the text is not kept$|the text can't be kept in .*No space left"
+        ) as refused:
+            server.client.keep_text(text)
+        assert refused.value.status == 503
+        assert [*volume.glob("store/texts/*/*")] == []
+        filler.unlink()
+
+        def keeps() -> bool:
+            try:
+                server.client.keep_text(text)
+            except ApiError:  # the next look at the volume is to come
+                return False
+            return True
+
+        wait_for(keeps, 30, "room for the text")
+        (kept,) = volume.glob("store/texts/*/*")
+        assert kept.read_text() == text

@@ -14,7 +14,7 @@ from orchestrator.client import Client
 from orchestrator.keys import KeyStore
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
-from shared_store import leagues, models
+from shared_store import leagues, models, texts
 from shared_store.bundles import seal
 from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Store
@@ -117,6 +117,14 @@ class World:
         path = path.format(reference=self.job, name=self.run, number=1)
         bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
         return self.http.request(method, self.url + path, json=body, headers=bearer)
+
+    def text_call(self, key: str, operation: Operation, text: str) -> httpx.Response:
+        """Upload a text, or read it as one of the run's."""
+        digest = texts.keep(self.server.home / "store" / "runs" / self.run / "texts", text.encode())
+        method, _, path = operation.partition(" ")
+        bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
+        path = path.format(name=self.run, sha256=digest)
+        return self.http.request(method, self.url + path, content=text.encode(), headers=bearer)
 
     def delete_key(self, key: str) -> httpx.Response:
         """Delete a key that was just made."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sqlite3
 from collections.abc import Sequence
 from functools import partial
@@ -129,6 +130,7 @@ class Simulation:
                 disk=SimulatedDisk(self),  # type: ignore[arg-type]
                 runs=runs,
             )
+            self._reconciler.texts._next_sweep = math.inf  # its store has no texts
         except (DatabaseError, Crash):
             self._reconciler = self._bus = None
             self.machine.after(2.0, self._start)

@@ -99,7 +99,7 @@ class SimulatedRunStore(RunStore):
 
         return self._call(f"read run {name}", body)
 
-    def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim) -> int:
+    def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim, texts: object = ()) -> int:
         def body() -> int:
             self._wait()
             run = self._world.volume.write(name)

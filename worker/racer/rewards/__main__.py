@@ -1,4 +1,7 @@
-"""``python -m worker.racer.rewards FILE`` says whether a reward function is valid, and whether it compiles."""
+"""``python -m worker.racer.rewards FILE`` says whether a reward function is valid, and whether it compiles.
+
+Standard error has the fault of a file that is not valid; of a valid one, a note where it was not run.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from shared_store.texts import IN_DEFINITION, size_in_definition
 from worker.racer.rewards.guard import check, read_file
 from worker.racer.rewards.translation import Outside, translate
 
@@ -20,17 +24,20 @@ def main() -> int:
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     failed = 0
     for path in parser.parse_args().files:
-        problem = check(path)
+        problem = check(path, note=lambda line: print(line, file=sys.stderr))
         if problem is not None:
             failed = 1
             print(problem, file=sys.stderr)
             continue
+        text = read_file(path)
         try:
-            notes = translate(read_file(path)).notes
+            notes = translate(text).notes
         except Outside as outside:
             print(f"{path}: valid; {outside}")
         else:
             print("\n".join([f"{path}: valid, compiled to the device", *(f"  {note}" for note in notes)]))
+        if size_in_definition({"file": str(path), "text": text}) > IN_DEFINITION:
+            print(f"  {len(text.encode()):,} bytes: a job keeps it in the store, not in its definition")
     return failed
 
 

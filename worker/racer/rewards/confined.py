@@ -8,40 +8,60 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import math
+import os
 import resource
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from importlib.machinery import PathFinder
 from typing import Any
 
+from worker.racer.rewards import sandbox
 from worker.racer.rewards.problems import one_line
 
 MEMORY = 2 << 30
 """Bytes of address space of a process that runs a reward function."""
 MOST_PRINTED = 64 << 10
 """Characters that one call may print; what it prints is dropped."""
-_NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 _PARENT_DEATH_SIGNAL = 1
 Reward = Callable[[dict[str, Any]], Any]
 
 
-def confine(memory: int = MEMORY, cpu: int | None = None) -> None:
-    """Limit this process: memory, CPU time, no file with content, no core dump, no further process, and no network where it can be had.
+def confine(memory: int = MEMORY, cpu: int | None = None, keep: Collection[int] = ()) -> str:
+    """Limit this process for good: memory, CPU time, descriptors, and what its system calls reach (:mod:`~worker.racer.rewards.sandbox`).
 
     Args:
         memory: Bytes of address space.
         cpu: Seconds of CPU time; None: no limit.
+        keep: Descriptors that stay open, beside the first three.
+
+    Returns:
+        Why the sandbox does not hold here, one line; empty where it does.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    libc.unshare(_NEW_USER | _NEW_NETWORK)  # refused in some containers; the rest holds there, too
-    limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0, resource.RLIMIT_NPROC: 0}
+    for name in os.listdir("/proc/self/fd"):
+        if (descriptor := int(name)) > 2 and descriptor not in keep:
+            with contextlib.suppress(OSError):  # that of the list itself
+                os.close(descriptor)
+    limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}
     if cpu is not None:
         limits[resource.RLIMIT_CPU] = cpu
     for kind, most in limits.items():
-        hard = resource.getrlimit(kind)[1]
-        least = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (least, least))
+        sandbox.limit(kind, most)
+    libc.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    sys.meta_path.insert(0, _Hidden())
+    return sandbox.enter(libc)
+
+
+class _Hidden:
+    """Packages that can't be read any more are not there: NumPy and SciPy use some of them where they find them."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> None:
+        """Raises ModuleNotFoundError for them."""
+        known = path is not None or name in sandbox.PACKAGES or name in sys.stdlib_module_names
+        if not known and PathFinder.find_spec(name, [os.path.dirname(os.__file__)]) is None:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
 class Flooded(BaseException):
@@ -125,7 +145,8 @@ def told_result(result: Any) -> str:
 def told_error(error: BaseException) -> str:
     """The message for an exception that a function raised."""
     if isinstance(error, ModuleNotFoundError):
-        return f"{error.name} is not installed here"
+        way = f": pip install {error.name} (the extra 'worker' has it)" if error.name in sandbox.PACKAGES else ""
+        return f"{error.name} is not installed here{way}"
     if isinstance(error, MemoryError):
         return f"it used more than {MEMORY >> 30} GiB of memory"
     if isinstance(error, RecursionError):

@@ -1,34 +1,45 @@
 """Checks a reward function before any job starts: its text, its imports and names, and what it does with sample inputs.
 
-It is a guard against mistakes and carelessness, not a sandbox: a determined attacker gets round it. What isolates jobs is in
-docs/security.md.
+The text's check is against mistakes and carelessness: a determined attacker gets round it. What holds such a one, while the samples
+are tried, is the process's sandbox (:mod:`~worker.racer.rewards.sandbox`).
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
+import functools
 import io
 import json
 import os
+import re
 import subprocess
 import sys
+import threading
 import tokenize
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from shared_store.wording import nearest
-from worker.racer.rewards.problems import Problem, RewardRefused
+from worker.racer.rewards.problems import KINDS, Problem, RewardRefused
 from worker.racer.rewards.samples import samples
 
 LARGEST = 140_000
 """Characters of a file."""
+MOST_TOKENS = 60_000
+"""Words, signs and lines of a file: what its parser takes time and memory for. The longest of 299 real files has 45,000."""
 MODULES = ("math", "random", "numpy", "scipy", "shapely")
 """Packages that may be imported."""
 SECONDS = 5.0
 """For a call on one sample, and for the file's own statements with their imports [s]."""
 _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
+_MOST_SAID = 64 << 10
+"""Bytes that the process may answer."""
+Note = Callable[[str], object]
+"""Is called with a line for the user."""
 NAMES = frozenset(
     (  # noqa: SIM905
         "open exec eval compile input breakpoint exit quit help globals locals vars dir getattr setattr delattr"
@@ -55,14 +66,15 @@ _SUBMODULES = {
 _OWN = {"self", "cls"}
 
 
-def check(path: Path) -> Problem | None:
+def check(path: Path, note: Note | None = None) -> Problem | None:
     """The first fault of a reward function in a file, or None.
 
     Args:
         path: The file.
+        note: As of :func:`check_source`.
     """
     try:
-        return check_source(read_file(path), str(path))
+        return check_source(read_file(path), str(path), note=note)
     except RewardRefused as refused:
         return refused.problem
 
@@ -87,20 +99,28 @@ def read_file(path: Path) -> str:
         raise RewardRefused(Problem("SYNTAX_ERROR", told, str(path))) from error
 
 
-def check_source(source: str, file: str = "reward_function.py") -> Problem | None:
+def check_source(
+    source: str, file: str = "reward_function.py", *, anyway: bool = False, note: Note | None = None
+) -> Problem | None:
     """:func:`check`, of a text.
 
     Args:
         source: The text.
         file: The name of its file, for messages.
+        anyway: Run it also where the sandbox does not hold: for a job's own node, which runs the function in any case.
+        note: Called with one line where the sandbox does not hold.
     """
-    return read(source, file) or try_out(source, file)
+    return read(source, file) or try_out(source, file, anyway=anyway, note=note)
 
 
+@functools.lru_cache(maxsize=16)
 def read(source: str, file: str) -> Problem | None:
     """Faults of the text itself, which is not run."""
     if len(source) > LARGEST:
         return Problem("SYNTAX_ERROR", f"{len(source):,} characters; a reward function has at most {LARGEST:,}", file)
+    if (tokens := len(re.findall(r"\w+|[^\w \t]", source))) > MOST_TOKENS:
+        told = f"{tokens:,} words, signs and lines; a reward function has at most {MOST_TOKENS:,}"
+        return Problem("SYNTAX_ERROR", told, file)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -197,33 +217,88 @@ def _function(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
         yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", found[0].lineno
 
 
-def try_out(source: str, file: str) -> Problem | None:
-    """Faults with sample inputs, found in a process of its own with limits."""
+def try_out(source: str, file: str, *, anyway: bool = False, note: Note | None = None) -> Problem | None:
+    """Faults with sample inputs, found in a process of its own with limits. Arguments as of :func:`check_source`.
+
+    The process may be in the hands of an attacker: its answer is bounded, and can say nothing but a fault of this function.
+    """
     root = str(Path(__file__).parents[3])
-    asked = {"source": source, "file": file, "samples": samples(), "seconds": SECONDS, "root": root}
-    command = [sys.executable, "-I", "-B", str(Path(__file__).with_name("trial.py"))]
-    try:
-        ended = subprocess.run(
-            command, input=json.dumps(asked), capture_output=True, text=True, timeout=_PATIENCE, env=environment()
+    asked = {
+        "source": source,
+        "file": file,
+        "samples": samples(),
+        "seconds": SECONDS,
+        "root": root,
+        "anyway": anyway,
+    }
+    answer, errors, code = _answer(json.dumps(asked).encode())
+    lines = [line for each in answer.decode(errors="replace").splitlines() if (line := _read_line(each))]
+    unconfined = next((str(line["unconfined"]) for line in lines[:1] if "unconfined" in line), "")
+    if unconfined and note is not None:
+        fate = (
+            "the function is not kept from this job's files" if anyway else "it was not run: the job's own nodes try it"
         )
-    except subprocess.TimeoutExpired as error:
-        said = error.stdout.decode() if isinstance(error.stdout, bytes) else error.stdout or ""
-        return Problem("TIMEOUT", f"{_last(said)} did not end within {_PATIENCE:g} s", file)
-    lines = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
-    if lines and "kind" in lines[-1]:
-        found = lines[-1]
-        return Problem(found["kind"], found["message"], file, found["line"]) if found["kind"] else None
+        note(f"{file}: no sandbox, since {unconfined}; {fate}")
+    if unconfined and not anyway:
+        return None
+    if code is None:
+        return Problem("TIMEOUT", f"{_last(lines)} did not end within {_PATIENCE:g} s", file)
     if not lines:
-        told = " ".join(ended.stderr.split())[-300:]
+        told = " ".join(errors.decode(errors="replace").split())[-300:]
         return Problem("TEST_FAILURE", f"the process that tries the function did not start: {told}", file)
-    cause = f"signal {-ended.returncode}" if ended.returncode < 0 else f"exit code {ended.returncode}"
-    return Problem("TEST_FAILURE", f"{_last(ended.stdout)} ended the process ({cause})", file)
+    found = lines[-1]
+    if found.get("kind") == "":
+        return None
+    if found.get("kind") in KINDS and isinstance(found.get("line"), int):
+        return Problem(found["kind"], " ".join(str(found.get("message")).split()), file, found["line"])
+    cause = f"signal {-code}" if code < 0 else f"exit code {code}"
+    return Problem("TEST_FAILURE", f"{_last(lines)} ended the process ({cause})", file)
 
 
-def _last(said: str) -> str:
+def _answer(asked: bytes) -> tuple[bytes, bytes, int | None]:
+    """What the process wrote, its errors, and its exit code; None: it did not end in time."""
+    late = threading.Event()
+
+    def expire() -> None:
+        late.set()
+        process.kill()
+
+    with subprocess.Popen(
+        [sys.executable, "-I", "-B", str(Path(__file__).with_name("trial.py"))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment(),
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+        timer = threading.Timer(_PATIENCE, expire)
+        timer.start()
+        try:
+            with contextlib.suppress(BrokenPipeError), process.stdin:
+                process.stdin.write(asked)
+            said = process.stdout.read(_MOST_SAID)
+            if len(said) == _MOST_SAID:
+                process.kill()
+            errors = process.stderr.read(_MOST_SAID)
+            code = process.wait()
+        finally:
+            timer.cancel()
+            process.kill()
+    return said, errors, None if late.is_set() else code
+
+
+def _read_line(line: str) -> dict[str, Any]:
+    """A line of the answer; nothing where it is none."""
+    try:
+        said = json.loads(line)
+    except (ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+def _last(lines: list[dict[str, Any]]) -> str:
     """The last step that the process reported."""
-    lines = [json.loads(line) for line in said.splitlines() if line.startswith('{"trying"') and line.endswith("}")]
-    return str(lines[-1]["trying"]) if lines else "the file"
+    return next((str(line["trying"]) for line in reversed(lines) if "trying" in line), "the file")
 
 
 def environment() -> dict[str, str]:

@@ -32,7 +32,7 @@ def main() -> None:
         os.dup2(nothing, descriptor)
     file, seconds, worlds = asked["file"], asked["seconds"], asked["worlds"]
     tracks = [[tuple(point) for point in track] for track in asked["tracks"]]
-    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")
+    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")  # its descriptor is closed, and its size sealed
     width, most, of_object = parameters.NUMBERS, parameters.MOST_OBJECTS, parameters.OBJECT_NUMBERS
     numbers, objects = shared[: worlds * width], shared[worlds * width : worlds * (width + most * of_object)]
     rewards = shared[worlds * (width + most * of_object) :]
@@ -54,7 +54,9 @@ def main() -> None:
         end(f"the function printed more than {confined.MOST_PRINTED >> 10} KiB of text in one call", line)
 
     alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
-    confined.confine(asked["memory"])
+    confined.confine(
+        asked["memory"], keep=(steps.fileno(), out.fileno())
+    )  # where it does not hold, the guard has told it
     with confined.printing(printed):
         try:
             alarm.set(60.0)  # imports, on a loaded machine

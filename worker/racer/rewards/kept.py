@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -13,22 +14,29 @@ from worker.racer.rewards.guard import LARGEST, read, read_file
 from worker.racer.rewards.problems import RewardRefused
 from worker.tasks.config import STRICT
 
+_read = lru_cache(maxsize=8)(read)
+"""A submission makes a configuration several times, and parsing the longest text takes a second."""
+
 
 @dataclass(frozen=True, config=STRICT)
 class RewardFile:
-    """A learner's reward function.
+    """A learner's reward function, with its text, or with the digest of a long text that is kept beside the job.
 
     Raises:
-        ValueError: The guard refuses the text; nothing of it is run.
+        ValueError: The guard refuses the text, of which nothing is run; or there are both a text and a digest.
     """
 
     file: Annotated[str, Field(min_length=1, max_length=1000)] = "reward_function.py"
     """Name of the file, in messages."""
     text: Annotated[str, Field(max_length=LARGEST)] = ""
     """Its content."""
+    sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")] = ""
+    """Of a text that is kept beside the job (:mod:`shared_store.texts`), which the ranks get as ``text``."""
 
     def __post_init__(self) -> None:
-        if problem := read(self.text, self.file):
+        if self.sha256 and self.text:
+            raise Refused((), "it has both a text and a sha256; leave one of them out")
+        if not self.sha256 and (problem := _read(self.text, self.file)):
             raise Refused((), str(problem))
 
 
@@ -36,9 +44,13 @@ def reward_file(value: RewardFile | str) -> RewardFile:
     """The reward function of a configuration, which may name its path, relative to the working directory.
 
     Raises:
-        Refused: The file can't be read, or the guard refuses its text.
+        Refused: The file can't be read, the guard refuses its text, or only its digest is here.
     """
     if isinstance(value, RewardFile):
+        if value.sha256:
+            raise Refused(
+                (), f"{value.file}: its text, with sha256 {value.sha256}, is kept beside a job; name the file itself"
+            )
         return value
     try:
         return RewardFile(value, read_file(Path(value)))

@@ -12,7 +12,7 @@ import warp as wp
 from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
-from worker.racer.rewards.problems import Failure, RewardRefused, one_line
+from worker.racer.rewards.problems import Failure, Problem, RewardRefused, one_line
 from worker.racer.rewards.translation import Outside, translate
 from worker.racer.rewards.workers import Workers
 
@@ -52,7 +52,7 @@ class RewardFunction:
         compiled: bool = True,
         processes: int | None = None,
     ) -> None:
-        if problem := checked(source, file):
+        if problem := checked(source, file)[0]:
             raise RewardRefused(problem)
         self.file = file
         self.function: Any = None
@@ -119,8 +119,11 @@ class RewardFunction:
             self._workers.close()
 
 
-checked = functools.lru_cache(maxsize=64)(check_source)
-"""The guard, asked once in a process for each function."""
+@functools.lru_cache(maxsize=64)
+def checked(source: str, file: str) -> tuple[Problem | None, tuple[str, ...]]:
+    """The guard's answer on a job's own node, asked once in a process for each function, with its warnings, a line each."""
+    notes: list[str] = []
+    return check_source(source, file, anyway=True, note=notes.append), tuple(notes)
 
 
 def compiled_function(source: str, file: str, device: str) -> tuple[Any, Any, str, tuple[str, ...]]:

@@ -1,6 +1,7 @@
 """The guard's process: tries a reward function on sample inputs, with limits, and says what happened in lines of JSON.
 
-Run by its path, in isolated mode. It reads one JSON object from standard input: ``source``, ``file``, ``samples``, ``seconds``, ``root``.
+Run by its path, in isolated mode. It reads one JSON object from standard input: ``source``, ``file``, ``samples``, ``seconds``, ``root``,
+``anyway``: try it also where the sandbox does not hold.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ def main() -> None:
         end("TEST_FAILURE", f"{now} printed more than {confined.MOST_PRINTED >> 10} KiB of text", line)
 
     alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
-    confined.confine(cpu=int(4 * asked["seconds"]) + 5)
+    if unconfined := confined.confine(cpu=int(4 * asked["seconds"]) + 5, keep=(out.fileno(),)):
+        tell(unconfined=unconfined)
+        if not asked["anyway"]:
+            os._exit(0)
     try:
         with confined.printing(printed):
             tell(trying=now)

@@ -6,6 +6,7 @@ The arrays are in shared memory; a step costs one message to each process and on
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import mmap
 import os
@@ -28,6 +29,8 @@ SECONDS = 2.0
 """For one call [s]."""
 _START = 120.0
 """For a process to start and import what the function imports [s]."""
+_MOST_SAID = 1 << 20
+"""Bytes of an answer."""
 
 
 class Workers:
@@ -66,8 +69,10 @@ class Workers:
         count = processes or min(len(os.sched_getaffinity(0)), -(-worlds // 16))
         self.file, self._seconds, self._share = file, seconds, -(-worlds // count)
         cells = worlds * (NUMBERS + MOST_OBJECTS * OBJECT_NUMBERS + 1)
-        self._descriptor = os.memfd_create("rewards")
+        self._descriptor = os.memfd_create("rewards", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(self._descriptor, 4 * cells)
+        # shorter, it would kill those that have it mapped
+        fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
         shared = np.frombuffer(mmap.mmap(self._descriptor, 0), dtype=np.float32)
         self.numbers, rest = np.split(shared, [worlds * NUMBERS])
         self.objects, self._rewards = np.split(rest, [worlds * MOST_OBJECTS * OBJECT_NUMBERS])
@@ -154,6 +159,8 @@ class Workers:
             if not poll.poll(max(0.0, 1000.0 * (until - time.monotonic()))):
                 raise RewardFailed(f"{self.file}: {cars}: the function did not return, and its process takes no signal")
             part = os.read(process.stdout.fileno(), 1 << 16)
+            if len(said) > _MOST_SAID:
+                raise RewardFailed(f"{self.file}: {cars}: the function's process answers without end")
             if not part:
                 code = process.wait()
                 cause = f"signal {-code}" if code < 0 else f"exit code {code}"

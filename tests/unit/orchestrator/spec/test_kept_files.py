@@ -10,9 +10,12 @@ import pytest
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec import file as specfile
-from orchestrator.spec import kept_files
+from orchestrator.spec import kept_files, strict_yaml
 from orchestrator.spec.changes import override
-from orchestrator.spec.kept_files import MOST, changes_with_files, with_files
+from orchestrator.spec.compile import compile_definition, long_texts
+from orchestrator.spec.kept_files import changes_with_files, with_files
+from orchestrator.spec.model import validate
+from shared_store.texts import IN_DEFINITION, LARGEST, digest_of
 from tests.support.refusals import refusal
 
 GOOD = "# ½ 😀 \"quoted\" \\ and\ttabs\ndef reward_function(params):\n    return params['speed']\n"
@@ -39,7 +42,7 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are read, and not tried: that takes a process each."""
-    monkeypatch.setattr(kept_files, "_check", lambda path, how: None)
+    monkeypatch.setattr(kept_files, "_check", lambda *_: None)
 
 
 def config(changes: list[str] | None = None) -> dict[str, Any]:
@@ -58,6 +61,10 @@ def test_a_job_has_the_text_of_the_files_that_it_names(directory: Path) -> None:
     assert again is not None and again.config == found
 
 
+def no_text(text: str) -> None:
+    raise AssertionError(f"{text[:20]} is short, and belongs into the assignment")
+
+
 def _train() -> dict[str, Any]:
     return {"task": "Racer", "worlds": 8, "iterations": 2}
 
@@ -68,13 +75,13 @@ def test_a_change_of_a_run_has_the_text_of_the_file_whatever_is_in_it() -> None:
         return {"train": {"task": "Racer"}}
 
     given = ["train.iterations=9", "train.config.reward_function=mine.py", "train.config.track=chicane"]
-    first, second, third = changes_with_files(racer, given)
+    first, second, third = changes_with_files(racer, given, no_text)
     assert (first, third) == (given[0], given[2]) and second.isascii()
     kept = {"file": "mine.py", "text": GOOD}
     assert override({}, [second]) == {"train": {"config": {"reward_function": kept}}}
-    (whole,) = changes_with_files(racer, ["train.config={reward_function: mine.py, track: oval}"])
+    (whole,) = changes_with_files(racer, ["train.config={reward_function: mine.py, track: oval}"], no_text)
     assert override({}, [whole])["train"]["config"] == {"reward_function": kept, "track": "oval"}
-    assert changes_with_files(lambda: {"train": {"task": "Ant"}}, given) == given
+    assert changes_with_files(lambda: {"train": {"task": "Ant"}}, given, no_text) == given
 
 
 @pytest.mark.parametrize("train", [_train() | {"task": "elsewhere.mine:Task"}, {"config": 3}, None])
@@ -96,14 +103,53 @@ def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Pat
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_a_file_that_does_not_fit_into_a_job_is_refused_with_the_limit(directory: Path) -> None:
-    (directory / "mine.py").write_text(GOOD + "#" * (MOST - 400))
-    assert len(config()["reward_function"]["text"]) > MOST - 400
-    (directory / "mine.py").write_text(GOOD + "#" * MOST)
-    with pytest.raises(
-        SpecError, match=r"mine\.py: it takes 20,\d{3} bytes of the job's definition, and may take 20,480"
-    ):
+def test_a_text_that_does_not_fit_into_a_definition_is_kept_beside_the_job_and_the_submitter_is_told(
+    directory: Path,
+) -> None:
+    (directory / "mine.py").write_text(GOOD + "#" * (IN_DEFINITION - 400))
+    short = specfile.load("job.yaml")
+    assert (long_texts(short), short.notes) == ([], ())
+    text = GOOD + "#" * IN_DEFINITION
+    (directory / "mine.py").write_text(text)
+    long = specfile.load("job.yaml")
+    assert long_texts(long) == [text]
+    told = f"train.config.reward_function: mine.py: {len(text.encode()):,} bytes: kept beside the job"
+    assert long.notes == (told,)
+    definition = json.dumps(compile_definition(long, ""))
+    assert digest_of(text) in definition and len(definition) < 4096
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_change_of_a_run_has_the_digest_of_a_long_text_which_is_kept_first(directory: Path) -> None:
+    text, kept = GOOD + "#" * IN_DEFINITION, list[str]()
+    (directory / "mine.py").write_text(text)
+    racer = {"train": {"task": "Racer"}}
+    (change,) = changes_with_files(lambda: racer, ["train.config.reward_function=mine.py"], kept.append)
+    assert kept == [text]
+    reference = {"file": "mine.py", "sha256": digest_of(text)}
+    assert override({}, [change]) == {"train": {"config": {"reward_function": reference}}}
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_file_beyond_the_limit_is_refused_with_that(directory: Path) -> None:
+    (directory / "mine.py").write_text("#" * (LARGEST + 1))
+    with pytest.raises(SpecError, match=r"job\.yaml:7: .*mine\.py: it has more than 1,048,576 bytes; shorten it"):
         specfile.load("job.yaml")
+    (directory / "mine.py").write_text(GOOD)
+    (directory / "space.json").write_text(json.dumps({"sensor": ["x" * IN_DEFINITION]}))
+    words = r"space\.json: it takes 20,\d{3} bytes of the job's definition, and may take 20,480; shorten it"
+    with pytest.raises(SpecError, match=words):
+        config(["train.config.action_space=space.json"])
+
+
+def test_a_digest_stands_for_a_text_and_never_beside_one() -> None:
+    kept = {"file": "mine.py", "sha256": "0" * 64}
+    changed = override(strict_yaml.load(JOB)[0], [f"train.config.reward_function={json.dumps(kept)}"])
+    found = validate(changed, "job").train
+    assert found is not None and found.config["reward_function"] == kept
+    both = override(changed, [f"train.config.reward_function={json.dumps({**kept, 'text': 'x = 1'})}"])
+    with pytest.raises(SpecError, match="it has both a text and a sha256; leave one of them out"):
+        validate(both, "job")
 
 
 @pytest.mark.usefixtures("unchecked")

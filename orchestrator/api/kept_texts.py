@@ -1,0 +1,65 @@
+"""The long texts that a job names by their digests: kept before the job is, and again where the run that it continues has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from orchestrator.api import permissions
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.control.kept_texts import references_of
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.gang import GangSpec
+from orchestrator.persistence.models import KeptText, now
+from shared_store.layout import Run
+from shared_store.texts import Reference, TextError, read, references, resolved_spec
+
+
+def check_texts(context: Context, gang: GangSpec) -> None:
+    """Check that the store keeps the texts that a definition or a job names, and keep them longer. Raises ClientError, StoreNeeded."""
+    rows = [_kept(context, reference) for reference in references_of(gang)]
+    for row in rows:
+        row.used_at = now()
+
+
+def keep_again(reconciler: Reconciler, run: Run, spec: Mapping[str, Any] | None) -> None:
+    """Keep the texts of a run for a job that continues or clones it, where the store has them no more. On a thread of the store.
+
+    Raises TextRefused, Unavailable. What the run lacks, too, is refused when the job is submitted.
+    """
+    for reference in references(spec):
+        with reconciler.database.session() as session:
+            source = reconciler.texts.source(session, reference)
+            is_known = session.get(KeptText, reference.sha256) is not None
+        if is_known and _is_there(source, reference):
+            continue
+        try:
+            text = read(run.texts, reference)
+        except (TextError, OSError):
+            continue
+        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
+
+
+def with_texts(reconciler: Reconciler, run: str, spec: Mapping[str, Any]) -> dict[str, Any]:
+    """The spec of a job of that run with its long texts, to be shown. On a thread of the store."""
+    with reconciler.database.session() as session:
+        folders = [reconciler.texts.source(session, reference) for reference in references(spec)]
+    return resolved_spec(spec, reconciler.store.run(run).texts, *folders)
+
+
+def _kept(context: Context, reference: Reference) -> KeptText:
+    row = context.session.get(KeptText, reference.sha256)
+    source = context.reconciler.texts.source(context.session, reference)
+    if row is None or not context.read(("text", reference.sha256), partial(_is_there, source, reference)):
+        raise ClientError(
+            f"{reference}: the store keeps no such text; submit the job with the file itself, or upload it first: "
+            f"PUT /api/texts/{reference.sha256}"
+        )
+    return row
+
+
+def _is_there(folder: Path, reference: Reference) -> bool:
+    return (folder / reference.sha256).is_file()

@@ -1,0 +1,53 @@
+"""A rank's job with a long text: read from its run, its digest checked, or refused in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store import texts
+from shared_store.layout import Store
+from shared_store.texts import digest_of
+from tests.support.refusals import refusal
+from worker.errors import UserError
+from worker.learning.job import Job
+from worker.racer.rewards.kept import RewardFile, reward_file
+from worker.tasks.overrides import Refused
+
+TEXT = "def reward_function(params):\n    return 1.0\n"
+REFERENCE = {"file": "mine.py", "sha256": digest_of(TEXT)}
+
+
+def environment(store: Path, kind: str) -> dict[str, str]:
+    section: dict[str, Any] = {"task": "Racer", "config": {"track": "oval", "reward_function": REFERENCE}}
+    spec = {"name": "line", kind: section}
+    return {"MUSTER_STORE": str(store), "MUSTER_RUN": "line", "MUSTER_EPOCH": "1", "MUSTER_SPEC": json.dumps(spec)}
+
+
+@pytest.mark.parametrize("kind", ["train", "evaluate", "race"])
+def test_a_rank_has_the_text_and_its_spec_the_digest(tmp_path: Path, kind: str) -> None:
+    texts.keep(Store(tmp_path).run("line").texts, TEXT.encode())
+    job = Job.from_env(environment(tmp_path, kind), kind)
+    assert job.section["config"] == {"track": "oval", "reward_function": {"file": "mine.py", "text": TEXT}}
+    assert job.spec[kind]["config"]["reward_function"] == REFERENCE
+
+
+def test_a_rank_refuses_a_text_that_is_missing_or_altered(tmp_path: Path) -> None:
+    path = Store(tmp_path).run("line").texts / REFERENCE["sha256"]
+    begins = f"train.config.reward_function: mine.py (sha256 {REFERENCE['sha256']}): the text kept at {path} is "
+    found = refusal(Job.from_env, environment(tmp_path, "train"), "train", error=UserError)
+    assert found == f"{begins}missing; submit the job again with the file"
+    path.parent.mkdir(parents=True)
+    path.write_text(TEXT + "#")
+    found = refusal(Job.from_env, environment(tmp_path, "train"), "train", error=UserError)
+    assert found == f"{begins}altered: its content has another digest; submit the job again with the file"
+
+
+def test_a_digest_alone_is_no_reward_function_that_could_be_run() -> None:
+    with pytest.raises(
+        Refused, match=r"mine\.py: its text, with sha256 .*, is kept beside a job; name the file itself"
+    ):
+        reward_file(RewardFile(**REFERENCE))
