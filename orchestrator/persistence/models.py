@@ -14,7 +14,8 @@ from orchestrator import machine
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
-from orchestrator.domain.job import Status, check_transition
+from orchestrator.domain.job import AWS_ENDINGS, RunTime, Status, check_transition
+from orchestrator.domain.reasons import Reason
 from orchestrator.persistence.columns import Names, storable
 from orchestrator.persistence.gangs import gangs
 
@@ -207,6 +208,20 @@ class Job(Base):
         return next((attempt for attempt in self.attempts if attempt.stopped_at is None), None)
 
     @property
+    def run_time(self) -> RunTime | None:
+        """How long it has run; of an array, from the start of its first child to its end. None before it starts."""
+        spans = [(each.started_at, each.stopped_at) for each in self.attempts]
+        return RunTime.of([(self.started_at, self.stopped_at)] if self.kind == "array" else spans, now())
+
+    @property
+    def reason(self) -> Reason:
+        """Why it is in its state, except for what the scheduler states about a job that waits."""
+        text = self.status_reason or ""
+        if AWS_ENDINGS.search(text) and self.attempts:
+            return Reason(self.attempts[-1].in_own_words(text), text)
+        return Reason.plain(text)
+
+    @property
     def is_terminal(self) -> bool:
         return Status(self.status).is_terminal
 
@@ -338,6 +353,22 @@ class Attempt(Base):
     def environment(self) -> str:
         """The name of its compute environment. Attempts of Muster 0.1 have none: they ran on this machine."""
         return self.compute_environment or "local"
+
+    @property
+    def run_time(self) -> RunTime | None:
+        """How long it has run; None before it starts."""
+        return RunTime.of([(self.started_at, self.stopped_at)], now())
+
+    def in_own_words(self, reason: str) -> str:
+        """The reason with the main node's own in place of AWS's general words, such as ``Essential container in task exited``."""
+        try:
+            main = self.node(self.job.gang.main)
+        except ValueError:  # the job's row is damaged
+            return reason
+        if main is None or not main.reason:
+            return reason
+        own = main.reason if main.exit_code == 0 else f"main node: {main.reason}"
+        return AWS_ENDINGS.sub(lambda _: own, reason)
 
     def node(self, index: int) -> Node | None:
         """Its node of this index; None if it has none, because it was started with fewer nodes."""

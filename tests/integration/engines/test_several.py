@@ -270,7 +270,7 @@ def test_two_engines_on_one_machine_share_its_cores(tmp_path: Path) -> None:
         served.wait(first, "RUNNING")
         second = plain(served, PLAIN, SCRIPT, "docker", **host_files())  # wants a tenth of a core
         reason = wait_for(lambda: "needs" in (r := served.detail(second)["statusReason"]) and r, 20, "a reason")
-        assert "; 0.05 CPUs, 0 GPUs, " in reason and reason.endswith(f" free until job test ({first[:8]}) ends"), reason
+        assert "; 0.05 CPUs, 0 GPUs, " in reason and f"waits for job test ({first[:8]}) to end: " in reason, reason
         served.client.batch("TerminateJob", jobId=first, reason="enough")
         assert served.wait(second)["status"] == "SUCCEEDED", served.detail(second)
         assert served.detail(second)["attempts"][0]["startedAt"] >= served.detail(first)["stoppedAt"]
