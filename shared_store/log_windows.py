@@ -32,8 +32,19 @@ _SEARCHED = 32 << 20
 
 _ERROR = re.compile(
     r"Traceback \(most recent call last\)|\b[A-Za-z]*(?:Error|Exception): |\b(?:ERROR|FATAL|CRITICAL)\b|\b[Ee]rror: |[Oo]ut of memory"
+    r"|can't start '|[Cc]ommand not found|: not found$|No such file or directory|Permission denied"
 )
-_OF_ERRORS = (b"traceback (", b"error", b"exception: ", b"fatal", b"critical", b"out of memory")
+_OF_SHELLS = (b"not found", b"no such file or directory", b"permission denied")
+_OF_ERRORS = (
+    b"traceback (",
+    b"error",
+    b"exception: ",
+    b"fatal",
+    b"critical",
+    b"out of memory",
+    b"can't start '",
+    *_OF_SHELLS,
+)
 
 
 @dataclass(frozen=True)

@@ -147,8 +147,8 @@ class Context:
             raise ClientError(str(error)) from None
 
     def reason(self, job: Job) -> str | None:
-        """Why a job waits now, or a note for its user while it runs; None if its stored reason suffices."""
-        return self.reconciler.admission.reason(job)
+        """The job's ``statusReason`` in the AWS Batch API; None before it has one."""
+        return self.reconciler.admission.reason(job).aws or None
 
 
 def reconciler_of(request: Request) -> Reconciler:

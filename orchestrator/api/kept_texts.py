@@ -13,7 +13,8 @@ from orchestrator.api.errors import ClientError
 from orchestrator.control.kept_texts import references_of
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec
-from orchestrator.persistence.models import KeptText, now
+from orchestrator.persistence.models import now
+from orchestrator.persistence.own_models import KeptText
 from shared_store.layout import Run
 from shared_store.texts import Reference, TextError, read, references, resolved_spec
 

@@ -36,10 +36,10 @@ from orchestrator.persistence.models import (
     Job,
     JobDefinition,
     JobQueue,
-    LogGroup,
     RunRecord,
     SchedulingPolicy,
 )
+from orchestrator.persistence.own_models import LogGroup
 
 HIDDEN = "(hidden)"
 """Stands for the value of an environment variable that the caller may not read."""

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.terminal import Console, echo, echo_json
+from orchestrator.cli.terminal import echo, echo_json, print_rows
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import config_path
 from orchestrator.home import muster_home
@@ -149,7 +149,7 @@ def status(
     )
     for name, value in told["outputs"].items():
         table.add_row(name, escape(str(value)))
-    Console(soft_wrap=True).print(table)
+    print_rows(table)
 
 
 def _follow(stack: Stack, made: str, began: float) -> list[Event]:

@@ -195,7 +195,7 @@ def stop(
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         if detail["status"] in TERMINAL:
-            echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
+            echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already{next_step(detail)}")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
@@ -215,8 +215,26 @@ def stop(
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
     if lost := lost_iterations(detail):
         echo(lost)
-    if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
+    if _can_go_on(detail):
         echo(f"continue with: muster resume {detail['run']}")
+
+
+def _can_go_on(detail: Mapping[str, Any]) -> bool:
+    """Whether a job's run can be resumed: it has a checkpoint, or runs a command from YAML."""
+    return bool((detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]))
+
+
+def next_step(detail: Mapping[str, Any]) -> str:
+    """What a person can do next with a job that is over, as the end of a sentence; empty where nothing comes to mind."""
+    if not _can_go_on(detail):
+        return ""
+    run = detail["run"]
+    if detail["status"] != "SUCCEEDED":
+        return f"; continue with: muster resume {run}"
+    if detail["kind"] != "train":
+        return ""
+    more = 2 * int(detail["spec"]["train"]["iterations"])
+    return f"; to train it further: muster resume {run} --set train.iterations={more} -f"
 
 
 def slow_iteration(detail: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.terminal import Console, echo, echo_json
+from orchestrator.cli.terminal import echo, echo_json, print_rows
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.home import local_region, local_url, muster_home
 from orchestrator.keys import KeyStore
@@ -74,7 +74,7 @@ def list_keys(as_json: JsonOption = False) -> None:
     for key in keys:
         created = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(key.created_at / 1000))
         table.add_row(key.name, key.access_key_id, key.rights, created)
-    Console(soft_wrap=True).print(table)
+    print_rows(table)
 
 
 def delete(name: NameArgument) -> None:

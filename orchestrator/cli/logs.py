@@ -51,6 +51,7 @@ def logs(
     with Client.connect() as client:
         client.notify = lambda line: echo(line, err=True)
         waits = Waits(client, job)
+        waits.tell()
         for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
             if not lines:
                 waits.tell()

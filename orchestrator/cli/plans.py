@@ -8,7 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json
+from orchestrator.cli.terminal import echo, echo_json, print_rows
 from orchestrator.client import Client
 
 
@@ -29,9 +29,6 @@ def show_plan(client: Client, definition: dict[str, Any], queue: str, as_json: b
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
         )
     echo(f"{definition['jobDefinitionName']} on the {plan['engine']} engine, queue {queue}; nothing was started")
-    whole = Console(width=WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
-    with whole.capture() as printed:
-        whole.print(table)
-    echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
+    print_rows(table)  # to be read once, and in full: a narrow terminal breaks the lines
     if plan["document"]:
         echo(f"\n{plan['document']}")

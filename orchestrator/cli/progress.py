@@ -13,9 +13,10 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, Unreachable
-from orchestrator.domain.job import TERMINAL
+from orchestrator.domain.job import TERMINAL, WAITING
 from shared_store.evaluations import in_one_line
 from shared_store.metrics import warnings_of
+from shared_store.phases import Phase, phase_in
 from shared_store.wording import counted
 
 _POLL = 0.3
@@ -33,18 +34,13 @@ def follow(client: Client, job_id: str) -> int:
         return _follow_logs(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
     client.notify = display.tell
-    seen, reason, has_run = 0, None, False
+    seen = 0
     with display:
         while True:
             try:
-                job = client.batch("DescribeJobs", jobs=[job_id])["jobs"][0]
-                over = job["status"] in TERMINAL
-                if job.get("statusReason") != reason:  # another attempt may have another number of nodes
-                    reason = job.get("statusReason")
-                    attempts = client.get(f"/api/jobs/{job_id}")["attempts"]
-                    display.nodes = len(attempts[-1]["nodes"]) if attempts else display.nodes
-                    has_run = any(attempt["epoch"] for attempt in attempts)
-                records = []
+                job = client.get(f"/api/jobs/{job_id}", store=False)
+                over, records = job["status"] in TERMINAL, []
+                has_run = any(attempt["epoch"] for attempt in job["attempts"])
                 # the run is there once an attempt has taken it: not yet at the beginning, and never where no attempt started
                 while has_run and (page := client.get(f"/api/runs/{detail['run']}/metrics", after=seen)):
                     records, seen = page, page[-1]["iteration"]
@@ -110,6 +106,7 @@ def best_told(run: str, best: Mapping[str, Any] | None) -> str:
 def _follow_logs(client: Client, job_id: str) -> int:
     client.notify = lambda line: echo(line, err=True)
     waits = Waits(client, job_id)
+    waits.tell()
     for lines in client.log_batches(job_id, follow=True):
         if lines:
             echo_raw("\n".join(map(_format, lines)))
@@ -136,9 +133,9 @@ class Waits:
 
 
 def _why_waiting(client: Client, job: str) -> str:
-    """A job's state and why it waits; empty once it runs or is over. Raises ApiError, Unreachable."""
-    found = client.get(f"/api/jobs/{named(job)}")
-    if found["status"] in ("RUNNING", *TERMINAL):
+    """A job's state and why it waits; empty before a scheduling pass has seen it, once it runs, or is over. Raises ApiError, Unreachable."""
+    found = client.get(f"/api/jobs/{named(job)}", store=False)
+    if found["status"] in ("SUBMITTED", "RUNNING", *TERMINAL) or found["statusReason"] == WAITING:
         return ""
     return f"{found['name']} ({found['id'][:8]}) {found['status']}: {one_line(found['statusReason'] or '')}"
 
@@ -214,18 +211,41 @@ class Activity:
 
 
 class _Display:
-    """Common state of both displays: progress and remaining time."""
+    """Common state of both displays: progress, phase and remaining time."""
 
     def __init__(self, detail: dict[str, Any]) -> None:
         self.total = int(detail["spec"]["train"]["iterations"])
         self.nodes, self.run = int(detail["nodes"]), str(detail["run"])
         self.name = f"{detail['name']} ({detail['id'][:8]})"
+        self.iteration = 0
+        """The last one that the present attempt has done."""
         self._first: tuple[float, int] | None = None
-        self.started = time.monotonic()
+        self._attempt, self._phase, self._since = 0, "", time.monotonic()
 
     def tell(self, text: str) -> None:
         """Show why nothing happens."""
         echo(text, err=True)
+
+    def enter(self, job: dict[str, Any]) -> bool:
+        """Note what the job does at present; returns whether that is something else than before."""
+        if attempts := job["attempts"]:  # another one may have another number of nodes
+            self.nodes = len(attempts[-1]["nodes"])
+            self.iteration = self.iteration if len(attempts) == self._attempt else 0
+            self._attempt = len(attempts)
+        phase = phase_in(job)
+        text = phase.words if phase else "" if self.iteration else "loading libraries"
+        text = text if job["status"] == "RUNNING" else ""
+        if text == self._phase:
+            return False
+        self._phase, self._since = text, time.monotonic()
+        return True
+
+    @property
+    def doing(self) -> str:
+        """What the job does at present, and since when; empty while iterations show it."""
+        if not self._phase or (self.iteration and self._phase == Phase.TRAINING):
+            return ""
+        return f"{self._phase} ({time.monotonic() - self._since:.0f} s)"
 
     def eta(self, record: dict[str, Any]) -> str:
         """Remaining time at the pace since the first displayed iteration (at first: of that iteration), as h:mm:ss."""
@@ -236,12 +256,6 @@ class _Display:
         pace = (now - self._first[0]) / done if done else record.get("iteration_seconds", 0.0)
         left = int((self.total - iteration) * pace)
         return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
-
-    def state(self, job: dict[str, Any]) -> str:
-        """State and reason, with the activity of a first start."""
-        if job["status"] == "RUNNING":
-            return f"starting {counted(self.nodes, 'node')}: loading libraries, compiling kernels the first time ({time.monotonic() - self.started:.0f} s)"
-        return f"{job['status']}: {one_line(job.get('statusReason', ''))}"
 
 
 class _Bar(_Display):
@@ -268,17 +282,21 @@ class _Bar(_Display):
         self._progress.update(self._task, text=one_line(text))
 
     def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
-        task = self._progress.tasks[0]
+        self.enter(job)
         if record:
             values = _describe(record)
-            iteration = record["iteration"]
-            text = (
-                f"{iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-                f"{values['rate']} steps/s  ETA {self.eta(record)}  {counted(self.nodes, 'node')}"
-            ) + "".join(f"  warning: {one_line(each)}" for each in warnings_of(record, self.run))
-            self._progress.update(self._task, completed=iteration, text=text)
-        elif task.completed == 0 or job["status"] not in ("RUNNING", *TERMINAL):
-            self._progress.update(self._task, text=self.state(job))
+            iteration = self.iteration = record["iteration"]
+            left = f"ETA {self.eta(record)}" if iteration < self.total else ""
+            parts = [
+                *(f"{iteration}/{self.total}", f"reward {values['reward']}", f"length {values['length']}"),
+                *(f"{values['rate']} steps/s", left, counted(self.nodes, "node")),
+                *(f"warning: {one_line(each)}" for each in warnings_of(record, self.run)),
+            ]
+            self._progress.update(self._task, completed=iteration, text="  ".join(filter(None, parts)))
+        elif job["status"] not in ("RUNNING", *TERMINAL):
+            self._progress.update(self._task, text=f"{job['status']}: {one_line(job['statusReason'] or '')}")
+        elif self.doing:
+            self._progress.update(self._task, text=self.doing)
 
 
 class _Lines(_Display):
@@ -298,14 +316,17 @@ class _Lines(_Display):
         self._flush()
 
     def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
-        state = f"{job['status']} {job.get('statusReason', '')}"
+        state = f"{job['status']}: {one_line(job['statusReason'] or '')}"
         if state != self._state and job["status"] not in TERMINAL:
             self._flush()
-            echo(f"{job['status']}: {one_line(job.get('statusReason', ''))}")
+            echo(state)
             self._state = state
         if record:
             self.eta(record)
-            self._latest = record
+            self._latest, self.iteration = record, record["iteration"]
+        if self.enter(job) and self.doing:
+            self._flush()
+            echo(self._phase)
         if time.monotonic() - self._printed >= _PLAIN_INTERVAL:
             self._flush()
 
@@ -313,9 +334,10 @@ class _Lines(_Display):
         if self._latest is None:
             return
         values, iteration = _describe(self._latest), self._latest["iteration"]
+        left = f"ETA {self.eta(self._latest)}  " if iteration < self.total else ""
         echo(
             f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-            f"steps/s {values['rate']}  ETA {self.eta(self._latest)}  nodes {self.nodes}"
+            f"steps/s {values['rate']}  {left}nodes {self.nodes}"
         )
         for each in warnings_of(self._latest, self.run):
             echo(f"warning: {one_line(each)}")

@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.terminal import Console, echo_json, one_line
+from orchestrator.cli.terminal import echo, echo_json, one_line, print_wrapped
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 
@@ -33,14 +33,15 @@ def queues(
         if name and not found:
             client.batch("GetJobQueueSnapshot", jobQueue=name)  # refuse an unknown name with the existing ones
         found = [queue for queue in found if _take_snapshot(client, queue, is_named=name is not None)]
-        front = _front(client, found[0]) if name else []
+        front = client.get("/api/queues", queue=name)["queues"][0]["front"] if name else []
     if as_json:
         echo_json(found, indent=1)
         return
-    console = Console()
-    console.print(_table(found))
-    if name:
-        console.print(_waiting(front) if front else "no job waits")
+    print_wrapped(_table(found))
+    if front:
+        print_wrapped(_waiting(front))
+    elif name:
+        echo("no job waits")
 
 
 def _take_snapshot(client: Client, queue: dict[str, Any], is_named: bool) -> bool:
@@ -51,12 +52,6 @@ def _take_snapshot(client: Client, queue: dict[str, Any], is_named: bool) -> boo
         if error.status != 403 or is_named:
             raise
     return "snapshot" in queue
-
-
-def _front(client: Client, queue: dict[str, Any]) -> list[dict[str, Any]]:
-    ids = [job["jobArn"].rpartition("/")[2] for job in queue["snapshot"]["frontOfQueue"]["jobs"]]
-    jobs = {job["jobId"]: job for job in client.batch("DescribeJobs", jobs=ids)["jobs"]} if ids else {}
-    return [jobs[job_id] for job_id in ids if job_id in jobs]
 
 
 def _table(queues: list[dict[str, Any]]) -> Table:
@@ -84,5 +79,5 @@ def _waiting(jobs: list[dict[str, Any]]) -> Table:
         table.add_column(column, no_wrap=True)
     table.add_column("WHY IT WAITS", overflow="fold")
     for number, job in enumerate(jobs, 1):
-        table.add_row(str(number), job["jobId"][:8], job["jobName"], escape(one_line(job.get("statusReason", ""))))
+        table.add_row(str(number), job["id"][:8], job["name"], escape(one_line(job["reason"] or "")))
     return table

@@ -14,7 +14,7 @@ from rich.text import Text
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.recordings import check_output
 from orchestrator.cli.tasks import ask_worker
-from orchestrator.cli.terminal import Console, echo, echo_json, print_cut
+from orchestrator.cli.terminal import echo, echo_json, print_cut, print_wrapped
 from orchestrator.domain.errors import SpecError
 from shared_store.wording import counted
 
@@ -195,6 +195,6 @@ def _table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]]
         table.add_row(*row)
     echo(f"\n{title}")
     if fold:
-        Console(highlight=False).print(table)
+        print_wrapped(table)
     else:
         print_cut(table)

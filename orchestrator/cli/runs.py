@@ -11,6 +11,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, store_here, tell_note
 from orchestrator.cli.progress import follow
+from orchestrator.cli.serving import CpusOption, StoreOption, found_or_own, see_through
 from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
@@ -33,11 +34,17 @@ def resume(
     set_: SetOption = None,
     accept_changed_robot: AcceptOption = False,
     engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
+    store: StoreOption = None,
+    cpus: CpusOption = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Resume a run from its newest checkpoint, at the next iteration."""
-    with Client.connect() as client:
+    """Resume a run from its newest checkpoint, at the next iteration.
+
+    Where no controller is running, this command is one until the job ends, as `muster run` is: it shows the progress, and Ctrl-C stops the
+    job after a checkpoint. --store and --cpus are for this case.
+    """
+    with found_or_own(store, cpus, [engine] if engine else ()) as (client, is_own):
         elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
         accepted = ["train.accept_changed_robot=true"] if accept_changed_robot else []
         body = {
@@ -58,10 +65,16 @@ def resume(
         else:
             at = f" from iteration {resumed['iteration']}" if resumed["kind"] == "train" else ""
             echo(f"resumed {resumed['run']}{at} as job {resumed['jobId']}")
-            if not follow_:
+            if not follow_ and not is_own:
                 echo(f"follow it with: muster logs {resumed['jobId'][:8]} -f")
-        if follow_:
-            raise typer.Exit(follow(client, resumed["jobId"]))
+        code = None
+        if is_own:
+            echo("no other controller is running: this command is the controller until the job ends", err=True)
+            code = see_through(client, resumed["jobId"])
+        elif follow_:
+            code = follow(client, resumed["jobId"])
+    if code is not None:
+        raise typer.Exit(code)
 
 
 def checkpoints(

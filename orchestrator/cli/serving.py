@@ -241,6 +241,19 @@ def controller(store: str | None, cpus: float | None, engines: Sequence[str] = (
 
 
 @contextlib.contextmanager
+def found_or_own(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[tuple[Client, bool]]:
+    """A client of this home directory's controller, and whether this command started that, since none was running.
+
+    One is started only where there may be runs: with a given store, or in a home directory that a controller had. Raises Unreachable.
+    """
+    is_own = not os.environ.get("MUSTER_URL") and local_url() is None
+    if is_own and store is None and not (muster_home() / "muster.db").is_file():
+        Client.connect()  # raises Unreachable, with what to do
+    with controller(store, cpus, engines) as connect:
+        yield connect(), is_own
+
+
+@contextlib.contextmanager
 def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -> Iterator[Client]:
     """A client of the controller that serves this home directory, or of a new one in this process."""
     url = os.environ.get("MUSTER_URL") or local_url()

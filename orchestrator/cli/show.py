@@ -17,6 +17,7 @@ from orchestrator.engines.installed import traits_of
 from shared_store.evaluations import in_one_line
 from shared_store.learning import in_words
 from shared_store.metrics import warnings_of
+from shared_store.phases import phase_in
 from shared_store.wording import counted
 
 _OF_RUN = {
@@ -27,6 +28,8 @@ _OF_RUN = {
     "render": "renders",
 }
 """Verb for what a job of each kind does with another run."""
+_CHILDREN = 20
+"""Greatest number of an array's children that are printed."""
 COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 
 
@@ -71,8 +74,10 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     console.print(f"[bold]{detail['name']}[/]  {detail['id']}  [{colour}]{detail['status']}[/]")
     facts = {
         "why": "" if detail["status"] == "SUCCEEDED" else one_line(detail["statusReason"] or ""),
+        "in AWS's API": "" if detail["status"] == "SUCCEEDED" else one_line(detail["awsCode"] or ""),
+        "phase": phase.words if (phase := phase_in(detail)) else "",
         "created": when(detail["createdAt"]),
-        "took": took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
+        "took": took(detail["ranSeconds"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
         "run": detail["run"] + (" (gone; another run has its name now)" if detail["runIsReplaced"] else ""),
         "store": one_line(detail.get("storeProblem") or ""),
@@ -104,6 +109,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     for name, value in facts.items():
         if value:
             console.print(f"  {name + ':':13} {value}", markup=False)
+    _show_children(console, detail)
     spent = 0
     for attempt in detail["attempts"]:
         started = attempt["startedAt"] is not None
@@ -114,7 +120,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         if spent < attempt["number"]:  # attempts that exited on request don't count against the allowed number
             number = f"{attempt['number']} ({spent} of {detail['attemptsAllowed']} spent)"
         reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] and ended != "succeeded" else ""
-        lasted = took(attempt["startedAt"], attempt["stoppedAt"])
+        lasted = took(attempt["ranSeconds"])
         console.print(
             f"  attempt {number} (epoch {attempt['epoch']}, {lasted}{_used(attempt, detail['kind'] == 'train')}) {ended}{counted}{reason}",
             markup=False,
@@ -128,6 +134,17 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             if node["log"]:  # not before the attempt has its run
                 console.print(f"      {node['log']}", markup=False, style="dim")
+
+
+def _show_children(console: Console, detail: Mapping[str, Any]) -> None:
+    """A line for each of an array's children, those that failed first."""
+    children = detail["children"] or []
+    for child in children[:_CHILDREN]:
+        reason = "" if child["status"] == "SUCCEEDED" else one_line(child["statusReason"] or "")
+        lasted = took(child["ranSeconds"])
+        console.print(f"    {child['index']:>5}  {child['status']:9}  {lasted:>8}  {reason}".rstrip(), markup=False)
+    if detail["job"].get("arrayProperties", {}).get("size", 0) > _CHILDREN and children:
+        console.print(f"    … the first {_CHILDREN}, those that failed first; --json has 100", markup=False)
 
 
 def _source(detail: Mapping[str, Any]) -> str:
@@ -175,12 +192,11 @@ def when(milliseconds: int | None) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(milliseconds / 1000)) if milliseconds else "-"
 
 
-def took(start: int | None, end: int | None) -> str:
-    if not start:
+def took(ran: float | None) -> str:
+    """The ``ranSeconds`` of a job or an attempt as h:mm:ss."""
+    if ran is None:
         return "-"
-    seconds = (
-        max(0, int((end or time.time() * 1000) - start)) // 1000
-    )  # this machine's clock may lag behind the controller's
+    seconds = int(ran)
     return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}"
 
 

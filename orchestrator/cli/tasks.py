@@ -13,7 +13,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json
+from orchestrator.cli.terminal import Console, echo, echo_json, print_wrapped
 from orchestrator.domain.errors import ServerError, SpecError
 
 
@@ -37,7 +37,7 @@ def tasks(
     if as_json:
         echo_json(found, indent=1)
         return
-    _print(_table(found))
+    print_wrapped(_table(found))
     if not name:
         return
     console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
@@ -47,24 +47,10 @@ def tasks(
         console.print("\nROBOTS\n" + "\n".join(robots), markup=False)
     for section, rows in found[0].get("tables", {}).items():
         echo("")
-        _print(_terms(section, rows))
+        print_wrapped(_terms(section, rows))
     if numbers := found[0].get("numbers"):
         console.print("\nNUMBERS of train.config.numbers and train.config.curriculum", markup=False)
-        _print(_numbers(numbers))
-
-
-def _print(table: Table) -> None:
-    """Print a table: on a terminal, wrap cells between words but never within a name; for another program, one line per row."""
-    terminal, wide = Console(), Console(width=10 * WHOLE)
-    if not sys.stdout.isatty():
-        wide.print(table, soft_wrap=True)
-        return
-    least = 2 * len(table.columns)
-    for column in table.columns:
-        sizes = [wide.measure(cell) for cell in (column.header, *column.cells)]
-        column.min_width = max(size.maximum if column.no_wrap else size.minimum for size in sizes)
-        least += column.min_width
-    Console(width=max(terminal.width, least)).print(table, soft_wrap=True)
+        print_wrapped(_numbers(numbers))
 
 
 def ask_worker(module: str, arguments: Sequence[str], failure: str) -> Any:

@@ -25,8 +25,8 @@ _UNSAFE = re.compile(
     "\ud800-\udfff\U000e0000-\U000e007f]"  # halves of characters, tags
 )
 _NO_COLOUR = "\x1b[0m"
-WHOLE = 1000
-"""Width for other programs and for output in full: nothing is cut."""
+_WIDEST = 100_000
+"""Width at which nothing is cut."""
 
 
 def visible(text: str, colours: bool = False) -> str:
@@ -79,21 +79,40 @@ class Console(rich.console.Console):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
 
 
+def print_rows(table: Table) -> None:
+    """Print each row of a table as one line, with nothing cut and no spaces at its end: to be read whole, or by another program."""
+    wide = Console(width=_WIDEST)
+    with wide.capture() as captured:
+        wide.print(table, soft_wrap=True)
+    echo_raw("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
 def print_cut(table: Table) -> None:
     """One line per row: on a terminal the last column is cut to the remaining width; for another program nothing is cut."""
-    console, wide = Console(), Console(width=10 * WHOLE)
+    if not sys.stdout.isatty():
+        print_rows(table)
+        return
+    console, wide = Console(), Console(width=_WIDEST)
     widths = [max(wide.measure(cell).maximum for cell in (each.header, *each.cells)) for each in table.columns]
     for column, width in zip(table.columns[:-1], widths, strict=False):  # rich would shrink all columns equally
         column.min_width = width
     taken = sum(2 + width for width in widths[:-1])
-    if not sys.stdout.isatty():
-        printed = Console(width=taken + 2 + widths[-1])
-        with printed.capture() as captured:
-            printed.print(table, soft_wrap=True)
-        echo_raw("\n".join(line.rstrip() for line in captured.get().splitlines()))  # one long row pads no other
-        return
     table.columns[-1].max_width = max(len("REASON"), console.width - taken)
     Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)
+
+
+def print_wrapped(table: Table) -> None:
+    """On a terminal, wrap cells between words but never within a name; for another program, one line per row."""
+    if not sys.stdout.isatty():
+        print_rows(table)
+        return
+    terminal, wide = Console(), Console(width=_WIDEST)
+    least = 2 * len(table.columns)
+    for column in table.columns:
+        sizes = [wide.measure(cell) for cell in (column.header, *column.cells)]
+        column.min_width = max(size.maximum if column.no_wrap else size.minimum for size in sizes)
+        least += column.min_width
+    Console(width=max(terminal.width, least)).print(table, soft_wrap=True)
 
 
 class _Formatter(logging.Formatter):

@@ -19,7 +19,7 @@ from orchestrator.api.native.routes import job_detail
 from orchestrator.api.permissions import Operation, current_identity
 from orchestrator.console.curves import columns
 from orchestrator.console.job_config import before_it, code_of, differences
-from orchestrator.console.job_facts import attempts_of, checkpoints_of, facts_of
+from orchestrator.console.job_facts import attempts_of, checkpoints_of, child_of, facts_of
 from orchestrator.console.job_log import ChosenLog, LiveLog
 from orchestrator.console.job_view import is_near, views
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
@@ -40,8 +40,6 @@ router, _stored = page_router(), page_router(stored=True)
 _recent = Recent()
 _RECORDS = 200
 """Iterations that one event brings; a page that has missed more reads its curves again."""
-_CHILDREN = 100
-"""Jobs of an array that its page names."""
 
 
 @router.get("/jobs/{reference}")
@@ -76,7 +74,7 @@ def job(request: Request, reference: str) -> Response:
         checkpoints=checkpoints,
         blank_checkpoint=dict.fromkeys(_CHECKPOINT, ""),
         definition=described["jobDefinition"].rpartition("/")[2],
-        children=range(min(array["size"], _CHILDREN)) if "statusSummary" in array else (),
+        children=[child_of(each) for each in detail["children"] or ()],
         array=array,
         has_run=is_visible,
         trains=bool(spec.get("train")),

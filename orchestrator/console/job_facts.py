@@ -20,6 +20,7 @@ from shared_store.evaluations import by_checkpoint
 from shared_store.layout import Run
 from shared_store.learning import in_words
 from shared_store.metrics import finite, warnings_of
+from shared_store.phases import Phase
 from shared_store.wording import counted
 
 CHECKPOINTS = 30
@@ -37,7 +38,6 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
     iteration, iterations = int(finite(last.get("iteration")) or 0), training.get("iterations") or 0
     seconds = finite(last.get("iteration_seconds"))
     attempts = detail["attempts"]
-    started = next((each["startedAt"] for each in attempts if each["startedAt"]), detail["startedAt"])
     results = detail["results"] or {}
     reason = (detail["statusReason"] or "") if status != Status.SUCCEEDED else ""
     problem = detail["storeProblem"] or ""
@@ -51,7 +51,7 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "iterations": iterations or 1,
         "progress": f"{iteration} of {iterations}" if iterations and iteration else "",
         "left": words.duration((iterations - iteration) * seconds)
-        if not is_over and iteration and seconds is not None
+        if not is_over and 0 < iteration < iterations and seconds is not None
         else "",
         "rate": words.count(last.get("steps_per_second")) if not is_over else "",
         "reward": words.count(last.get("reward")),
@@ -62,13 +62,24 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "reported": words.moment(last["time"] * 1000)
         if not is_over and isinstance(last.get("time"), int | float)
         else "",
+        "phase": Phase(detail["phase"]).words if detail["phase"] else "",
         "attempt": _attempt_of(detail),
         "where": _where(attempts[-1]["nodes"]) if attempts and not is_over else "",
-        "since": words.moment(started) if started and not is_over else "",
-        "took": words.duration((detail["stoppedAt"] - started) / 1000) if is_over and started else "",
+        "since": words.moment(detail["runsSince"]),
+        "took": "" if detail["runsSince"] else words.duration(detail["ranSeconds"]),
         "saved": counted(results["checkpoints"], "checkpoint") if results.get("checkpoints") else "",
         "evaluated": _evaluated(results.get("evaluation")),
         "evaluating": _automatic(results.get("automatic")),
+    }
+
+
+def child_of(child: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of an array's child."""
+    return {
+        **{name: child[name] for name in ("index", "id", "status")},
+        "reason": (child["statusReason"] or "") if child["status"] != Status.SUCCEEDED else "",
+        "since": words.moment(child["runsSince"]),
+        "took": "" if child["runsSince"] else words.duration(child["ranSeconds"]),
     }
 
 
@@ -95,8 +106,8 @@ def _attempt(attempt: Mapping[str, Any], begin: int, end: int, saves: bool) -> d
         "kind": ended,
         "why": (attempt["statusReason"] or "") if ended != "succeeded" else "",
         "started": words.moment(started),
-        "took": words.duration((stopped - started) / 1000) if started and stopped else "",
-        "since": words.moment(started) if started and not stopped else "",
+        "took": words.duration(attempt["ranSeconds"]) if stopped else "",
+        "since": words.moment(attempt["runsSince"]),
         "cost": cost + lost_words,
         "from": f"{max(0.0, 100 * (first - begin) / (end - begin)):.1f}",
         "span": f"{max(0.4, 100 * ((stopped or end) - first) / (end - begin)):.1f}",

@@ -175,10 +175,8 @@ def _row(job: Mapping[str, Any]) -> dict[str, Any]:
         "reward": words.count(progress.get("reward")),
         "spark": words.spark(progress.get("rewards") or ()),
         "created": words.moment(job.get("createdAt")),
-        "took": words.duration((job["stoppedAt"] - job["startedAt"]) / 1000)
-        if is_over and job.get("startedAt")
-        else "",
-        "since": words.moment(job.get("startedAt")) if job and not is_over else "",
+        "took": "" if job.get("runsSince") else words.duration(job.get("ranSeconds")),
+        "since": words.moment(job.get("runsSince")),
         "open": "" if is_over else "yes",
     }
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import UsageError
-from orchestrator.persistence.models import KnownAccount
+from orchestrator.persistence.own_models import KnownAccount
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.snapshot import holding_of, take_snapshot
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.job import Status
+from orchestrator.domain.reasons import Reason
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Job
 from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
@@ -126,17 +127,25 @@ class Admission:
         else:
             self._work_queue.look_again([job.id])
 
-    def reason(self, job: Job) -> str | None:
-        """Why a job waits now, or a note for its user while it runs; None where its own reason says all."""
+    def reason(self, job: Job) -> Reason:
+        """Why a job is in its state: why it waits now, a note for its user while it runs, how it ended."""
+        return self._present_reason(job) or job.reason
+
+    def _present_reason(self, job: Job) -> Reason | None:
+        """What the last pass and the disk say of the job now; None where its own reason says all."""
         shortage, report = self._disk.shortage(), self._report
         if job.status in (Status.STARTING, Status.RUNNING):
             failure = self._backoff.failure(("preempt", job.id)) if report and report.preempts(job.id) else None
             reason = failure or job.status_reason or ""
-            return failure if shortage is None or shortage in reason else "; ".join(filter(None, (reason, shortage)))
+            if shortage is not None and shortage not in reason:
+                return Reason.plain("; ".join(filter(None, (reason, shortage))))
+            return None if failure is None else Reason.plain(failure)
         if job.status != Status.RUNNABLE or self._work_queue.since(job.id) is None:
             return None
-        if shortage is not None or report is None:
-            return shortage
+        if shortage is not None:
+            return Reason.plain(shortage)
+        if report is None:
+            return None
         try:
             return report.reason(job.id)
         except KeyError:

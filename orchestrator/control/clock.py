@@ -15,7 +15,7 @@ from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.persistence.models import ClockState
+from orchestrator.persistence.own_models import ClockState
 
 log = logging.getLogger("muster.controller")
 

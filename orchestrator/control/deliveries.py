@@ -209,7 +209,7 @@ class Deliveries:
             loop.close()
 
     def _message(self, webhook: Webhook, job: Job) -> dict[str, Any]:
-        attempts = self._attempts(job)
+        attempts, reason = self._ended(job)
         name = run_of(job)
         checkpoint, summary = _evaluated(self._reconciler.store.run(name), job)
         evaluation = {key: summary[key] for key in _SHOWN} if summary else None
@@ -221,7 +221,7 @@ class Deliveries:
             "owner": job.owner,
             "run": name,
             "status": job.status,
-            "statusReason": job.status_reason,
+            "statusReason": reason,
             "stopped": job.stop_reason is not None,
             "exitCode": attempts[-1] if attempts else None,
             "attempts": len(attempts),
@@ -234,10 +234,11 @@ class Deliveries:
         }
         return {"type": event_of(job.status), "timestamp": _when(job.stopped_at), "data": data}
 
-    def _attempts(self, job: Job) -> list[int | None]:
-        """The exit code of each attempt."""
+    def _ended(self, job: Job) -> tuple[list[int | None], str | None]:
+        """The exit code of each attempt, and the reason of the job's end."""
         with self._database.session() as session:
-            return [attempt.exit_code for attempt in session.get_one(Job, job.id).attempts]
+            found = session.get_one(Job, job.id)
+            return [attempt.exit_code for attempt in found.attempts], found.reason.words or None
 
 
 def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None]:

@@ -6,8 +6,14 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.clock import Clock
+from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.job import WAITING, Status
 from orchestrator.persistence.models import Job
+
+_NAMED = 3
+"""Greatest number of failed children that an array's reason names."""
+_LONGEST = 120
+"""Greatest number of characters of a child's reason in it."""
 
 
 def settle(session: Session, job: Job, clock: Clock) -> None:
@@ -46,9 +52,18 @@ def _settle_array(session: Session, job: Job) -> None:
         return
     failed = counts.get(Status.FAILED, 0)
     if failed:
-        job.move(Status.FAILED, job.stop_reason or f"{failed} of {job.array_size} array jobs failed")
+        job.move(Status.FAILED, job.stop_reason or _failed_children(session, job, failed))
     else:
         job.move(Status.SUCCEEDED, "all array jobs succeeded")
+
+
+def _failed_children(session: Session, array: Job, failed: int) -> str:
+    """How many children failed, and the first of them by index, each with the start of its reason."""
+    children = select(Job).where(Job.parent == array.id, Job.status == Status.FAILED)
+    first = session.scalars(children.order_by(Job.array_index).limit(_NAMED)).all()
+    named = [f"{each.array_index} ({excerpt(' '.join(each.reason.words.split()), _LONGEST)})" for each in first]
+    others = [f"{failed - len(named)} more"] if failed > len(named) else []
+    return f"{failed} of {array.array_size} array jobs failed: {', '.join([*named, *others])}"
 
 
 def _state(session: Session, job_id: str) -> str:

@@ -21,7 +21,8 @@ from orchestrator import machine
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL
-from orchestrator.persistence.models import Job, JobDefinition, KeptText, now
+from orchestrator.persistence.models import Job, JobDefinition, now
+from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.session import Database, DatabaseError
 from shared_store import texts
 from shared_store.layout import Store

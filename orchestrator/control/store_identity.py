@@ -9,7 +9,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import Unavailable
-from orchestrator.persistence.models import Attempt, Job, KnownStore
+from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.own_models import KnownStore
 from shared_store.layout import Store, StoreError
 
 _NEWEST = 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -74,6 +74,30 @@ class Ending(StrEnum):
 
 
 @dataclass(frozen=True)
+class RunTime:
+    """How long a job has run, all its attempts together, without the waits between them."""
+
+    seconds: float
+    since: int | None
+    """While an attempt runs: when the job would have started, had it run without a pause (Unix time [ms])."""
+
+    @classmethod
+    def of(cls, attempts: Iterable[tuple[int | None, int | None]], moment: int) -> RunTime | None:
+        """None for a job that has not started.
+
+        Args:
+            attempts: Start and end of each (Unix time [ms]); no end: it runs.
+            moment: The present (Unix time [ms]).
+        """
+        begun = [(start, end) for start, end in attempts if start is not None]
+        if not begun:
+            return None
+        passed = sum(max(0, (moment if end is None else end) - start) for start, end in begun)
+        runs = any(end is None for _, end in begun)
+        return cls(passed / 1000, moment - passed if runs else None)
+
+
+@dataclass(frozen=True)
 class NodeEnd:
     """The end of one node; ``ended`` is the Unix time [s] of its first error, or of its end."""
 
@@ -132,6 +156,10 @@ def container_reason(reason: str | None, status_reason: str | None) -> str | Non
 def lost_host(host: str) -> str:
     """AWS Batch's reason for an attempt that has lost the host of its main node."""
     return f"{_LOST_HOST} (instance {host}) terminated."
+
+
+AWS_ENDINGS = re.compile(rf"{AWS_EXITED}|{re.escape(lost_host('HOST')).replace('HOST', '[^)]*')}")
+"""Both of these reasons, which AWS Batch gives whatever the main node's own reason is."""
 
 
 def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdict | None:

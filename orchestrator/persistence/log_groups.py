@@ -9,7 +9,8 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
-from orchestrator.persistence.models import Job, LogGroup, Node
+from orchestrator.persistence.models import Job, Node
+from orchestrator.persistence.own_models import LogGroup
 
 MOST = 1000
 """Log groups of a controller."""

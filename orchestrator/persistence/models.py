@@ -14,7 +14,8 @@ from orchestrator import machine
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
-from orchestrator.domain.job import Status, check_transition
+from orchestrator.domain.job import AWS_ENDINGS, RunTime, Status, check_transition
+from orchestrator.domain.reasons import Reason
 from orchestrator.persistence.columns import Names, storable
 from orchestrator.persistence.gangs import gangs
 
@@ -207,6 +208,20 @@ class Job(Base):
         return next((attempt for attempt in self.attempts if attempt.stopped_at is None), None)
 
     @property
+    def run_time(self) -> RunTime | None:
+        """How long it has run; of an array, from the start of its first child to its end. None before it starts."""
+        spans = [(each.started_at, each.stopped_at) for each in self.attempts]
+        return RunTime.of([(self.started_at, self.stopped_at)] if self.kind == "array" else spans, now())
+
+    @property
+    def reason(self) -> Reason:
+        """Why it is in its state, except for what the scheduler states about a job that waits."""
+        text = self.status_reason or ""
+        if AWS_ENDINGS.search(text) and self.attempts:
+            return Reason(self.attempts[-1].in_own_words(text), text)
+        return Reason.plain(text)
+
+    @property
     def is_terminal(self) -> bool:
         return Status(self.status).is_terminal
 
@@ -339,6 +354,22 @@ class Attempt(Base):
         """The name of its compute environment. Attempts of Muster 0.1 have none: they ran on this machine."""
         return self.compute_environment or "local"
 
+    @property
+    def run_time(self) -> RunTime | None:
+        """How long it has run; None before it starts."""
+        return RunTime.of([(self.started_at, self.stopped_at)], now())
+
+    def in_own_words(self, reason: str) -> str:
+        """The reason with the main node's own in place of AWS's general words, such as ``Essential container in task exited``."""
+        try:
+            main = self.node(self.job.gang.main)
+        except ValueError:  # the job's row is damaged
+            return reason
+        if main is None or not main.reason:
+            return reason
+        own = main.reason if main.exit_code == 0 else f"main node: {main.reason}"
+        return AWS_ENDINGS.sub(lambda _: own, reason)
+
     def node(self, index: int) -> Node | None:
         """Its node of this index; None if it has none, because it was started with fewer nodes."""
         if index < len(self.nodes) and self.nodes[index].index == index:  # nearly always: they are in this order
@@ -405,75 +436,6 @@ class Node(Base):
             **{key: value for key, value in known.items() if value is not None},
             **(ended if self.exit_code is not None else {}),
         }
-
-
-class ClockState(Base):
-    """The one row of steady time (:mod:`orchestrator.control.clock`)."""
-
-    __tablename__ = "clock"
-    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    boot: Mapped[str]
-    """Of the machine, as long as its monotonic clock counts on."""
-    offset: Mapped[int]
-    """Steady time less monotonic time [ms]."""
-    drift: Mapped[int]
-    """Wall-clock time less steady time [ms]."""
-
-
-class KnownStore(Base):
-    """The one row of the store that this database belongs to (:mod:`orchestrator.control.store_identity`)."""
-
-    __tablename__ = "store"
-    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    identity: Mapped[str]
-    """As its ``store.json`` has it."""
-
-
-class KeptText(Base):
-    """A long text of jobs, which lies in the store (:mod:`orchestrator.control.kept_texts`)."""
-
-    __tablename__ = "kept_texts"
-    sha256: Mapped[str] = mapped_column(primary_key=True)
-    owner: Mapped[str]
-    """The one who has uploaded it last."""
-    folder: Mapped[str]
-    """That of the controller which keeps it."""
-    size: Mapped[int]
-    """Bytes."""
-    uploaded_at: Mapped[int]
-    used_at: Mapped[int]
-    """When it was uploaded, or a definition or a job that names it was registered, last."""
-
-
-class KnownAccount(Base):
-    """The one row of the account in the ARNs (:mod:`orchestrator.control.account`)."""
-
-    __tablename__ = "account"
-    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    account: Mapped[str]
-    region: Mapped[str]
-
-
-class LogGroup(Base):
-    """A log group of a user's own; ``/aws/batch/job``, which always exists, has a row once it has a setting or a tag."""
-
-    __tablename__ = "log_groups"
-    name: Mapped[str] = mapped_column(primary_key=True)
-    owner: Mapped[str | None] = mapped_column(default=None)
-    """Whose key created it, or submitted the first job that logs there."""
-    retention: Mapped[int | None] = mapped_column(default=None)
-    """``retentionInDays``, which is shown and deletes nothing."""
-    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
-    created_at: Mapped[int] = mapped_column(default=now)
-
-
-class LogStream(Base):
-    """An empty stream that a client created; the streams of jobs are known by their nodes."""
-
-    __tablename__ = "log_streams"
-    log_group: Mapped[str] = mapped_column(ForeignKey("log_groups.name", ondelete="CASCADE"), primary_key=True)
-    name: Mapped[str] = mapped_column(primary_key=True)
-    created_at: Mapped[int] = mapped_column(default=now)
 
 
 class ShareUsage(Base):

@@ -7,6 +7,7 @@ from pathlib import Path
 from sqlalchemy import Column, Connection, MetaData, String, Table, insert, inspect, select
 
 from orchestrator.persistence.models import Base, ComputeEnvironment, JobQueue
+from orchestrator.persistence.own_models import KnownAccount  # noqa: F401 (its tables, too)
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 NEWEST = max(path.name for path in (MIGRATIONS / "versions").glob("[0-9]*.py")).partition("_")[0]

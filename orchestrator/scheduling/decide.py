@@ -144,7 +144,8 @@ class _Pass:
         """Whether one of the queue's time limits ends the job, the first in its queue that does not start. Only the time at the head counts
         (AWS's API model): the jobs behind it wait because of another job.
         """
-        code = (cache.impossible(job.shape) or NO_ROOM).partition(" - ")[0]
+        never = cache.impossible(job.shape)
+        code = never.code if never else NO_ROOM
         before = self.snapshot.leading.get(queue.name)
         since = before.since if before and (before.job, before.reason) == (job.job, code) else self.now
         self.leading[queue.name] = Leading(job.job, code, since)

@@ -8,6 +8,7 @@ from math import inf
 
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host
+from orchestrator.domain.reasons import Reason
 from orchestrator.scheduling.free_resources import Allocation, FreeResources
 from orchestrator.scheduling.placement import affordable, count_of, needs, never_fits
 from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue, Snapshot
@@ -54,13 +55,13 @@ def fit(
         if allocation := free.allocation(shape, ce.name):
             return Fit(allocation, None)
     possible, problem = examine(shape, ordered, free, elastic)
-    return Fit(None, None if possible else problem.partition(" - ")[2])
+    return Fit(None, None if possible else problem.words)
 
 
 def examine(
     shape: Shape, ces: Sequence[ComputeEnvironment], free: FreeResources, elastic: Collection[str] = ()
-) -> tuple[tuple[str, ...], str]:
-    """Names of the compute environments into which the gang fits if nothing runs, and why it does not fit into the others, with a code."""
+) -> tuple[tuple[str, ...], Reason]:
+    """Names of the compute environments into which the gang fits if nothing runs, and why it does not fit into the others."""
     possible, causes, too_many = [], [], 0
     for ce in ces:
         where = f"compute environment {ce.name}: " if len(ces) > 1 else ""
@@ -73,5 +74,5 @@ def examine(
         else:
             possible.append(ce.name)
     code = TOO_MANY_CPUS if too_many == len(ces) else TOO_LARGE
-    lead = f"{needs(shape)}; " if too_many else ""
-    return tuple(possible), f"{code} - {lead}{'; '.join(causes)}"
+    demand = [needs(shape)] if too_many else []
+    return tuple(possible), Reason.coded(code, "; ".join([*causes, *demand]))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from math import inf
 
 from orchestrator.domain.gang import Shape
+from orchestrator.domain.reasons import Reason
 from orchestrator.scheduling.fit import examine
 from orchestrator.scheduling.free_resources import Allocation, FreeResources
 from orchestrator.scheduling.placement import affordable, count_of, needs
@@ -39,7 +40,7 @@ class PassCache:
         self.failed: defaultdict[float, set[Shape]] = defaultdict(set)
         """Shapes that can't start any more in this pass, by their running time (see :meth:`span`)."""
         self._possible: dict[Shape, tuple[str, ...]] = {}
-        self._impossible: dict[Shape, str] = {}
+        self._impossible: dict[Shape, Reason] = {}
         for reservation in reservations:
             self.add(reservation)
 
@@ -64,8 +65,8 @@ class PassCache:
             self._examine(shape)
         return self._possible[shape]
 
-    def impossible(self, shape: Shape) -> str | None:
-        """Why the shape fits into no compute environment, even an empty one: a reason with its code."""
+    def impossible(self, shape: Shape) -> Reason | None:
+        """Why the shape fits into no compute environment, even an empty one."""
         return None if self.possible(shape) else self._impossible[shape]
 
     def allocation(self, shape: Shape, end: float) -> Allocation | None:
@@ -97,8 +98,8 @@ class PassCache:
             shape, list(self.compute_environments.values()), self.free
         )
 
-    def barred(self, shape: Shape) -> str | None:
-        """Why the queue's quota excludes the shape from every compute environment into which it would fit: a reason with its code."""
+    def barred(self, shape: Shape) -> Reason | None:
+        """Why the queue's quota excludes the shape from every compute environment into which it would fit."""
         if self.quota is None or self.open(shape):
             return None
         what = "GPU" if shape.uses_gpus else "CPU"
@@ -109,4 +110,4 @@ class PassCache:
             parts.append(f"its queue uses {used:g} of the {count_of(limit, what)} that it may use of {ce}")
         shares = f"{counted(self.quota.active, 'active share')}"
         kept = f"{100 * self.quota.kept:.3g}% is kept for shares that are not active ({shares} now)"
-        return f"{NO_ROOM} - {needs(shape)}; {'; '.join(parts)}: {kept}"
+        return Reason.coded(NO_ROOM, f"{'; '.join(parts)}: {kept}; {needs(shape)}")

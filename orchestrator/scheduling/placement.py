@@ -110,6 +110,18 @@ def needs(shape: Shape) -> str:
     return f"needs {at_least}{nodes} with {amounts(shape.least)} in all"
 
 
+def shortage(wanted: Resources, free: Resources) -> str:
+    """What is missing: ``1 of 2 CPUs, 512 MiB of 1 GiB short``; empty if enough is free in all."""
+    parts = []
+    if free.cpus + EPSILON < wanted.cpus:
+        parts.append(f"{_number(wanted.cpus - max(0.0, free.cpus))} of {count_of(wanted.cpus, 'CPU')}")
+    if free.gpus < wanted.gpus:
+        parts.append(f"{wanted.gpus - max(0, free.gpus)} of {count_of(wanted.gpus, 'GPU')}")
+    if free.memory < wanted.memory:
+        parts.append(f"{_size(wanted.memory - max(0, free.memory))} of {_size(wanted.memory)}")
+    return f"{', '.join(parts)} short" if parts else ""
+
+
 def together(hosts: Sequence[Host]) -> str:
     """The total of the hosts, in words."""
     return amounts(sum((host.resources for host in hosts), Resources()))
@@ -117,14 +129,21 @@ def together(hosts: Sequence[Host]) -> str:
 
 def amounts(resources: Resources) -> str:
     """``4 CPUs, 1 GPU, 2 GiB``; negative amounts are shown as 0."""
-    memory = max(0, resources.memory)
-    size = f"{memory / 1024:.3g} GiB" if memory >= 1024 else f"{memory} MiB"
+    size = _size(max(0, resources.memory))
     return f"{count_of(max(0, resources.cpus), 'CPU')}, {count_of(resources.gpus, 'GPU')}, {size}"
+
+
+def _size(memory: int) -> str:
+    return f"{memory / 1024:.3g} GiB" if memory >= 1024 else f"{memory} MiB"
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}".rstrip("0").rstrip(".")
 
 
 def count_of(number: float, what: str) -> str:
     """``1 CPU``, ``2.5 CPUs``, ``96000 CPUs``."""
-    text = f"{number:.2f}".rstrip("0").rstrip(".")
+    text = _number(number)
     return f"{text} {what}{'s' if text != '1' else ''}"
 
 

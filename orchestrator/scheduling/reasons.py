@@ -10,14 +10,18 @@ from math import inf
 from typing import Protocol
 
 from orchestrator.domain.gang import Shape
+from orchestrator.domain.reasons import Reason
 from orchestrator.domain.resources import EPSILON, Resources
 from orchestrator.scheduling.free_resources import FreeResources
 from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
-from orchestrator.scheduling.placement import count_of, limit_of, needs, together
+from orchestrator.scheduling.placement import count_of, limit_of, needs, shortage, together
 from orchestrator.scheduling.reservation import Reservation
 from orchestrator.scheduling.snapshot import Waiting
 
-NO_COMPUTE_ENVIRONMENT = "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
+NO_COMPUTE_ENVIRONMENT = Reason(
+    "no compute environment of its queue is enabled",
+    "ACTION_REQUIRED - CE(s) associated with the job queue are invalid.",
+)
 _NAMED = 3
 """Greatest number of jobs that a reason names."""
 
@@ -67,7 +71,7 @@ class WaitReport:
         )
         self._preempted = {each.job for each in preempts}
         self._orders: dict[str, tuple[str, ...]] = {}
-        self._common: dict[tuple[str, Shape], tuple[bool, str]] = {}
+        self._common: dict[tuple[str, Shape], tuple[bool, Reason]] = {}
 
     def order(self, queue: str) -> Sequence[str]:
         """Ids of the queue's waiting jobs in the order of service; empty if none waits."""
@@ -80,37 +84,39 @@ class WaitReport:
         """Whether the pass has decided to preempt this job."""
         return job in self._preempted
 
-    def reason(self, job: str) -> str:
-        """The ``statusReason`` of a job that waits. Raises KeyError for one that starts, is cancelled or was not waiting."""
+    def reason(self, job: str) -> Reason:
+        """Why a job waits. Raises KeyError for one that starts, is cancelled or was not waiting."""
         queue, position = self._positions[job]
         queue_order = self._queues[queue]
         if queue_order.cache is None or not queue_order.cache.compute_environments:
             return NO_COMPUTE_ENVIRONMENT
         if reservation := self._reservations.get(job):
-            return f"{NO_ROOM} - {self._free(reservation.job.shape, reservation.allocation.compute_environment)}{self._until(reservation)}"
+            lack = self._lack(reservation.job.shape, reservation.allocation.compute_environment)
+            awaited = self._awaited(reservation)
+            return Reason.coded(NO_ROOM, f"waits for {awaited}: {lack}" if awaited else lack)
         key = (queue, queue_order.jobs[position].shape)
         if key not in self._common:
             self._common[key] = self._common_reason(queue, queue_order.cache, key[1])
-        behind, text = self._common[key]
+        behind, reason = self._common[key]
         if not behind:
-            return text
+            return reason
+        words = f"{_ordinal(position + 1)} in queue {queue}, {reason.words}"
         # AWS gives a code to the first job of a queue only, the one that is stuck
-        code = f"{NO_ROOM} - " if position == 0 else ""
-        return f"{code}{_ordinal(position + 1)} in queue {queue}, {text}"
+        return Reason.plain(words) if position else Reason.coded(NO_ROOM, words)
 
-    def _common_reason(self, queue: str, cache: PassCache, shape: Shape) -> tuple[bool, str]:
+    def _common_reason(self, queue: str, cache: PassCache, shape: Shape) -> tuple[bool, Reason]:
         """The reason shared by all jobs of a shape in a queue, and whether it is another job."""
         if reason := cache.impossible(shape) or cache.barred(shape):
             return False, reason
         unknown = [cache.compute_environments[ce].unknown for ce in cache.possible(shape)]
         if all(unknown):
-            return False, f"{NO_ROOM} - {needs(shape)}; {unknown[0]}"
+            return False, Reason.coded(NO_ROOM, f"{unknown[0]}; {needs(shape)}")
         before = self._before(queue, cache, shape)
         if before is None:
-            return False, f"{NO_ROOM} - {self._free(shape, cache.possible(shape)[0])}"
+            return False, Reason.coded(NO_ROOM, self._lack(shape, cache.possible(shape)[0]))
         wants = f"{needs(before.job.shape)}{self._start(before, ' and starts by ')}"
         name = _named(before.job.name, before.job.job)
-        return True, f"behind job {name}, which {wants}{self._hint(shape, cache)}"
+        return True, Reason.plain(f"behind job {name}, which {wants}{self._hint(shape, cache)}")
 
     @cached_property
     def _positions(self) -> dict[str, tuple[str, int]]:
@@ -128,19 +134,20 @@ class WaitReport:
             reservations[0] if reservations else None,
         )
 
-    def _free(self, shape: Shape, ce: str) -> str:
-        """The shape's demand, the free part of the compute environment, and why that does not suffice although it seems to."""
+    def _lack(self, shape: Shape, ce: str) -> str:
+        """What the compute environment lacks for the shape now, the shape's demand, and the free part."""
         hosts = [self._resources.hosts[name] for name in self._resources.members[ce]]
         if self._resources.cpus[ce] + EPSILON < shape.least.cpus:
             left = count_of(max(0.0, self._resources.cpus[ce]), "CPU")
-            return f"{needs(shape)}; compute environment {ce} may use {left} more at this time"
+            return f"compute environment {ce} may use {left} more at this time; {needs(shape)}"
         if limit := limit_of(self._resources.totals(ce)):
-            return f"{needs(shape)}; {limit}"
-        enough = shape.least <= sum((host.resources for host in hosts), Resources())
-        return f"{needs(shape)}; {together(hosts)} free{', but not in one piece for each node' if enough else ''}"
+            return f"{limit}; {needs(shape)}"
+        free = sum((host.resources for host in hosts), Resources())
+        short = shortage(shape.least, free) or "enough is free, but not in one piece for each node"
+        return f"{short}; {needs(shape)}; {together(hosts)} free"
 
-    def _until(self, reservation: Reservation) -> str:
-        """The jobs whose end the reservation waits for, and the latest time of that."""
+    def _awaited(self, reservation: Reservation) -> str:
+        """The jobs whose end the reservation waits for, and its latest time; empty if it waits for none."""
         preempted = [each for each in reservation.awaits if each.job in self._preempted]
         awaited = preempted or list(reservation.awaits)
         if not awaited:
@@ -148,12 +155,12 @@ class WaitReport:
         names = [_named(each.name, each.job) for each in awaited[-_NAMED:]]
         others = len(awaited) - len(names)
         who = ", ".join(names) + (f" and {others} more" if others else "")
-        plural = "s" if len(awaited) > 1 else ""
+        who = f"job{'s' if len(awaited) > 1 else ''} {who}"
         if preempted:
-            return f" until job{plural} {who}, preempted for it, {'have' if plural else 'has'} stopped"
+            return f"{who}, preempted for it, to stop"
         if all(each.ending for each in awaited):
-            return f" until job{plural} {who} {'have' if plural else 'has'} stopped"
-        return f" until job{plural} {who} end{'' if plural else 's'}{self._start(reservation, ', at the latest at ')}"
+            return f"{who} to stop"
+        return f"{who} to end{self._start(reservation, ', at the latest at ')}"
 
     def _start(self, reservation: Reservation, lead: str) -> str:
         """The latest start of its job; empty if unknown or imminent."""

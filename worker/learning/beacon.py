@@ -9,7 +9,8 @@ from typing import Any
 
 
 class Beacon:
-    """Messages to the supervisor: ``iteration`` and ``steps_per_second``, ``said`` (of a save), ``done``.
+    """Messages to the supervisor: ``phase`` (:class:`shared_store.phases.Phase`), ``iteration`` and ``steps_per_second``, ``said`` (of a
+    save), ``done``.
 
     A message that finds the pipe full is dropped: the supervisor wants the newest, and the loop must not wait for it.
     Without a supervisor (torchrun, a debugger) nothing is sent.

@@ -8,6 +8,7 @@ from time import sleep
 from typing import TYPE_CHECKING
 
 from shared_store.files import write_atomic
+from shared_store.phases import Phase
 from worker.errors import TrainingError
 from worker.evaluation.evaluation import best_words, evaluate
 from worker.learning.algorithm import Share
@@ -32,17 +33,21 @@ def complete(loop: Loop) -> None:
 
     Raises TrainingError where the gang is asked to exit before the store takes the checkpoint.
     """
-    loop.beacon.tell(done=True)  # training is over: a slow volume must not look like a stalled iteration
+    loop.beacon.tell(
+        done=True, phase=Phase.SAVING
+    )  # training is over: a slow volume must not look like a stalled iteration
     name = _save(loop)
     loop.failures.tell(again=True)
     loop.say(f"evaluating checkpoint {name}")
     worlds = held_out_worlds(loop)
     glance = _glance(loop, worlds)
+    loop.beacon.tell(phase=Phase.EVALUATING)
     result = evaluate(worlds, loop.algorithm.policy(), loop.gang, checkpoint=name)
     loop.say(str(result))
     if not loop.gang.is_main:
         return
     run, plot = loop.job.run, None
+    loop.beacon.tell(phase=Phase.WRITING)
     try:
         result.write(run, iteration=loop.state.progress.iteration, config={})
         from worker.plot import plot_reward
@@ -56,6 +61,7 @@ def complete(loop: Loop) -> None:
     if plot:
         loop.say(f"reward plot: {plot}")
     if glance:
+        loop.beacon.tell(phase=Phase.DRAWING)
         _show(loop, glance, run.metrics / "policy.png")
 
 
@@ -91,7 +97,7 @@ def held_out_worlds(loop: Loop) -> Task:
         total = min(loop.share.total, EVALUATED * loop.gang.size)
         share = Share.of(loop.gang.rank, loop.gang.size, total)
         seed = held_out_seed(loop.training.seed)
-        worlds = build_task(type(loop.task), loop.config, share, loop.gang, seed)
+        worlds = build_task(type(loop.task), loop.config, share, loop.gang, seed, loop.beacon)
     last = max(0, progress.iteration - 1)
     begin_evaluation(worlds, last, progress.reward, progress.episode_length, adaptive_steps(loop.task))
     return worlds

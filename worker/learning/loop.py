@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import Checkpoint
 from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.phases import Phase
 from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.errors import TrainingError, UserError
@@ -74,6 +75,7 @@ class Loop:
         """Duration of an iteration [s] above which each one is saved: a stop may have to leave in the middle of the next one."""
         self.exits = False
         """Whether a request to exit is being carried out."""
+        self.beacon = Beacon()
         self.task, self.algorithm = self._build()
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
@@ -99,7 +101,7 @@ class Loop:
         captured = gang.device if captures else "cpu"
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._exchange = Exchange(gang, self.task)
-        self.reporter, self.fence, self.beacon = Reporter(self.gate), Fence(job.run, job.epoch), Beacon()
+        self.reporter, self.fence = Reporter(self.gate), Fence(job.run, job.epoch)
         self.failures = Failures(self.task, lambda line: self.reporter.do(_print, line))
         self.state.saver.start()
         end_startup()
@@ -108,7 +110,7 @@ class Loop:
         """This rank's worlds and the learner; the learner's weights are drawn alike on all ranks."""
         training, gang = self.training, self.gang
         seed_generators(training.seed)
-        task = build_task(training.task_type, training.config, self.share, gang, training.seed)
+        task = build_task(training.task_type, training.config, self.share, gang, training.seed, self.beacon)
         made = build_algorithm(training.algorithm_type, training.settings, task, self.share, gang, training.seed)
         check_state(made, training.algorithm)
         return task, made
@@ -138,6 +140,7 @@ class Loop:
         attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
         self.say("\n".join(filter(None, [*self.task.notes(), self._beginning(), self._begun])))
         self._stopwatch.begin()
+        self.beacon.tell(phase=Phase.TRAINING)
         try:
             while progress.iteration < self.training.iterations:
                 if attending and attending.attend():

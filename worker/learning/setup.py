@@ -15,12 +15,14 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.documents import DocumentError
 from shared_store.epoch import check_epoch
 from shared_store.files import read_json, write_json
+from shared_store.phases import Phase
 from shared_store.policy_changes import brief, differences, robot_changes
 from shared_store.policy_contract import Contract, read
 from worker.distributed import Gang, warm_marker
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
+from worker.learning.beacon import Beacon
 from worker.learning.job import Job, user_errors
 from worker.simulation.robot_values import shown_value
 from worker.tasks.adapting import begin_evaluation
@@ -34,10 +36,18 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
-def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int) -> Task:
-    """This rank's worlds; kernels are compiled once per cache. Raises UserError for refused settings and for mistakes in the user's own code."""
+def build_task(
+    task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int, beacon: Beacon | None = None
+) -> Task:
+    """This rank's worlds; kernels are compiled once per cache. Raises UserError for refused settings and for mistakes in the user's own code.
+
+    ``beacon``: where the phase is reported.
+    """
     marker = warm_marker(task_type, gang.device)
-    if gang.is_main and marker is not None and not marker.exists():
+    is_cold = marker is not None and not marker.exists()
+    if beacon is not None:
+        beacon.tell(phase=Phase.COMPILING if is_cold else Phase.BUILDING)
+    if gang.is_main and is_cold:
         print("compiling kernels: this takes a minute or two, the first time", flush=True)
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
     name = f"{task_type.__module__}:{task_type.__qualname__}"

@@ -21,7 +21,8 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
-from orchestrator.persistence.models import Job, LogGroup, LogStream, Node
+from orchestrator.persistence.models import Job, Node
+from orchestrator.persistence.own_models import LogGroup, LogStream
 from shared_store.layout import Store
 
 _RETENTIONS = (

@@ -16,7 +16,8 @@ from orchestrator.api.batch.describe import stream_name
 from orchestrator.api.logs.events import LogFile, log_file
 from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import LOG_GROUP
-from orchestrator.persistence.models import Attempt, Job, LogStream, Node
+from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.own_models import LogStream
 from shared_store.layout import Store
 
 MOST_STREAMS = 1000

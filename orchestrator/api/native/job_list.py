@@ -11,18 +11,20 @@ from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Query, Request
-from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy import ColumnElement, case, func, or_, select
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.api import permissions
-from orchestrator.api.context import reconciler_of
+from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.damaged import DAMAGED, DamagedRow, reading
+from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
-from orchestrator.domain.job import Status
+from orchestrator.domain.job import RunTime, Status
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.spec.evaluations import AUTOMATIC_TAG
 from orchestrator.spec.model import KINDS
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store
@@ -36,6 +38,13 @@ REWARDS = 40
 _FRESH = 1.0
 """Seconds for which the curve of a job that is not over is not read again."""
 _MOST_CURVES = 4096
+_CHILDREN = 100
+"""Greatest number of an array's children that are listed."""
+_FAILED_FIRST = (
+    *(Status.FAILED, Status.RUNNING, Status.STARTING, Status.RUNNABLE, Status.PENDING, Status.SUBMITTED),
+    Status.SUCCEEDED,
+)
+"""The order of an array's children by state."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +81,20 @@ def find_jobs(
     search: str = Query(default="", max_length=200, description="part of a name, run or owner, or the start of an id"),
     offset: int = Query(default=0, ge=0, lt=2**31),
     most: int = Query(default=JOBS_A_PAGE, ge=1, le=JOBS_A_PAGE, alias="max"),
+    progress: bool = Query(default=True, description="whether to read the progress of trainings in the store"),
 ) -> dict[str, Any]:
     """The jobs that the caller may see, the newest first, with the progress of trainings; ``total`` of them, and how many in each state."""
-    wanted = Wanted(tuple(status), queue, search)
-    return page_of_jobs(reconciler_of(request), wanted, offset, most)
+    reconciler = reconciler_of(request)
+    if queue:
+        with reconciler.database.session() as session:
+            if queue not in (known := queue_names(session)):
+                raise UnknownQueue(queue, known, 404)
+    return page_of_jobs(reconciler, Wanted(tuple(status), queue, search), offset, most, progress)
 
 
-def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE) -> dict[str, Any]:
+def page_of_jobs(
+    reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE, with_progress: bool = True
+) -> dict[str, Any]:
     """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter."""
     conditions = wanted.conditions()
     with reconciler.database.session() as session:
@@ -88,7 +104,8 @@ def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: 
         query = query.options(selectinload(Job.attempts)).offset(offset).limit(most)
         jobs = session.scalars(query).all()
         rows = [_row(reconciler, job) for job in jobs]
-    progress = _progress(reconciler, [training for _, training in rows if training is not None])
+    trainings = [training for _, training in rows if training is not None and with_progress]
+    progress = _progress(reconciler, trainings)
     found = [{**row, "progress": progress.get(row["id"])} for row, _ in rows]
     states = wanted.statuses or tuple(Status)
     return {"jobs": found, "total": sum(counts.get(each, 0) for each in states), "counts": counts}
@@ -106,6 +123,27 @@ def kind_of(spec: Mapping[str, Any] | None) -> str:
     return next((kind for kind in KINDS if (spec or {}).get(kind)), "command")
 
 
+def ran(time: RunTime | None) -> dict[str, Any]:
+    """How long a job or an attempt has run, as its part of an answer."""
+    return {"ranSeconds": time and time.seconds, "runsSince": time and time.since}
+
+
+def children_of(reconciler: Reconciler, session: Session, array: Job) -> list[dict[str, Any]]:
+    """The children of an array: those that failed first, then those that run, wait and succeeded; at most 100."""
+    order = case({str(status): place for place, status in enumerate(_FAILED_FIRST)}, value=Job.status)
+    query = select(Job).where(Job.parent == array.id).order_by(order, Job.array_index).limit(_CHILDREN)
+    return [
+        {
+            "index": child.array_index,
+            "id": child.id,
+            "status": child.status,
+            "statusReason": reconciler.admission.reason(child).words or None,
+            **ran(child.run_time),
+        }
+        for child in session.scalars(query.options(selectinload(Job.attempts)))
+    ]
+
+
 @dataclass(frozen=True)
 class _Training:
     """A job that has begun to train."""
@@ -120,16 +158,18 @@ def _row(reconciler: Reconciler, job: Job) -> tuple[dict[str, Any], _Training | 
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "statusReason": reconciler.admission.reason(job) or job.status_reason,
+        "statusReason": reconciler.admission.reason(job).words or None,
         "queue": job.queue,
         "owner": job.owner,
         "run": job.run,
         "createdAt": job.created_at,
         "startedAt": job.started_at,
         "stoppedAt": job.stopped_at,
+        **ran(job.run_time),
         "attempt": len(job.attempts),
         "attemptsAllowed": job.attempts_allowed,
         "arraySize": job.array_size,
+        "automaticEvaluation": job.tags.get(AUTOMATIC_TAG),
     }
     try:
         with reading(job):

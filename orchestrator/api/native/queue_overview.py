@@ -120,7 +120,7 @@ def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> l
             "name": job.name,
             "owner": job.owner,
             "share": job.share,
-            "reason": reconciler.admission.reason(job) or job.status_reason,
+            "reason": reconciler.admission.reason(job).words,
             "since": times.get(job.id),
         }
         for job in waiting

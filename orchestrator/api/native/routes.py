@@ -9,9 +9,9 @@ import time
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -53,6 +53,7 @@ from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
 from shared_store.logs import LogFollower, LogLine, timestamp
+from shared_store.phases import Phase, phase_in
 
 router = APIRouter(prefix="/api")
 router.include_router(job_list.router)
@@ -128,11 +129,17 @@ def _limit(capacity: Queued) -> dict[str, Any] | None:
 
 
 @router.get("/jobs/{reference}")
-def job_detail(request: Request, reference: str) -> Any:
+def job_detail(
+    request: Request,
+    reference: str,
+    store: Annotated[bool, Query(description="whether to read the run in the store: its results and progress")] = True,
+) -> Any:
     """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results.
 
-    ``storeProblem``: why there are no results, where the store does not answer. ``withoutEffect``: members of its definition for
-    Fargate, which change nothing here.
+    ``awsCode``: what the AWS Batch API states beyond ``statusReason``: AWS's code, or AWS's own words. ``ranSeconds``: how long all
+    attempts ran, together. ``phase``: what a training does at present. ``children``: of an array, those that failed first.
+    ``storeProblem``: why there are no results, where the store does not answer.
+    ``withoutEffect``: members of its definition for Fargate, which change nothing here.
     """
     reconciler = reconciler_of(request)
     with reconciler.database.session() as session:
@@ -140,13 +147,14 @@ def job_detail(request: Request, reference: str) -> Any:
         run = reconciler.store.run(job.run)
     problem, is_replaced, results, progress = None, False, None, None
     try:
-        found = reconciler.calls.call(partial(facts_of, run))
-        with reconciler.database.session() as session:
-            owner = owner_of(session, found)
-        is_replaced = is_of_earlier_run(job, found)
-        # a job may continue a run of another queue
-        if owner is not None and permissions.is_visible(owner) and not is_replaced:
-            results, progress = reconciler.calls.call(partial(_results, run))
+        found = reconciler.calls.call(partial(facts_of, run)) if store else None
+        if found is not None:
+            with reconciler.database.session() as session:
+                owner = owner_of(session, found)
+            is_replaced = is_of_earlier_run(job, found)
+            # a job may continue a run of another queue
+            if owner is not None and permissions.is_visible(owner) and not is_replaced:
+                results, progress = reconciler.calls.call(partial(_results, run))
     except (StoreSilent, OSError) as error:
         problem = str(error)
     with reconciler.database.session() as session:
@@ -155,7 +163,7 @@ def job_detail(request: Request, reference: str) -> Any:
         definition = named_definition(session, job.definition)
         with reading(job):
             attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
-            gang = job.gang
+            gang, reason = job.gang, reconciler.admission.reason(job)
             detail = {
                 "id": job.id,
                 "name": job.name,
@@ -164,12 +172,16 @@ def job_detail(request: Request, reference: str) -> Any:
                 "runIsReplaced": is_replaced,
                 "kind": job_list.kind_of(gang.spec),
                 "status": job.status,
-                "statusReason": reconciler.admission.reason(job) or job.status_reason,
+                "statusReason": reason.words or None,
+                "awsCode": reason.code or None,
                 "queue": job.queue,
                 "share": job.share,
                 "createdAt": job.created_at,
                 "startedAt": job.started_at,
                 "stoppedAt": job.stopped_at,
+                **job_list.ran(job.run_time),
+                "phase": _phase(attempts, gang.main) if job.status == Status.RUNNING else None,
+                "children": job_list.children_of(reconciler, session, job) if job.kind == "array" else None,
                 "nodes": len(gang.nodes),
                 "attempts": attempts,
                 "attemptsAllowed": job.attempts_allowed,
@@ -182,6 +194,12 @@ def job_detail(request: Request, reference: str) -> Any:
                 "storeProblem": problem,
             }
     return permissions.shown(detail)
+
+
+def _phase(attempts: Sequence[dict[str, Any]], main: int) -> Phase | None:
+    """The phase of the training that runs; None where its main node has not reported one."""
+    nodes = attempts[-1]["nodes"] if attempts else []
+    return next((phase_in(node["progress"]) for node in nodes if node["index"] == main), None)
 
 
 def _results(run: Run) -> tuple[runs.StoredRun | None, dict[str, Any] | None]:
@@ -289,9 +307,10 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
         "epoch": attempt.epoch,
         "startedAt": attempt.started_at,
         "stoppedAt": attempt.stopped_at,
+        **job_list.ran(attempt.run_time),
         "ending": attempt.ending,
         "exitCode": attempt.exit_code,
-        "statusReason": attempt.status_reason,
+        "statusReason": attempt.status_reason and attempt.in_own_words(attempt.status_reason),
         "fault": attempt.fault,
         "spent": attempt.spent,
         "computeEnvironment": attempt.compute_environment,

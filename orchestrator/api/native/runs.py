@@ -337,7 +337,7 @@ def _check_progress(session: Session, run: FoundRun, after: Spec, chosen: Checkp
     if chosen.iteration >= after.train.iterations and not owing:
         raise ClientError(
             f"run {run.name} is complete at iteration {chosen.iteration} of {after.train.iterations}; "
-            f"to continue: --set train.iterations={chosen.iteration * 2}",
+            f"to train it further: muster resume {run.name} --set train.iterations={chosen.iteration * 2} -f",
             CONFLICT,
         )
 

@@ -60,13 +60,14 @@ def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch,
     impossible = batch.submit(gang)
     pending = batch.submit(plain, queue="q-low", dependsOn=[{"jobId": head}])
     needs = "needs 1 node with 0.5 CPUs, 0 GPUs, 64 MiB in all"
-    free = f"{NO_ROOM} - {needs}; compute environment q-one-cpu may use 0 CPUs"
-    assert batch.reason(head, NO_ROOM) == f"{free} more at this time until job q-holds ({first[:8]}) ends"
+    waits = f"{NO_ROOM} - waits for job q-holds ({first[:8]}) to end"
+    limit = "compute environment q-one-cpu may use 0 CPUs more at this time"
+    assert batch.reason(head, NO_ROOM) == f"{waits}: {limit}; {needs}"
     behind = f"2nd in queue q-low, behind job q-plain ({head[:8]}), which {needs}"
     assert batch.reason(second, "2nd") == behind
     assert batch.reason(too_wide, "MISCONFIGURATION") == (
-        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 1 node with 2 CPUs, 0 GPUs, 64 MiB in all; "
-        "compute environment q-one-cpu has at most 1 CPU"
+        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - compute environment q-one-cpu has at most 1 CPU; "
+        "needs 1 node with 2 CPUs, 0 GPUs, 64 MiB in all"
     )
     said = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
     assert "the largest host has 8 CPUs, " in said
@@ -185,7 +186,7 @@ case $AWS_BATCH_JOB_ATTEMPT in 1) {UNTIL.format("never")};; 2) [ $AWS_BATCH_JOB_
     [attempt] = waiting["attempts"]
     assert attempt["statusReason"] == f"preempted by job q-urgent ({high[:8]})"
     assert attempt["container"]["exitCode"] == 75
-    assert batch.reason(low, NO_ROOM).endswith(f"until job q-urgent ({high[:8]}) ends")
+    assert f"waits for job q-urgent ({high[:8]}) to end: " in batch.reason(low, NO_ROOM)
     assert batch.front("q-low") == [low]
     gate(tmp_path, "go")
     assert batch.wait(high)["status"] == "SUCCEEDED"

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import pytest
 from rich.table import Table
 
 from orchestrator.cli.show import _gpus
-from orchestrator.cli.terminal import print_cut
+from orchestrator.cli.terminal import print_cut, print_rows, print_wrapped
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.definitions import container, single
 from tests.support.orchestrator.jobs import FOREVER, refusal
@@ -191,6 +192,22 @@ def test_for_another_program_long_reasons_are_whole_and_no_column_is_lost(capsys
     assert row.split()[:3] == ["0123abcd", "a-job", "FAILED"] and row.count("story") == 120
 
 
+@pytest.mark.parametrize("printing", [print_cut, print_wrapped, print_rows])
+def test_for_another_program_a_long_row_of_any_table_pads_no_other(
+    printing: Callable[[Table], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    printing(table(("0123abcd", "a-job", "FAILED", "a long story " * 2000), ("4567abcd", "b", "RUNNABLE", "")))
+    header, long, short = capsys.readouterr().out.splitlines()
+    assert header.split() == ["JOB", "NAME", "STATUS", "REASON"] and long.count("story") == 2000
+    assert short == "4567abcd  b      RUNNABLE" and not any(each.endswith(" ") for each in (header, long, short))
+
+
+def test_no_table_that_is_read_by_another_program_ends_in_spaces(shared_server: Serving) -> None:
+    for command in (["list"], ["queues"], ["queues", "default"], ["tracks", "list"], ["league", "list"]):
+        done = shared_server.muster(*command)
+        assert done.returncode == 0 and not [each for each in done.stdout.splitlines() if each.endswith(" ")], command
+
+
 def test_an_empty_selection_of_a_log_says_so(shared_server: Serving) -> None:
     job = shared_server.gang("print('here')", name="brief")
     shared_server.wait(job)
@@ -220,6 +237,26 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
         assert f"{array}:2" in shared_server.muster("show", reference).stdout
     for missing in ("many:3", "many:x", "nosuch:0", f"{array[:8]}:1:1"):
         refused(["show", missing], shared_server.home, 2, f"job {missing} does not exist")
+
+
+def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(shared_server: Serving) -> None:
+    client = shared_server.client
+    fails = ["sh", "-c", "exit $((AWS_BATCH_JOB_ARRAY_INDEX % 2 * AWS_BATCH_JOB_ARRAY_INDEX))"]
+    client.batch("RegisterJobDefinition", **single("odd", container(command=fails)))
+    job = {"jobName": "odd", "jobQueue": "default", "jobDefinition": "odd", "arrayProperties": {"size": 9}}
+    array = client.batch("SubmitJob", **job)["jobId"]
+    found = shared_server.wait(array)
+    why = [f"{index} (main node: rank 0 exited with code {index})" for index in (1, 3, 5)]
+    reason = f"4 of 9 array jobs failed: {', '.join(why)}, 1 more"
+    assert (found["status"], found["statusReason"]) == ("FAILED", reason)
+    assert client.batch("DescribeJobs", jobs=[array])["jobs"][0]["statusReason"] == reason
+    states = [(each["index"], each["status"]) for each in found["children"]]
+    assert states == [*((i, "FAILED") for i in (1, 3, 5, 7)), *((i, "SUCCEEDED") for i in (0, 2, 4, 6, 8))]
+    assert all(each["ranSeconds"] >= 0 for each in found["children"])
+    lines = shared_server.muster("show", array).stdout.splitlines()
+    listed = [line.split(maxsplit=3) for line in lines if line.split()[1:2] in (["FAILED"], ["SUCCEEDED"])]
+    assert [int(each[0]) for each in listed] == [1, 3, 5, 7, 0, 2, 4, 6, 8]
+    assert listed[3][3] == "main node: rank 0 exited with code 7" and listed[0][2].startswith("0:00:0")
 
 
 def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -> None:
@@ -257,10 +294,51 @@ def test_who_follows_a_command_that_waits_is_told_why(server: Serving) -> None:
     for each in following:
         assert each.stderr is not None
         line = each.stderr.readline()
-        assert line.startswith("all-reduce (") and f" free until job test ({full[:8]}) ends" in line, line
+        assert line.startswith("all-reduce (") and f": waits for job test ({full[:8]}) to end: " in line, line
     server.client.batch("TerminateJob", jobId=full, reason="enough")
     for each in following:
         assert each.communicate(timeout=60 * PATIENCE)[1].count("RUNNABLE") == 0 and each.returncode == 0
+
+
+def test_who_follows_a_log_is_told_again_when_the_reason_changes(server: Serving, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    script = f"import os, signal, time\nsignal.signal(15, signal.SIG_IGN)\nwhile not os.path.exists({str(gate)!r}): time.sleep(0.05)"
+    server.wait(full := server.gang(script, cpus="4"), "RUNNING")
+    waiting = server.gang("print('at last')", cpus="4", name="next")
+    wait_for(lambda: "waits for job" in server.detail(waiting)["statusReason"], 30, "its reason")
+    command = [MUSTER, "logs", "next", "-f"]
+    env = {**os.environ, "MUSTER_HOME": str(server.home)}
+    followed = subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert followed.stderr is not None
+    assert f": waits for job test ({full[:8]}) to end: 4 of 4 CPUs short" in followed.stderr.readline()
+    server.client.batch("TerminateJob", jobId=full, reason="enough")
+    assert f": waits for job test ({full[:8]}) to stop: 4 of 4 CPUs short" in followed.stderr.readline()
+    gate.touch()
+    assert "at last" in followed.communicate(timeout=60 * PATIENCE)[0] and followed.returncode == 0
+
+
+RESUMED = """name: twice
+resources: {cpus: 0.1, memory: 64MiB}
+command: [sh, -c, 'test -e "$GATE" || exit 3; echo through']
+environment: {GATE: "%s"}
+retry: {attempts: 1}
+"""
+
+
+def test_resume_is_the_controller_itself_where_none_is_running(tmp_path: Path) -> None:
+    gate, spec, home = tmp_path / "gate", tmp_path / "job.yaml", tmp_path / "home"
+    spec.write_text(RESUMED % gate)
+    ran = call_muster("run", str(spec), home=home)
+    assert ran.returncode == 1 and "exited with code 3" in ran.stdout, ran.stdout + ran.stderr
+    [run] = [each.name for each in (home / "store" / "runs").iterdir()]
+    again = call_muster("resume", run, home=home)
+    assert again.returncode == 1 and f"resumed {run} as job " in again.stdout and "follow it with" not in again.stdout
+    assert "this command is the controller until the job ends" in again.stderr
+    gate.touch()
+    through = call_muster("resume", run, "--set", "name=thrice", home=home)
+    assert through.returncode == 0 and "through" in through.stdout and "SUCCEEDED  thrice (" in through.stdout
+    assert not (home / "controller.json").exists() and len(list((home / "store" / "runs").iterdir())) == 1
+    refused(["resume", "nosuch"], home, 2, "run nosuch does not exist in")
 
 
 @pytest.mark.parametrize(

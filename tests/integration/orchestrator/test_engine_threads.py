@@ -284,8 +284,9 @@ def test_an_engine_that_hangs_at_the_start_keeps_its_own_jobs_waiting_alone(clie
     waiting = submit_gang(client, "pass", queue="fake")
     await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
     silent = "the fake engine has not answered "  # yet, and later since when
-    said = f"CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 0.1 CPUs, 0 GPUs, 64 MiB in all; {silent}"
-    wait_for(lambda: detail(client, waiting)["statusReason"].startswith(said), 20, "the reason")
+    wait_for(lambda: detail(client, waiting)["statusReason"].startswith(silent), 20, "the reason")
+    assert detail(client, waiting)["statusReason"].endswith("; needs 1 node with 0.1 CPUs, 0 GPUs, 64 MiB in all")
+    assert detail(client, waiting)["awsCode"] == "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
     engines = {each["name"]: each for each in client.get("/api/queues")["engines"]}
     assert engines["local"]["problem"] is None and engines["local"]["toldAt"] is not None
     assert engines["fake"]["problem"].startswith(silent) and engines["fake"]["toldAt"] is None

@@ -16,6 +16,8 @@ import pytest
 
 from orchestrator.api.batch import rules
 from orchestrator.api.native import continuing
+from orchestrator.console.job_facts import facts_of
+from orchestrator.console.jobs import _row as jobs_page_row
 from orchestrator.domain import attempt
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.api import EngineError
@@ -23,7 +25,10 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
+from shared_store.layout import Store
+from shared_store.log_windows import Chosen, first_error
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
+from tests.support.definitions import container, single
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.processes import processes_of
 
@@ -63,7 +68,43 @@ def test_the_same_fault_twice_is_not_tried_a_third_time(shared_server: Serving) 
 def test_a_job_of_the_batch_api_is_tried_as_often_as_it_says_whatever_its_fault(shared_server: Serving) -> None:
     found = shared_server.wait(shared_server.gang(FAULTY, attempts=3))
     assert found["status"] == "FAILED" and [each["fault"] for each in found["attempts"]] == [None] * 3
-    assert found["statusReason"] == "Essential container in task exited"
+    words = "main node: rank 0 exited with code 1: ValueError: 3"
+    assert found["statusReason"] == found["attempts"][-1]["statusReason"] == words
+    assert found["awsCode"] == "Essential container in task exited"
+
+
+def test_a_program_that_is_missing_is_the_reason_everywhere_but_in_the_batch_api(shared_server: Serving) -> None:
+    client = shared_server.client
+    client.batch("RegisterJobDefinition", **single("lost", container(command=["no-such-program"])))
+    job = client.batch("SubmitJob", jobName="lost", jobQueue="default", jobDefinition="lost")["jobId"]
+    found = shared_server.wait(job)
+    own = "can't start 'no-such-program': No such file or directory; is it installed, and is the path right?"
+    assert found["statusReason"] == found["attempts"][0]["statusReason"] == f"main node: {own}"
+    assert found["attempts"][0]["nodes"][0]["exitCode"] == 127
+    shown = " ".join(shared_server.muster("show", job).stdout.split())
+    assert f"why: main node: {own} in AWS's API: Essential container in task exited" in shown
+    assert f"main node: {own}" in shared_server.muster("list").stdout
+    [described] = client.batch("DescribeJobs", jobs=[job])["jobs"]
+    assert described["statusReason"] == "Essential container in task exited"
+    assert described["attempts"][0]["statusReason"] == "Essential container in task exited"
+    run = Store(shared_server.home / "store").run(found["run"])
+    assert [each.text for each in first_error(Chosen(run, job), {}).lines] == [own]
+
+
+def test_a_job_has_run_as_long_as_all_its_attempts_together_wherever_it_is_asked(shared_server: Serving) -> None:
+    job = shared_server.gang("import time; time.sleep(1.2); exit(3)", attempts=3, name="thrice")
+    found = shared_server.wait(job)
+    spans = [each["stoppedAt"] - each["startedAt"] for each in found["attempts"]]
+    assert len(spans) == 3 and found["ranSeconds"] == sum(spans) / 1000 >= 3.6 and found["runsSince"] is None
+    (row,) = shared_server.client.get("/api/jobs", search=job)["jobs"]
+    assert row["ranSeconds"] == found["ranSeconds"]
+    seconds = int(found["ranSeconds"])
+    shown = shared_server.muster("show", job).stdout
+    assert f"took:         0:00:{seconds:02}\n" in shown
+    (line,) = [each for each in shared_server.muster("list").stdout.splitlines() if each.startswith(job[:8])]
+    assert f" 0:00:{seconds:02} " in line
+    rows = [facts_of({**found, "spec": None})["took"], jobs_page_row(row)["took"]]
+    assert rows == [f"{seconds} s"] * 2
 
 
 def test_two_faults_in_a_row_and_a_failure_without_one_are_tried_again(shared_server: Serving) -> None:

@@ -107,7 +107,7 @@ def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment
     train = {"task": "Cartpole", "worlds": 6, "iterations": 2}
     document = {"name": "fits", "nodes": 3, "resources": {"cpus": 0.4, "memory": 16}, "train": train}
     refusals = {
-        "small": "needs 3 nodes with 1.2 CPUs, 0 GPUs, 48 MiB in all; compute environment small has at most 1 CPU",
+        "small": "compute environment small has at most 1 CPU; needs 3 nodes with 1.2 CPUs, 0 GPUs, 48 MiB in all",
         "elsewhere": "the largest host has nothing: there is no host",
         "nowhere": "there is no queue 'nowhere'; there is default, elsewhere",
     }

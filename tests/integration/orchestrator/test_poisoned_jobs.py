@@ -87,7 +87,7 @@ class FakeController(Generic[E]):
 
         def reason() -> str:
             found = self.job(name)
-            return self.reconciler.admission.reason(found) or found.status_reason or ""
+            return self.reconciler.admission.reason(found).words
 
         wait_for(lambda: said in reason(), 30, f"{name} says {said!r}")
 

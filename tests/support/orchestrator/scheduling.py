@@ -129,7 +129,8 @@ class Pass:
         return " ".join(_short(each) for each in self.decisions.report.order(queue))
 
     def reason(self, name: str) -> str:
-        return self.decisions.report.reason(f"{name}-0123456789")
+        """In the AWS Batch API."""
+        return self.decisions.report.reason(f"{name}-0123456789").aws
 
 
 def leads(name: str, reason: str, seconds: int, queue: str = "default") -> dict[str, Leading]:

@@ -200,7 +200,7 @@ class Simulation:
         assert self._reconciler is not None
         query = "SELECT id, name, status, status_reason FROM jobs WHERE status = 'RUNNABLE'"
         rows = [Job(id=row[0], name=row[1], status=row[2], status_reason=row[3]) for row in self.memory.execute(query)]
-        return [(job.name, self._reconciler.admission.reason(job) or job.status_reason or "") for job in rows]
+        return [(job.name, self._reconciler.admission.reason(job).aws) for job in rows]
 
     # -- the bus ------------------------------------------------------------------------------------------------------
 

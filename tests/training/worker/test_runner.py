@@ -18,6 +18,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
+from shared_store.phases import Phase
 from tests.support.refusals import refusal
 from tests.support.worker.declared import Sliders
 from tests.support.worker.in_process import call_worker
@@ -355,3 +356,31 @@ def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytes
         export(run, checkpoint, started.task)
     assert json.loads((target / "manifest.json").read_text()) == facts, "what was published stays"
     assert [path.name for path in run.exports.iterdir()] == [checkpoint.name]
+
+
+def test_a_training_reports_its_phases_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    monkeypatch.setenv("MUSTER_PROGRESS_FD", str(write))
+    monkeypatch.delenv("WARP_CACHE_PATH", raising=False)
+    monkeypatch.setenv("MUSTER_PICTURE", "0")  # its worlds have no shapes
+    train(training(tmp_path, run="run", iterations=2))
+    os.close(write)
+    with os.fdopen(read) as messages:
+        told = [json.loads(line) for line in messages]
+    phases = [Phase(each["phase"]) if "phase" in each else each.get("iteration") for each in told]
+    phases = [each for each in phases if each is not None]
+    at_the_end = [Phase.SAVING, Phase.EVALUATING, Phase.WRITING]
+    assert phases == [Phase.BUILDING, Phase.TRAINING, 1, 2, *at_the_end]
+
+
+def test_a_cache_without_the_task_s_kernels_is_told_as_their_compilation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, write = os.pipe()
+    monkeypatch.setenv("MUSTER_PROGRESS_FD", str(write))
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
+    runner(training(tmp_path, run="cold", iterations=1)).close()
+    runner(training(tmp_path, run="warm", iterations=1)).close()
+    os.close(write)
+    with os.fdopen(read) as messages:
+        assert [json.loads(line).get("phase") for line in messages] == [Phase.COMPILING, Phase.BUILDING]

@@ -264,6 +264,14 @@ def test_the_first_error_of_each_node_is_found_and_words_like_it_are_not(tmp_pat
     write(run, 1, 0, [(1, 0, plain), (2, 0, "Traceback (most recent call last):"), (3, 0, "ValueError: later")])
     write(run, 1, 1, [(1, 1, "torch.OutOfMemoryError: CUDA out of memory")])
     write(run, 1, 2, [(1, 2, plain)])
+    write(run, 1, 3, [(1, 3, "can't start 'python': No such file or directory; is it installed?")])
+    write(run, 1, 4, [(1, 4, "sh: 1: python: not found")])
+    write(
+        run,
+        1,
+        5,
+        [(1, 5, "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. It was not found in time")],
+    )
     found = first_error(Chosen(run, JOB), {})
-    assert [line.node for line in found.lines] == [0, 1] and found.is_over
+    assert [line.node for line in found.lines] == [0, 1, 3, 4] and found.is_over
     assert found.lines[0].text.startswith("Traceback")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.cli.jobs import lost_iterations, slow_iteration
+from orchestrator.cli.jobs import lost_iterations, next_step, slow_iteration
 
 
 def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[str, Any]:
@@ -22,3 +22,16 @@ def test_iterations_that_no_checkpoint_has_are_lost_and_a_long_one_is_told_befor
     assert slow_iteration(training(7, 7, seconds=40.0, status="RUNNABLE")) == ""
     told = slow_iteration(training(7, 7, seconds=40.0))
     assert told.startswith("an iteration takes about 40 s; ") and "muster checkpoint ant, then stop" in told
+
+
+def test_a_job_that_is_over_says_what_can_follow() -> None:
+    facts: dict[str, Any] = {"run": "ant-1", "spec": {"train": {"iterations": 300}}, "results": {"checkpoint": "c"}}
+    assert next_step(training(300, 300, status="SUCCEEDED", **facts)) == (
+        "; to train it further: muster resume ant-1 --set train.iterations=600 -f"
+    )
+    assert next_step(training(7, 7, status="FAILED", **facts)) == "; continue with: muster resume ant-1"
+    assert next_step(training(0, 0, status="FAILED", **{**facts, "results": {}})) == ""
+    assert next_step({"kind": "command", "status": "FAILED", "run": "c-1", "results": None}) == (
+        "; continue with: muster resume c-1"
+    )
+    assert next_step({"kind": "command", "status": "SUCCEEDED", "run": "c-1", "results": None}) == ""

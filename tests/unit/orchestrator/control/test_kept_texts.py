@@ -17,7 +17,8 @@ from orchestrator.control.kept_texts import DAYS, KeptTexts, TextRefused
 from orchestrator.domain.errors import Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.persistence import models
-from orchestrator.persistence.models import Job, JobDefinition, KeptText
+from orchestrator.persistence.models import Job, JobDefinition
+from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.session import Database
 from shared_store.layout import Store
 from shared_store.texts import LARGEST, digest_of

@@ -7,7 +7,17 @@ import itertools
 import pytest
 
 from orchestrator.domain.attempt import Phase
-from orchestrator.domain.job import TRANSITIONS, Ending, NodeEnd, Status, check_transition, container_reason, judge
+from orchestrator.domain.job import (
+    AWS_ENDINGS,
+    TRANSITIONS,
+    Ending,
+    NodeEnd,
+    RunTime,
+    Status,
+    check_transition,
+    container_reason,
+    judge,
+)
 
 S = Status
 LEGAL = {
@@ -47,6 +57,27 @@ def test_an_ended_job_stays_ended_and_every_other_one_can_end() -> None:
 def test_databases_of_older_controllers_hold_these_words() -> None:
     assert [each.value for each in Status] == [each.name for each in Status]
     assert [each.value for each in (*Ending, *Phase)] == [each.name.lower() for each in (*Ending, *Phase)]
+
+
+@pytest.mark.parametrize(
+    ("attempts", "seconds", "since"),
+    [
+        ([(10_000, 13_000), (20_000, 24_500), (None, None)], 7.5, None),
+        ([(10_000, 13_000), (90_000, None)], 13.0, 87_000),
+        ([(110_000, None)], 0.0, 100_000),  # a clock that was put back
+    ],
+)
+def test_a_job_has_run_as_long_as_its_attempts_together(
+    attempts: list[tuple[int | None, int | None]], seconds: float, since: int | None
+) -> None:
+    assert RunTime.of(attempts, 100_000) == RunTime(seconds, since)
+    assert RunTime.of([(None, None)], 100_000) is None and RunTime.of([], 100_000) is None
+
+
+def test_aws_s_words_for_an_end_are_found_within_other_words_and_others_are_not() -> None:
+    for words in ("Essential container in task exited", "Host EC2 (instance local/a-1) terminated."):
+        assert AWS_ENDINGS.sub("X", f"attempt 1 failed ({words}); trying again") == "attempt 1 failed (X); trying again"
+    assert AWS_ENDINGS.search("Job attempt duration exceeded timeout") is None
 
 
 RUNS, DONE, FAILED, LEFT = None, 0, 1, 75

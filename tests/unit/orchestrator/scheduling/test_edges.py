@@ -64,7 +64,7 @@ def test_a_gang_is_preempted_once_for_two_heads() -> None:
         [host("a"), host("b")], [job("x", 3, queue="p"), job("y", 3, queue="q")], [both], queues, environments
     )
     assert decided.preempted == "both"
-    assert decided.reason("y").endswith("free until job both (both-012), preempted for it, has stopped")
+    assert decided.reason("y").startswith(f"{CAPACITY} - waits for job both (both-012), preempted for it, to stop: ")
 
 
 def test_long_jobs_together_leave_the_head_the_cpus_of_its_compute_environment() -> None:
@@ -82,7 +82,7 @@ def test_an_idle_queue_s_answer_has_a_place_or_a_problem() -> None:
     placed = fit(gang(node(2)), asked, both, [host()])
     assert placed == Fit(Allocation("a - b", (on("a", 2, memory=100),)), None)
     assert fit(gang(node(3)), asked, both, [host()]) == Fit(
-        None, "needs 1 node with 3 CPUs, 0 GPUs, 100 MiB in all; compute environment a - b has at most 2 CPUs"
+        None, "compute environment a - b has at most 2 CPUs; needs 1 node with 3 CPUs, 0 GPUs, 100 MiB in all"
     )
 
 

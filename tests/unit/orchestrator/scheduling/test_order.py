@@ -49,8 +49,8 @@ def test_a_gang_starts_whole_or_not_at_all() -> None:
     decided = Pass([host(cpus=8)], [job("ant", gang(*[node()] * 4))], [running("cart", on("a", 5, memory=10))])
     assert decided.starts == ()
     assert decided.reason("ant") == (
-        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 4 nodes with 4 CPUs, 0 GPUs, 400 MiB in all; "
-        "3 CPUs, 0 GPUs, 7.99 GiB free until job cart (cart-012) ends"
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - waits for job cart (cart-012) to end: 1 of 4 CPUs short; "
+        "needs 4 nodes with 4 CPUs, 0 GPUs, 400 MiB in all; 3 CPUs, 0 GPUs, 7.99 GiB free"
     )
 
 
@@ -59,7 +59,8 @@ def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
     assert Pass([host(cpus=8)], waiting).started == "ant:a+a+a+a"
     assert Pass([host(cpus=8)], waiting, [running("x", on("a", 5))]).started == "ant:a+a+a"
     assert Pass([host(cpus=8)], waiting, [running("x", on("a", 7))]).reason("ant") == (
-        f"{CAPACITY} - {needs(2, nodes=2, least='at least ')}; 1 CPU, 0 GPUs, 8 GiB free until job x (x-012345) ends"
+        f"{CAPACITY} - waits for job x (x-012345) to end: 1 of 2 CPUs short; {needs(2, nodes=2, least='at least ')}; "
+        "1 CPU, 0 GPUs, 8 GiB free"
     )
     limited = Pass([host(cpus=16)], [job("ant", gang(*[node(2)] * 4, minimum=1))], (), (), [environment(max_cpus=5)])
     assert limited.started == "ant:a+a", "to the limit of its compute environment"
@@ -165,7 +166,7 @@ def test_a_compute_environment_uses_no_more_cpus_than_it_may() -> None:
     decided = Pass([host("a", 8), host("b", 8)], line(job("x", 2), job("y", 2)), held, (), environments)
     assert decided.started == "x:a"
     assert decided.reason("y") == (
-        f"{CAPACITY} - {needs(2)}; compute environment all may use 1 CPU more at this time until job cart (cart-012) ends"
+        f"{CAPACITY} - waits for job cart (cart-012) to end: compute environment all may use 1 CPU more at this time; {needs(2)}"
     )
 
 
@@ -181,7 +182,7 @@ def test_one_machine_that_two_engines_have_is_not_given_out_twice() -> None:
         assert decided.started == "a:docker/here" and "free" in decided.reason("b")
         held = [running("a", Placement("docker/here", gpus, cpus, 100), environment="docker")]
         decided = Pass([one, two], both[1:], held, queues, environments)
-        assert decided.started == "" and "until job a (a-012345) ends" in decided.reason("b")
+        assert decided.started == "" and "waits for job a (a-012345) to end: " in decided.reason("b")
     # what a head of one engine waits for is kept by the other too, but for what it leaves
     held = [running("a", on("localhost", 2), environment="local", timeout=200)]
     waiting = line(job("head", 3, queue="docker"), job("late", queue="local"), job("b", queue="local"))

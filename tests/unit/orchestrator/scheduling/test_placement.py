@@ -13,7 +13,19 @@ from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
 from orchestrator.scheduling.fit import fit
 from orchestrator.scheduling.placement import never_fits, place
-from tests.support.orchestrator.scheduling import Pass, environment, gang, host, job, node, on, queue, running, seats
+from tests.support.orchestrator.scheduling import (
+    Pass,
+    environment,
+    gang,
+    host,
+    job,
+    needs,
+    node,
+    on,
+    queue,
+    running,
+    seats,
+)
 
 
 def where(shape: Shape, *hosts: Host) -> str | None:
@@ -129,7 +141,7 @@ def test_what_the_queue_of_an_engine_gives_at_most_is_named_in_place_of_hosts() 
     assert never_fits(gang(node(5)), limited) == f"each node needs 5 CPUs, 0 GPUs, 100 MiB; {most}"
     assert never_fits(gang(*[node(3)] * 2), limited) == f"needs 2 nodes with 6 CPUs, 0 GPUs, 200 MiB in all; {most}"
     waits = Pass(limited, [job("ant", 2)], [running("cart", on("slurm/main", 3))]).reason("ant")
-    assert waits.endswith(f"; {most} until job cart (cart-012) ends")
+    assert waits.endswith(f" - waits for job cart (cart-012) to end: {most}; {needs(2)}")
 
 
 def test_hosts_that_are_away_are_taken_only_where_the_gang_needs_them() -> None:

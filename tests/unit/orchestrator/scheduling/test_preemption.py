@@ -19,6 +19,7 @@ from tests.support.orchestrator.scheduling import (
     job,
     leads,
     line,
+    needs,
     node,
     on,
     queue,
@@ -39,7 +40,7 @@ def test_a_job_of_a_higher_queue_preempts_also_for_the_cpus_that_may_be_used_and
     decided = Pass([host()], [job("ant", 3, queue="high"), job("small", 2, queue="low", timeout=60)], [cart()], HIGH)
     assert decided.preempts == (Preempt("cart-0123456789", "ant-0123456789"),)
     assert decided.starts == ()
-    assert decided.reason("ant").endswith("free until job cart (cart-012), preempted for it, has stopped")
+    assert decided.reason("ant").startswith(f"{CAPACITY} - waits for job cart (cart-012), preempted for it, to stop: ")
     assert decided.reason("small").startswith(f"{CAPACITY} - 1st in queue low, behind")
     decided = Pass([host(cpus=64)], [job("ant", 3, queue="high")], [cart(2)], HIGH, [environment(max_cpus=4)])
     assert decided.preempted == "cart"
@@ -99,7 +100,9 @@ def test_no_more_are_preempted_than_needed_and_none_while_some_stop() -> None:
     assert Pass([host()], [job("ant", 2, queue="high")], held, HIGH).preempted == ""
     decided = Pass([host()], [job("ant", 3, queue="high")], held, HIGH)
     assert decided.preempted == "second"
-    assert decided.reason("ant").endswith(" until job second (second-0), preempted for it, has stopped")
+    assert decided.reason("ant").startswith(
+        f"{CAPACITY} - waits for job second (second-0), preempted for it, to stop: "
+    )
     report = decided.decisions.report
     assert [report.preempts(each.job) for each in held] == [False, True]
 
@@ -158,7 +161,7 @@ def test_only_the_first_that_does_not_start_is_cancelled_and_the_next_takes_its_
     held, leading = [running("cart", on("a", 2), timeout=700)], leads("stuck", CAPACITY, 601)
     decided = Pass([host()], waiting, held, [queue(limits=LIMITED)], leading=leading)
     assert (decided.started, decided.cancelled, decided.waits()) == ("runs:a", "stuck", "next small")
-    assert decided.reason("next").startswith(f"{CAPACITY} - needs 1 node with 4 CPUs")
+    assert f"3 of 4 CPUs short; {needs(4)}; " in decided.reason("next")
     assert decided.reason("small").startswith("2nd in queue default, behind job next (next-012)")
 
 

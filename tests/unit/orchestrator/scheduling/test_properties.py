@@ -76,13 +76,13 @@ def check_pass(snapshot: Snapshot, decisions: Decisions) -> None:
     waits = [job for queue in snapshot.queues for job in decisions.report.order(queue)]
     assert sorted(waits) == sorted(by_id.keys() - gone)
     for job_id in waits:
-        reason = decisions.report.reason(job_id)
+        reason = decisions.report.reason(job_id).aws
         assert 20 < len(reason) < 1024 and "\n" not in reason
     by_job = {gang.job: gang for gang in snapshot.running}
     for preempt in decisions.preempts:
         assert by_job[preempt.job].preemptible and not by_job[preempt.job].ending
         assert preempt.by in waits
-        assert decisions.report.reason(preempt.by).startswith("CAPACITY:")
+        assert decisions.report.reason(preempt.by).aws.startswith("CAPACITY:")
     assert len({preempt.job for preempt in decisions.preempts}) == len(decisions.preempts)
 
 
@@ -154,7 +154,7 @@ def test_jobs_that_pass_the_head_do_not_delay_it(
     decisions = decide(snapshot)
     check_pass(snapshot, decisions)
     report = decisions.report
-    heads = [by_id[job] for job in report.order("default") if report.reason(job).startswith("CAPACITY")]
+    heads = [by_id[job] for job in report.order("default") if report.reason(job).aws.startswith("CAPACITY")]
     if not heads:
         return
     reservation = heads[0]
@@ -187,7 +187,7 @@ def test_every_job_starts_no_later_than_was_promised_when_it_first_was_the_head(
             ends[start.job] = now + lengths[start.job]
             running.append(begun(left.pop(start.job), start.compute_environment, start.placements, now))
         for job in decisions.report.order("default"):
-            if decisions.report.reason(job).startswith("CAPACITY"):
+            if decisions.report.reason(job).aws.startswith("CAPACITY"):
                 promised.setdefault(job, earliest(left[job].shape, hosts, running, now))
         if not running:
             break
@@ -309,7 +309,7 @@ class Cluster(RuleBasedStateMachine):
         assert not self.running
         for name in self.waiting:
             assert self.decisions is not None
-            reason = self.decisions.report.reason(name)
+            reason = self.decisions.report.reason(name).aws
             assert reason.startswith("MISCONFIGURATION:") or "is kept for shares that are not active" in reason
 
     def requeue(self, name: str) -> None:

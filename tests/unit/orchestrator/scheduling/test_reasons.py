@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from orchestrator.domain.reasons import Reason
 from orchestrator.scheduling.decide import decide
 from orchestrator.scheduling.fit import fit
 from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue, Snapshot
@@ -53,14 +54,14 @@ def test_while_an_engine_has_not_told_its_hosts_its_jobs_wait_and_say_so() -> No
     waiting = line(job("ant", queue="silent"), job("cart", queue="both"), job("huge", 64, queue="both"))
     decided = Pass([host()], waiting, (), queues, [silent, there])
     assert decided.started == "cart:a", "in a compute environment that is known"
-    assert decided.reason("ant") == f"{CAPACITY} - {needs(1)}; the ray engine has not answered yet"
-    assert decided.reason("huge").endswith("the ray engine has not answered yet"), "it may have that much"
+    assert decided.reason("ant") == f"{CAPACITY} - the ray engine has not answered yet; {needs(1)}"
+    assert f"{CAPACITY} - {silent.unknown}; " in decided.reason("huge"), "it may have that much"
     waiting = line(job("large", 4, queue="both"), job("next", 3, queue="both"))
     cart = running("cart", on("a", 1), environment="there")
     assert "behind job large" in Pass([host()], waiting, [cart], queues, [silent, there]).reason("next")
     quiet = replace(environment("quiet", hosts=()), unknown="the slurm engine has not answered yet")
     waiting, queues[1] = [job("ant", queue="both")], queue("both", environments=("quiet", "silent"))
-    assert Pass([], waiting, (), queues, [silent, quiet]).reason("ant").endswith(quiet.unknown), "its first one"
+    assert f"- {quiet.unknown}; " in Pass([], waiting, (), queues, [silent, quiet]).reason("ant"), "its first one"
     queues[1] = queue("both", environments=("silent", "there"))
     asked = fit(gang(node(64)), queues[1], {"silent": silent, "there": there}, [host()])
     assert (asked.allocation, asked.problem) == (None, None), "it is not refused"
@@ -71,13 +72,14 @@ def test_the_reasons_of_all_refusing_compute_environments_are_reported_and_nobod
     decided = Pass([host()], line(job("big", gang(node(2), node(2))), job("small")), (), queues, small)
     assert decided.started == "small:a"
     assert decided.reason("big") == (
-        f"{MAXIMUM} - {needs(4, nodes=2)}; "
-        "compute environment p has at most 3 CPUs; compute environment q has at most 2.5 CPUs"
+        f"{MAXIMUM} - compute environment p has at most 3 CPUs; compute environment q has at most 2.5 CPUs; "
+        f"{needs(4, nodes=2)}"
     )
     either = [environment("p", max_cpus=1), environment("q", ("b",))]
     assert Pass([host(), host("b", 1)], [job("x", 2)], (), queues, either).reason("x") == (
-        f"{REQUIREMENT} - {needs(2)}; compute environment p has at most 1 CPU; "
-        "compute environment q: each node needs 2 CPUs, 0 GPUs, 100 MiB; the largest host has 1 CPU, 0 GPUs, 8 GiB"
+        f"{REQUIREMENT} - compute environment p has at most 1 CPU; "
+        "compute environment q: each node needs 2 CPUs, 0 GPUs, 100 MiB; the largest host has 1 CPU, 0 GPUs, 8 GiB; "
+        f"{needs(2)}"
     )
 
 
@@ -96,6 +98,20 @@ def test_a_queue_without_a_usable_compute_environment_says_so(
     decided = Pass([host()], [job("x")], (), queues, environments)
     assert decided.starts == () and decided.waits() == "x"
     assert decided.reason("x") == "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
+
+
+def test_the_words_begin_with_what_matters_and_aws_s_code_is_apart() -> None:
+    short = gang(*[node(1, 1, 4096)] * 2)
+    held = [running("cart", on("a", 3, (0,), memory=4096))]
+    reason = Pass([host(cpus=4, gpus=2)], [job("ant", short)], held).decisions.report.reason("ant-0123456789")
+    assert reason.words == (
+        "waits for job cart (cart-012) to end: 1 of 2 CPUs, 1 of 2 GPUs, 4 GiB of 8 GiB short; "
+        "needs 2 nodes with 2 CPUs, 2 GPUs, 8 GiB in all; 1 CPU, 1 GPU, 4 GiB free"
+    )
+    assert (reason.aws, reason.code) == (f"{CAPACITY} - {reason.words}", CAPACITY)
+    nowhere = Pass([host()], [job("x")], (), [queue(environments=())]).decisions.report.reason("x-0123456789")
+    assert nowhere.words == "no compute environment of its queue is enabled" and nowhere.code == nowhere.aws
+    assert Reason.plain("starting 1 node").code == ""
 
 
 # -- the report -------------------------------------------------------------------------------------------------------
@@ -117,21 +133,20 @@ def test_the_board_lists_who_still_waits_and_numbers_them() -> None:
 def test_a_reason_says_that_room_is_in_pieces_and_names_the_last_gangs_that_it_waits_for() -> None:
     held = [running("x", on("a", 2)), running("y", on("b", 2)), running("z", on("b", 1)), running("v", on("a", 1))]
     assert Pass([host("a"), host("b")], [job("ant", 2)], held).reason("ant") == (
-        f"{CAPACITY} - {needs(2)}; "
-        "2 CPUs, 0 GPUs, 16 GiB free, but not in one piece for each node until job v (v-012345) ends"
+        f"{CAPACITY} - waits for job v (v-012345) to end: enough is free, but not in one piece for each node; {needs(2)}; "
+        "2 CPUs, 0 GPUs, 16 GiB free"
     )
     held = [running("x", on("a", 2), ending=True), running("y", on("a", 2), timeout=700)]
-    assert (
-        Pass([host()], [job("ant", 4)], held)
-        .reason("ant")
-        .endswith("free until jobs x (x-012345), y (y-012345) end, at the latest at 2027-01-15 08:10:00 UTC")
-    )
+    said = "waits for jobs x (x-012345), y (y-012345) to end, at the latest at 2027-01-15 08:10:00 UTC: 4 of 4 CPUs short; "
+    assert said in Pass([host()], [job("ant", 4)], held).reason("ant")
     late = [running("x", on("a", 2), timeout=50)]
-    assert Pass([host()], [job("ant", 4)], late).reason("ant").endswith("free until job x (x-012345) ends"), "overdue"
+    assert "for job x (x-012345) to end: 2 of 4 CPUs short" in Pass([host()], [job("ant", 4)], late).reason("ant"), (
+        "overdue"
+    )
     held = [running(f"r{i}", on("a", 1), timeout=100 + i) for i in range(1, 6)]
     assert Pass([host(cpus=5)], [job("ant", 5)], held).reason("ant") == (
-        f"{CAPACITY} - {needs(5)}; 0 CPUs, 0 GPUs, 8 GiB free until jobs r3 (r3-01234), r4 (r4-01234), "
-        "r5 (r5-01234) and 2 more end, at the latest at 2027-01-15 08:00:05 UTC"
+        f"{CAPACITY} - waits for jobs r3 (r3-01234), r4 (r4-01234), r5 (r5-01234) and 2 more to end, "
+        f"at the latest at 2027-01-15 08:00:05 UTC: 5 of 5 CPUs short; {needs(5)}; 0 CPUs, 0 GPUs, 8 GiB free"
     )
 
 
@@ -140,7 +155,7 @@ def test_a_reason_says_that_room_is_in_pieces_and_names_the_last_gangs_that_it_w
     [
         (4, 3.5, "compute environment all may use 0.5 CPUs more at this time"),
         (4, 6, "compute environment all may use 0 CPUs more at this time"),
-        (6, 2, "2 CPUs, 0 GPUs, 8 GiB free"),  # exactly the 4 CPUs that it needs: the host lacks them
+        (6, 2, "2 of 4 CPUs short"),  # exactly the 4 CPUs that it needs: the host lacks them
     ],
 )
 def test_a_reason_names_the_limit_of_the_compute_environment_where_that_is_what_lacks(
@@ -148,14 +163,14 @@ def test_a_reason_names_the_limit_of_the_compute_environment_where_that_is_what_
 ) -> None:
     hosts = [host(cpus=4 if most == 6 else 64)]
     waits = Pass(hosts, [job("ant", 4)], [running("cart", on("a", used))], (), [environment(max_cpus=most)])
-    assert waits.reason("ant") == f"{CAPACITY} - {needs(4)}; {says} until job cart (cart-012) ends"
+    assert waits.reason("ant").startswith(f"{CAPACITY} - waits for job cart (cart-012) to end: {says}; {needs(4)}")
 
 
 def test_a_time_is_of_the_wall_clock_whatever_the_pass_counts_from() -> None:
     held = [running("cart", on("a", 1), timeout=700)]
     snapshot = Snapshot(NOW, [host()], {"all": environment()}, {"default": queue()}, [job("ant", 4)], held, {})
     ahead = decide(replace(snapshot, drift=3_600_000)).report.reason("ant-0123456789")
-    assert ahead.endswith("at the latest at 2027-01-15 09:10:00 UTC")
+    assert "at the latest at 2027-01-15 09:10:00 UTC" in ahead.words
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ def test_a_reward_function_has_the_waypoints_of_the_line_which_do_not_wrap() -> 
     while not task.dones[0]:
         task.step(ahead(task))
         rewards.append(task.rewards[0].item())
-        nearest.append(task.sensors["race"].arrays.numbers.numpy()[0])
+        nearest.append(task.sensors["race"].arrays.numbers.numpy()[0].copy())
     assert rewards[0] == pytest.approx(80_003, abs=0.1) and rewards[-1] == pytest.approx(80_079.1, abs=0.02)
     before = NUMBER_COLUMNS["closest_objects"]
     after = before + 1

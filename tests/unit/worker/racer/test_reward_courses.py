@@ -98,7 +98,7 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
             assert params["track_width"] == pytest.approx(found.width[0], abs=0.03)
             assert params["is_offtrack"] == (name == "off-track")
             assert on_road(track, [[params["x"], params["y"]]])[0] == (name != "off-track"), name
-            np.testing.assert_array_equal(params["waypoints"], track.line())
+            np.testing.assert_array_equal(params["waypoints"], track.line()[:: -1 if back else 1])
             assert max(params["closest_waypoints"]) < len(params["waypoints"])
             places = np.array(params["objects_location"]).reshape(-1, 2)
             there = project(track, places)

@@ -17,7 +17,7 @@ from tests.support.worker.racing import round_the_guard
 from worker.racer.rewards import confined, guard, parameters, sandbox
 from worker.racer.rewards.guard import check_source, try_out
 from worker.racer.rewards.problems import RewardFailed
-from worker.racer.rewards.samples import oval
+from worker.racer.rewards.samples import OVAL, oval
 from worker.racer.rewards.workers import Workers
 
 MACHINE = os.uname().machine
@@ -46,7 +46,7 @@ def tried(body: str, head: str = HEAD, **options: bool) -> str:
     """The guard's answer about a function whose text it does not look at, as about one that gets round it."""
     lines = "".join(f"    {line}\n" for line in body.strip().split("\n"))
     source = round_the_guard(f"{head}def reward_function(params):\n{lines}    return 1.0\n")
-    return str(try_out(source, "r.py", **options) or "")
+    return str(try_out(source, "r.py", OVAL.trials()[0], **options) or "")
 
 
 def called(body: str, head: str = HEAD) -> str:

@@ -1,0 +1,77 @@
+"""The tables of what a controller is and keeps: its clock, store, account, texts and log groups. Jobs are in :mod:`.models`."""
+
+from __future__ import annotations
+
+from sqlalchemy import ForeignKey
+from sqlalchemy.orm import Mapped, mapped_column
+
+from orchestrator.persistence.models import Base, now
+
+
+class ClockState(Base):
+    """The one row of steady time (:mod:`orchestrator.control.clock`)."""
+
+    __tablename__ = "clock"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    boot: Mapped[str]
+    """Of the machine, as long as its monotonic clock counts on."""
+    offset: Mapped[int]
+    """Steady time less monotonic time [ms]."""
+    drift: Mapped[int]
+    """Wall-clock time less steady time [ms]."""
+
+
+class KnownStore(Base):
+    """The one row of the store that this database belongs to (:mod:`orchestrator.control.store_identity`)."""
+
+    __tablename__ = "store"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    identity: Mapped[str]
+    """As its ``store.json`` has it."""
+
+
+class KeptText(Base):
+    """A long text of jobs, which lies in the store (:mod:`orchestrator.control.kept_texts`)."""
+
+    __tablename__ = "kept_texts"
+    sha256: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str]
+    """The one who has uploaded it last."""
+    folder: Mapped[str]
+    """That of the controller which keeps it."""
+    size: Mapped[int]
+    """Bytes."""
+    uploaded_at: Mapped[int]
+    used_at: Mapped[int]
+    """When it was uploaded, or a definition or a job that names it was registered, last."""
+
+
+class KnownAccount(Base):
+    """The one row of the account in the ARNs (:mod:`orchestrator.control.account`)."""
+
+    __tablename__ = "account"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    account: Mapped[str]
+    region: Mapped[str]
+
+
+class LogGroup(Base):
+    """A log group of a user's own; ``/aws/batch/job``, which always exists, has a row once it has a setting or a tag."""
+
+    __tablename__ = "log_groups"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Whose key created it, or submitted the first job that logs there."""
+    retention: Mapped[int | None] = mapped_column(default=None)
+    """``retentionInDays``, which is shown and deletes nothing."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class LogStream(Base):
+    """An empty stream that a client created; the streams of jobs are known by their nodes."""
+
+    __tablename__ = "log_streams"
+    log_group: Mapped[str] = mapped_column(ForeignKey("log_groups.name", ondelete="CASCADE"), primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    created_at: Mapped[int] = mapped_column(default=now)

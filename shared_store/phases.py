@@ -1,0 +1,32 @@
+"""What a training does at present, as its main rank reports it to the supervisor, and the supervisor to the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Any
+
+
+class Phase(StrEnum):
+    """The parts of a training, in their order."""
+
+    COMPILING = "compiling kernels"
+    BUILDING = "building worlds"
+    TRAINING = "training"
+    SAVING = "saving the last checkpoint"
+    EVALUATING = "evaluating"
+    WRITING = "writing the results"
+    DRAWING = "drawing the policy"
+
+    @property
+    def words(self) -> str:
+        """For people; the longest phase has its duration."""
+        return f"{self} (the first time takes minutes)" if self is Phase.COMPILING else str(self)
+
+
+def phase_in(progress: Mapping[str, Any] | None) -> Phase | None:
+    """The phase in a node's progress; None where it has none: the node loads libraries, or its program reports nothing."""
+    try:
+        return Phase((progress or {})["phase"])
+    except (KeyError, ValueError):  # a program writes what it likes
+        return None
