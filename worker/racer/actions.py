@@ -172,7 +172,7 @@ def _discrete(space: Any) -> ActionSpace:
     asked = []
     for number, action in enumerate(space):
         where = ("action_space", number)
-        _check_keys(where, action, ("steering_angle", "speed", "index"))
+        _check_keys(where, action, ("steering_angle", "speed"))
         asked.append(
             (
                 _number((*where, "steering_angle"), action["steering_angle"], "degrees"),
@@ -221,15 +221,15 @@ def _range(name: str, ends: Any, limits: tuple[float, float], unit: str, notes: 
 
 
 def _check_keys(where: tuple[str | int, ...], value: Any, keys: Sequence[str]) -> None:
-    """Refuse what is no mapping of these keys; ``index`` may be missing."""
+    """Refuse what is no mapping with these keys; others beside them, such as ``index``, are not looked at."""
     if not isinstance(value, Mapping):
-        raise Refused(where, f"expected a mapping of {', '.join(keys[:2])}, found {shown(value)}")
-    for key in value:
-        if key not in keys:
-            raise Refused(where, f"there is no key {shown(key)}; {nearest(str(key), list(keys))}")
-    for key in keys[:2]:
-        if key not in value:
-            raise Refused(where, f"{key} is missing")
+        raise Refused(where, f"expected a mapping of {', '.join(keys)}, found {shown(value)}")
+    missing = [key for key in keys if key not in value]
+    for key in value if missing else ():
+        if key not in (*keys, "index"):
+            raise Refused(where, f"there is no key {shown(key)}; {nearest(str(key), missing)}")
+    if missing:
+        raise Refused(where, f"{missing[0]} is missing")
 
 
 def _number(where: tuple[str | int, ...], value: Any, unit: str) -> float:

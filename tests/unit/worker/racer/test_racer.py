@@ -221,6 +221,7 @@ def noted(space: Any, algorithm: str = "ppo") -> list[str]:
 def test_actions_out_of_the_car_s_range_are_clipped_as_aws_s_simulator_does_with_a_note_for_each_kind() -> None:
     wild = [(45, 5), (-30, "8"), (0, 0.05), ("-31.5", 4), (30, 0.1)]
     asked = [{"steering_angle": angle, "speed": speed, "index": number} for number, (angle, speed) in enumerate(wild)]
+    asked[0]["name"] = "left"  # nor does AWS look at it
     clipped = ((30.0, 4.0), (-30.0, 4.0), (0.0, 0.1), (-30.0, 4.0), (30.0, 0.1))
     for content in (asked, {"action_space": asked}):  # older files hold the list alone
         config = RacerConfig(action_space=content)
