@@ -183,7 +183,7 @@ def test_each_control_step_of_a_rollout_is_one_row_however_late_the_device_is(tm
     task, train = CASES[case]
     training = build(task, 32, tmp_path, iterations=1, **train)
     training.train()
-    rollout = Rollout.of(training.job.run, None, 1)
+    rollout = Rollout.of(training.job.run, {}, 1)
     work = torch.zeros(4096, 4096, device="cuda")
     for number, rows in enumerate(rollout.steps(20)):
         assert (rows.first, rows.lost, len(rows)) == (number, 0, 1)
