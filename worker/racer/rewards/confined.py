@@ -18,7 +18,7 @@ from typing import Any
 
 from worker.racer.rewards import sandbox
 from worker.racer.rewards.namespaces import Forbidden
-from worker.racer.rewards.problems import LARGEST_REWARD, one_line, out_of_range
+from worker.racer.rewards.problems import LARGEST_REWARD, one_line, out_of_range, plain
 
 MEMORY = 2 << 30
 """Bytes of address space of a process that runs a reward function."""
@@ -132,10 +132,10 @@ def told_result(result: Any) -> str:
 def told_error(error: BaseException) -> str:
     """The message for an exception that a function raised."""
     if isinstance(error, Forbidden):
-        return str(error)
+        return plain(str(error))
     if isinstance(error, ModuleNotFoundError):
         way = f": pip install {error.name} (the extra 'worker' has it)" if error.name in sandbox.PACKAGES else ""
-        return f"{error.name} is not installed here{way}"
+        return plain(f"{error.name} is not installed here{way}")
     if isinstance(error, MemoryError):
         return f"it used more than {MEMORY >> 30} GiB of memory"
     if isinstance(error, RecursionError):

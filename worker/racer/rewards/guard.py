@@ -27,7 +27,7 @@ from typing import Any
 
 from shared_store.wording import nearest
 from worker.racer.rewards.namespaces import FILES, MODULES, NAMES, SUBMODULES
-from worker.racer.rewards.problems import KINDS, Problem, RewardRefused
+from worker.racer.rewards.problems import KINDS, Problem, RewardRefused, plain
 from worker.racer.rewards.samples import OVAL, Course
 
 LARGEST = 140_000
@@ -44,6 +44,8 @@ _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
 _MOST_SAID = 64 << 10
 """Bytes that the process may answer."""
+_LONGEST = 400
+"""Characters of a message."""
 Note = Callable[[str], object]
 """Is called with a line for the user."""
 _SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())  # noqa: SIM905
@@ -296,7 +298,7 @@ def try_out(
     }
     answer, errors, code = _answer(json.dumps(asked).encode())
     lines = [line for each in answer.decode(errors="replace").splitlines() if (line := _read_line(each))]
-    unconfined = next((str(line["unconfined"]) for line in lines[:1] if "unconfined" in line), "")
+    unconfined = next((plain(str(line["unconfined"])) for line in lines[:1] if "unconfined" in line), "")
     if unconfined and note is not None:
         fate = (
             "the function is not kept from this job's files" if anyway else "it was not run: the job's own nodes try it"
@@ -307,13 +309,13 @@ def try_out(
     if code is None:
         return Problem("TIMEOUT", f"{_last(lines)} did not end within {_PATIENCE:g} s", file)
     if not lines:
-        told = " ".join(errors.decode(errors="replace").split())[-300:]
+        told = plain(errors.decode(errors="replace")[-300:], _LONGEST)
         return Problem("TEST_FAILURE", f"the process that tries the function did not start: {told}", file)
     found = lines[-1]
     if found.get("kind") == "":
         return None
     if found.get("kind") in KINDS and isinstance(found.get("line"), int):
-        return Problem(found["kind"], " ".join(str(found.get("message")).split()), file, found["line"])
+        return Problem(found["kind"], plain(str(found.get("message")), _LONGEST), file, found["line"])
     cause = f"signal {-code}" if code < 0 else f"exit code {code}"
     return Problem("TEST_FAILURE", f"{_last(lines)} ended the process ({cause})", file)
 
@@ -361,7 +363,7 @@ def _read_line(line: str) -> dict[str, Any]:
 
 def _last(lines: list[dict[str, Any]]) -> str:
     """The last step that the process reported."""
-    return next((str(line["trying"]) for line in reversed(lines) if "trying" in line), "the file")
+    return next((plain(str(line["trying"])) for line in reversed(lines) if "trying" in line), "the file")
 
 
 def environment() -> dict[str, str]:

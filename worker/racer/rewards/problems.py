@@ -72,8 +72,17 @@ def alike(message: str) -> str:
     return re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", message)
 
 
-def one_line(error: BaseException, most: int = 200) -> str:
+def one_line(error: BaseException) -> str:
     """An exception in one line."""
-    text = " ".join(str(error).split())
-    shown = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    try:
+        text = str(error)
+    except BaseException as other:  # a learner's own class
+        text = f"its message can't be shown, since its __str__ raises {type(other).__name__}"
+    return plain(f"{type(error).__name__}: {text}" if text else type(error).__name__)
+
+
+def plain(text: str, most: int = 200) -> str:
+    """A text in one line of at most so many characters; what does not print, such as a control character, is shown escaped."""
+    line = " ".join(str.split(text[: 2 * most]))
+    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in line)
     return shown if len(shown) <= most else shown[: most - 1] + "…"

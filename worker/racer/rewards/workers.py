@@ -17,16 +17,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
 
 from worker.racer.rewards.confined import MEMORY
 from worker.racer.rewards.guard import environment
 from worker.racer.rewards.interpreter import ANEW
 from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
-from worker.racer.rewards.problems import Failure, RewardFailed, alike
+from worker.racer.rewards.problems import Failure, RewardFailed, alike, plain
 
 SECONDS = 2.0
 """For one call [s]."""
@@ -34,6 +36,24 @@ _START, _COPY = 120.0, 5.0
 """For a process to start and import what the function imports, and for the copy of a car [s]."""
 _MOST_SAID = 1 << 20
 """Bytes of an answer."""
+_LONGEST = 300
+"""Characters of a message."""
+_Number = Annotated[int, Field(ge=0, lt=1 << 31)]
+
+
+@dataclass(frozen=True)
+class _End:
+    """The last answer of a process: why it goes on no more; ``car`` -1: no car's call is the cause."""
+
+    message: str
+    line: _Number
+    car: Annotated[int, Field(ge=-1, lt=1 << 31)]
+
+
+_ANSWER: TypeAdapter[_End | list[tuple[str, int, int, int]]] = TypeAdapter(
+    _End | list[tuple[str, _Number, _Number, _Number]]
+)
+"""What a process may answer: the function may have it in its hands."""
 
 
 class Workers:
@@ -160,12 +180,17 @@ class Workers:
         until = time.monotonic() + patience
         for number, process in enumerate(self.processes):
             line = self._line(process, number, until)
-            said = json.loads(line)
-            if isinstance(said, dict):
-                place = f"{self.file}:{said['line']}" if said["line"] else self.file
-                car = f"car {said['car']}: " if said["car"] >= 0 else ""
-                raise RewardFailed(f"{place}: {car}{said['message']}")
-            for told, at, car, count in said:
+            try:
+                said = _ANSWER.validate_json(line, strict=True)
+            except ValidationError:
+                told = "the process of the function answered what it never writes: the function wrote to its pipe"
+                raise RewardFailed(f"{self.file}: {self._cars(number)}: {told}") from None
+            if isinstance(said, _End):
+                place = f"{self.file}:{said.line}" if said.line else self.file
+                who = f"car {said.car}: " if said.car >= 0 else ""
+                raise RewardFailed(f"{place}: {who}{plain(said.message, _LONGEST)}")
+            for message, at, car, count in said:
+                told = plain(message, _LONGEST)
                 place = f"{self.file}:{at}" if at else self.file
                 first = self._first.setdefault(f"{at}: {alike(told)}", f"{place}: {told}")
                 self.failures.setdefault(first, Failure(0, car)).count += count
@@ -173,8 +198,7 @@ class Workers:
     def _line(self, process: subprocess.Popen[bytes], number: int, until: float) -> bytes:
         """An answer, whole."""
         assert process.stdout is not None
-        first = number * self._share
-        cars = f"cars {first} to {min(first + self._share, len(self._rewards)) - 1}"
+        cars = self._cars(number)
         said, poll = b"", select.poll()
         poll.register(process.stdout, select.POLLIN)
         while not said.endswith(b"\n"):
@@ -189,6 +213,11 @@ class Workers:
                 raise RewardFailed(f"{self.file}: {cars}: the process of the function ended ({cause})")
             said += part
         return said
+
+    def _cars(self, number: int) -> str:
+        """The cars of a process, in messages."""
+        first = number * self._share
+        return f"cars {first} to {min(first + self._share, len(self._rewards)) - 1}"
 
     def close(self) -> None:
         """End the processes."""

@@ -401,3 +401,36 @@ def test_where_all_holds_there_is_no_note() -> None:
     assert (
         check_source("def reward_function(params):\n    return 1.0\n", "r.py", note=notes.append) is None and not notes
     )
+
+
+NONSENSE = {
+    "text": b"hello\n",
+    "null": b"null\n",
+    "mapping": b"{}\n",
+    "nested": b"[" * 200_000 + b"\n",
+    "numbers": b"[1]\n",
+    "types": b'[["a",1,2,"x"]]\n',
+    "bytes": b"\xff\n",
+    "digits": b'[["a",1,0,' + b"9" * 5000 + b"]]\n",
+}
+WRITE = """\
+import fcntl
+for descriptor in range(3, 12):
+    try:
+        if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_WRONLY:
+            os.write(descriptor, {!r})
+    except OSError:
+        pass
+os._exit(0)"""
+
+
+@pytest.mark.parametrize("answer", NONSENSE.values(), ids=NONSENSE.keys())
+def test_an_answer_that_no_worker_writes_ends_the_pool_with_one_line(answer: bytes) -> None:
+    words = "the process of the function answered what it never writes: the function wrote to its pipe"
+    with pytest.raises(RewardFailed) as caught:
+        called(WRITE.format(answer))
+    assert str(caught.value) == f"r.py: cars 0 to 0: {words}"
+
+
+def test_what_a_function_has_a_worker_say_is_one_line_without_control_characters() -> None:
+    assert called(WRITE.format(b'[["\\u001b[2J\\nerror: hi",1,0,1]]\n')) == "r.py:1: \\x1b[2J error: hi"
