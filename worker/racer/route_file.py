@@ -22,6 +22,10 @@ from worker.racer.track import Track
 _MAGIC = b"\x93NUMPY"
 _CLOSED = 1e-3
 """Greatest distance of the last row from the first one [m]."""
+_MISSING = 1.5
+"""Ends of a line that are at most so many of its longest steps apart are those of a loop of which the closing row is missing."""
+_EVEN = 1.01
+"""Rows that are evenly apart differ by no more than this."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,7 @@ def _track(rows: Floats, name: str) -> Imported:
         )
     for column, ring in enumerate(RINGS):
         check_numbers(rows[:, 2 * column : 2 * column + 2], ring)
-    closed = _is_closed(rows)
-    notes = []
+    closed, notes = _is_closed(rows)
     if closed:
         rows = rows[:-1]
     kept = _different(rows[:, :2], closed)
@@ -135,21 +138,27 @@ def _track(rows: Floats, name: str) -> Imported:
     return Imported(track, tuple(notes))
 
 
-def _is_closed(rows: Floats) -> bool:
-    """Whether the last row is the first one once more. Raises BadTrack for a loop of which rows are missing.
+def _is_closed(rows: Floats) -> tuple[bool, list[str]]:
+    """Whether the last row is the first one once more, with notes. Raises BadTrack for a loop of which rows are missing.
 
-    The ends of an open track are farther from each other than its road is wide.
+    The ends of an open track are farther from each other than its road is wide and its waypoints are apart. A border of a loop may be
+    open by no more than its own rows are apart: many files have it so.
     """
     lines = [rows[:, 2 * column : 2 * column + 2] for column in range(3)]
     gaps = [float(norm(line[-1] - line[0])) for line in lines]
-    if max(gaps) <= _CLOSED:
-        return True
-    if min(gaps) > _CLOSED and gaps[0] > norm(lines[1][0] - lines[2][0]):
-        return False
-    name, line, gap = next(each for each in zip(RINGS, lines, gaps, strict=True) if each[2] > _CLOSED)
+    longest = [float(norm(np.diff(line[:-1], axis=0)).max()) for line in lines]
+    apart = [(name, line, gap) for name, line, gap in zip(RINGS, lines, gaps, strict=True) if gap > _CLOSED]
+    if gaps[0] <= _CLOSED and all(gap <= max(_CLOSED, _EVEN * step) for gap, step in zip(gaps, longest, strict=True)):
+        return True, [
+            f"the {name} is open by {gap:.3f} m, no more than its rows are apart: taken as a loop without its last point"
+            for name, _, gap in apart
+        ]
+    if min(gaps) > _CLOSED and gaps[0] > max(float(norm(lines[1][0] - lines[2][0])), _MISSING * longest[0]):
+        return False, [f"taken as an open track; its ends are {gaps[0]:.2f} m apart"]
+    name, line, gap = apart[0]
     raise BadTrack(
         f"the {name} is open: {gap:.3f} m lie between {at(line, 0)} and {at(line, len(rows) - 1)}; the last row of a loop has to be the "
-        "first one once more, and the ends of an open track are farther apart than its road is wide"
+        "first one once more, and the ends of an open track are farther apart than its road is wide and than its waypoints"
     )
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 from shared_store.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, known, open_track, straight
+from worker.racer.arithmetic import norm
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import circuit_of
 from worker.racer.geometry import advance, on_road, place_at, project
@@ -29,6 +30,7 @@ from worker.tasks.racer import Racer, RacerPixels
 
 HORSESHOE = open_track()
 END = HORSESHOE.length
+OPEN = f"taken as an open track; its ends are {math.dist(*HORSESHOE.center[[0, -1]]):.2f} m apart"
 
 
 @pytest.fixture(autouse=True)
@@ -69,14 +71,15 @@ def test_the_measures_of_an_open_track_end_at_its_last_waypoint() -> None:
 def test_an_open_track_comes_back_from_its_file_with_its_borders_the_right_way() -> None:
     for track in (HORSESHOE, HORSESHOE.turned_round()):
         found = from_bytes(to_bytes(track), "again")
-        assert (found.track.digest, found.track.closed, found.notes) == (track.digest, False, ())
+        assert (found.track.digest, found.track.closed, found.notes) == (track.digest, False, (OPEN,))
     swapped = from_bytes(file(HORSESHOE.rows()[:, [0, 1, 4, 5, 2, 3]]), "again")
     assert swapped.track.digest == HORSESHOE.digest
     assert swapped.notes == (
+        OPEN,
         "the borders were swapped (columns 2 and 3 lie right of the centre line): taken the right way",
     )
     twice = from_bytes(file(np.repeat(HORSESHOE.rows(), 2, axis=0)), "again")
-    assert twice.track.digest == HORSESHOE.digest and twice.notes[0].startswith("left out 80 rows")
+    assert twice.track.digest == HORSESHOE.digest and twice.notes[1].startswith("left out 80 rows")
 
 
 def test_a_loop_of_which_the_last_rows_are_missing_is_no_open_track() -> None:
@@ -89,6 +92,28 @@ def test_a_loop_of_which_the_last_rows_are_missing_is_no_open_track() -> None:
     assert "the centre line is open" in refusal(from_bytes, file(rows), "x", error=BadTrack)
     sides = {"center": HORSESHOE.center, "inner": HORSESHOE.outer, "outer": HORSESHOE.inner}
     assert "has its inner border on the left" in refusal(Track, "x", **sides, closed=False, error=BadTrack)
+
+
+def test_a_coarse_loop_without_its_closing_row_is_no_open_track() -> None:
+    turn = 2 * np.pi * np.arange(24) / 24
+    ring = np.stack((np.cos(turn), np.sin(turn)), -1)
+    rows = np.hstack((4.0 * ring, 3.7 * ring, 4.3 * ring))  # its steps are longer than its road is wide
+    assert refusal(from_bytes, file(rows), "x", error=BadTrack).startswith("the centre line is open: 1.044 m lie")
+    closed = from_bytes(file(np.vstack((rows, rows[:1]))), "x")
+    assert (closed.track.closed, closed.notes) == (True, ())
+
+
+def test_a_loop_with_a_border_that_is_open_by_a_row_or_less_is_a_loop() -> None:
+    rows = OVAL.rows()
+    closing = norm(OVAL.outer[-1] - OVAL.outer[0])
+    rows[-1, 4:6] = rows[0, 4:6] + np.array([-closing, 0.0])
+    found = from_bytes(file(rows), "x")
+    assert found.track.digest == OVAL.digest
+    assert found.notes == (
+        f"the outer border is open by {closing:.3f} m, no more than its rows are apart: taken as a loop without its last point",
+    )
+    rows[-1, 4] -= 0.2
+    assert refusal(from_bytes, file(rows), "x", error=BadTrack).startswith("the outer border is open: 0.")
 
 
 def test_places_on_an_open_track_end_at_its_ends() -> None:
