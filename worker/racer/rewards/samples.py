@@ -23,8 +23,8 @@ class Placed:
     """Something on the track.
 
     Attributes:
-        way: Along the centre line from the start [m].
-        offset: From the centre line to the left [m].
+        way: Along the centre line from the start, in the line's own direction [m].
+        offset: From the centre line to the left [m]: of a car in its direction, of an object in the line's.
         turned: From the direction of the track to the left [degrees].
         speed: In m/s.
     """
@@ -63,6 +63,13 @@ class Line:
     def on(self, way: float) -> float:
         """A way along the line, which may be more than a lap: from the start, and no farther than the ends of an open line [m]."""
         return way % self.length if self.closed else min(max(way, 0.0), self.length)
+
+    def driven(self, way: float, is_reversed: bool) -> float:
+        """A way along the line, in the direction in which a car drives: reversed, from the end of an open line [m]."""
+        way = self.on(way)
+        if is_reversed:
+            return self.on(self.length - way)
+        return way
 
     def width(self, way: float) -> float:
         """Of the road [m]."""
@@ -123,7 +130,10 @@ def sample(
     far = abs(car.offset)
     left = car.offset > 0.0
     poses = [line.at(each.way) for each in objects]
-    ahead = sorted(range(len(objects)), key=lambda index: (objects[index].way - car.way) % line.period)
+    way, *others = (
+        line.driven(each.way, is_reversed) for each in (car, *objects)
+    )  # all that follows is in driving direction
+    ahead = sorted(range(len(objects)), key=lambda index: (others[index] - way) % line.period)
     params = {
         "all_wheels_on_track": far + _CAR <= width / 2,
         "x": x - car.offset * math.sin(direction),
@@ -134,7 +144,7 @@ def sample(
         "is_reversed": is_reversed,
         "is_crashed": False,
         "is_offtrack": far - _CAR > width / 2,
-        "progress": 100.0 * line.on(car.way) / line.length,
+        "progress": 100.0 * way / line.length,
         "steps": 1,
         "speed": car.speed,
         "steering_angle": 0.0,
@@ -142,17 +152,17 @@ def sample(
         "track_width": width,
         "closest_waypoints": [segment, segment + 1],
         "closest_objects": [ahead[-1], ahead[0]] if ahead else [0, 0],
-        "projection_distance": line.on(car.way),
+        "projection_distance": way,
         "sim_time": 0.0,
-        "object_in_camera": any((each.way - car.way) % line.period < 2.0 for each in objects),
+        "object_in_camera": any((other - way) % line.period < 2.0 for other in others),
         "waypoints": list(points),
         "objects_location": [
             (px - each.offset * math.sin(angle), py + each.offset * math.cos(angle))
             for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
         ],
-        "objects_distance": [line.on(each.way) for each in objects],
+        "objects_distance": others,
         "objects_heading": [0.0] * len(objects),
-        "objects_left_of_center": [each.offset > 0.0 for each in objects],
+        "objects_left_of_center": [each.offset != 0.0 and (each.offset > 0.0) != is_reversed for each in objects],
         "objects_speed": [each.speed for each in objects],
         "objects_distance_from_center": [abs(each.offset) for each in objects],
     }

@@ -21,7 +21,7 @@ from worker.racer.rewards.__main__ import main
 from worker.racer.rewards.courses import courses_for, courses_of
 from worker.racer.rewards.guard import check_source
 from worker.racer.rewards.parameters import row_of
-from worker.racer.rewards.samples import FINE_OVAL
+from worker.racer.rewards.samples import FINE_OVAL, Line, oval
 from worker.tasks.configs.racer import ObstacleConfig, RewardFile
 
 NEXT = """def reward_function(params):
@@ -94,6 +94,8 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
         for name, params in samples.items():
             back = params["is_reversed"]
             found = project(track, [[params["x"], params["y"]]], back)
+            assert params["projection_distance"] == pytest.approx(found.along[0], abs=0.06), name
+            assert params["progress"] == pytest.approx(100.0 if name == "finish" else found.progress[0], abs=0.6)
             assert params["distance_from_center"] == pytest.approx(found.distance[0], abs=0.04), name
             assert params["track_width"] == pytest.approx(found.width[0], abs=0.03)
             assert params["is_offtrack"] == (name == "off-track")
@@ -101,15 +103,32 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
             np.testing.assert_array_equal(params["waypoints"], track.line()[:: -1 if back else 1])
             assert max(params["closest_waypoints"]) < len(params["waypoints"])
             places = np.array(params["objects_location"]).reshape(-1, 2)
-            there = project(track, places)
+            there = project(track, places, back)
             np.testing.assert_allclose(there.along, params["objects_distance"], atol=0.06)
             np.testing.assert_array_equal(
                 there.left[there.distance > 0.01],
                 np.array(params["objects_left_of_center"], bool)[there.distance > 0.01],
             )
+            if len(places):
+                gaps = there.along - found.along[0]
+                ahead = gaps % (track.length if track.closed else 2 * track.length)
+                if name not in ("objects", "crashed"):  # there the next box is level with the car, or nearly so
+                    assert params["closest_objects"] == [ahead.argmax(), ahead.argmin()], name
             if boxes:
                 np.testing.assert_allclose(places, circuit.obstacle_poses[0, :, :2], atol=0.05)
             row_of(params)
+
+
+def test_distances_and_sides_of_a_reversed_sample_are_those_in_driving_direction() -> None:
+    boxes = (ObstacleConfig(2.0, "inner"), ObstacleConfig(8.0, "outer"), ObstacleConfig(15.0, "inner"))
+    (course,) = courses_of(circuit_of([OVAL], boxes))
+    params = course.trials()[0]["reversed"]
+    assert params["projection_distance"] == pytest.approx(
+        OVAL.length - 3.3 * OVAL.length / Line(oval()).length, abs=0.01
+    )
+    assert params["objects_distance"] == pytest.approx([OVAL.length - way for way in (2.0, 8.0, 15.0)], abs=0.01)
+    assert params["objects_left_of_center"] == [False, True, False]
+    assert params["closest_objects"] == [1, 0]
 
 
 def test_the_command_tries_the_tracks_that_it_finds_and_says_which_it_does_not(
