@@ -92,8 +92,8 @@ class TrainingTrace:
         cars = arrays.trace.shape[0]
         tracks = [task.circuit.tracks[number] for number in arrays.tracks.numpy()[:cars].tolist()]
         self._lengths = [track.length for track in tracks]
-        self._slots = cars * steps
-        """Episodes that can end in an iteration."""
+        self._slots = CARS * steps
+        """Episodes that can end in an iteration, whatever number of cars a later attempt has."""
         with on_torch_stream(task.device):
             self._counter = wp.zeros(1, dtype=wp.int32, device=task.device)
             self._arrays_of_rows = [
@@ -187,12 +187,19 @@ class TrainingTrace:
 
     def _load(self, iteration: int) -> None:
         """Go on with what was kept for a checkpoint; without it, each car's next episode is the first one that is noted."""
+        content: dict[str, Any] = {}
+        path = self._unfinished / f"{iteration:08d}.npz"
         try:
-            with np.load(self._unfinished / f"{iteration:08d}.npz", allow_pickle=False) as kept:
+            with np.load(path, allow_pickle=False) as kept:
                 content = dict(kept)
-        except (OSError, ValueError):  # trained without a trace until now
-            content = {"begun": np.array((self._folder / "0-iteration.csv").exists())}
-        self._begun = bool(content["begun"])
+        except FileNotFoundError:
+            pass  # trained without a trace until now
+        except Exception as error:  # a damaged archive fails in many ways
+            why = f"{type(error).__name__}: {error}"
+            print(
+                f"warning: {path} can't be read ({why}); its unfinished episodes are left out of the trace", flush=True
+            )
+        self._begun = bool(content.get("begun", (self._folder / "0-iteration.csv").exists()))
         for car in range(len(self._open)):
             rows = content.get(f"rows_{car}")
             self._open[car] = None if rows is None else [rows]

@@ -25,6 +25,7 @@ from worker.learning.loop import Loop
 from worker.learning.trained import load_policies
 from worker.racer.presets import make_preset
 from worker.racer.sim_trace import SIM_TRACE_COLUMNS
+from worker.racer.training_trace import CARS as MOST_CARS
 from worker.tasks.configs.racer import RacerConfig
 from worker.tasks.overrides import configured
 from worker.tasks.racer import Racer
@@ -79,7 +80,7 @@ def test_a_file_has_the_whole_episodes_that_ended_in_its_iteration(store: Path) 
         assert len(ended) == told[number]["episodes"]
         numbers = [int(episode[0]["episode"]) for episode in ended]
         # from file 0 deepracer-utils learns how many an iteration can have
-        assert numbers == [*range(len(ended) - 1), CARS * STEPS - 1 if number == 0 else len(ended) - 1]
+        assert numbers == [*range(len(ended) - 1), MOST_CARS * STEPS - 1 if number == 0 else len(ended) - 1]
         for episode in ended:
             assert [row["steps"] for row in episode] == [str(step) for step in range(len(episode))]
             assert [row["episode_status"] == "prepare" for row in episode] == [True] + [False] * (len(episode) - 1)
@@ -112,13 +113,40 @@ def test_a_trace_that_begins_at_a_resume_has_no_episode_without_its_beginning(st
     assert rows and all(episode[0]["episode_status"] == "prepare" for episode in episodes(rows))
 
 
+@pytest.mark.parametrize("damage", [b"", b"x" * 100, None], ids=["empty", "other", "cut"])
+def test_episodes_in_a_damaged_file_are_left_out_with_a_warning(
+    store: Path, damage: bytes | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = f"damaged-{len(damage) if damage is not None else 'cut'}"
+    stop_after(runner(racing(store, name, sim_trace=2), task=Racer), 5)
+    path = Store(store).run(name).path / "sim-trace" / "unfinished" / "00000004.npz"
+    path.write_bytes(path.read_bytes()[:300] if damage is None else damage)
+    train(racing(store, name, epoch=2, sim_trace=2), task=Racer).close()
+    (warning,) = [line for line in capsys.readouterr().out.splitlines() if "unfinished" in line]
+    assert warning.startswith(f"warning: {path} can't be read (")
+    assert warning.endswith("); its unfinished episodes are left out of the trace")
+    assert all(
+        episode[0]["episode_status"] == "prepare" for rows in files(store, name).values() for episode in episodes(rows)
+    )
+
+
+def test_more_cars_from_a_resume_on_have_numbers_of_their_own(store: Path) -> None:
+    stop_after(runner(racing(store, "more", sim_trace=1), task=Racer), 5)
+    train(racing(store, "more", epoch=2, sim_trace=4), task=Racer).close()
+    found = files(store, "more")
+    # as deepracer-utils counts: the greatest number of file 0 says how many an iteration can have
+    most = 1 + max(int(row["episode"]) for row in found[0])
+    unique = [number * most + int(each[0]["episode"]) for number, rows in found.items() for each in episodes(rows)]
+    assert most >= 4 * STEPS and len(unique) == len(set(unique))
+
+
 def test_deepracer_utils_reads_a_training(store: Path, tmp_path: Path) -> None:
     pytest.importorskip("deepracer", reason="pip install deepracer-utils, or make tracking")
     from deepracer.logs import AnalysisUtils, DeepRacerLog
 
     config = {"action_space": {"action_space": CHOICES}, "sim_trace": 3}
     train(racing(tmp_path, "choosing", **config), task=Racer).close()
-    for run, cars in ((Store(store).run("traced"), CARS), (Store(tmp_path).run("choosing"), 3)):
+    for run in (Store(store).run("traced"), Store(tmp_path).run("choosing")):
         log = DeepRacerLog(str(run.path))
         log.load_training_trace()
         rows = log.dataframe()
@@ -128,7 +156,7 @@ def test_deepracer_utils_reads_a_training(store: Path, tmp_path: Path) -> None:
         ended = sum(len(episodes(each)) for each in there.values())
         aggregated = AnalysisUtils.simulation_agg(rows, secondgroup="unique_episode")
         assert len(aggregated) == ended
-        assert rows["unique_episode"].max() < SMALL["iterations"] * cars * STEPS
+        assert rows["unique_episode"].max() < SMALL["iterations"] * MOST_CARS * STEPS
         assert log.hyperparameters() == json.loads((run.path / "ip" / "hyperparameters.json").read_text())
         assert log.hyperparameters()["batch_size"] == CARS * STEPS // 2
         assert log.agent_and_network()["network"] == "MLP"
