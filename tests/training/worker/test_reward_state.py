@@ -42,6 +42,8 @@ FUNCTIONS = {
     "        random.seed(int(1000 * abs(now)))\n    return now + random.random() + gauss(0, 1) + random.choice([1, 2, 3])\n",
     "numpy.random": f"import numpy as np\nfrom numpy.random import rand\nnp.random.seed(3)\n{USE}    if params['steps'] == 2:\n"
     "        np.random.seed(int(1000 * abs(now)))\n    return float(now + rand() + np.random.normal() + np.random.sample())\n",
+    "draws of scipy's rotations": "import numpy as np\nfrom scipy.spatial.transform import Rotation\nnp.random.seed(6)\n"
+    f"{USE}    return float(now + np.random.rand() + Rotation.random().as_quat()[0])\n",
     "scipy's draws": f"import numpy as np\nfrom scipy import stats\nnp.random.seed(5)\n{USE}"
     "    return float(now + stats.norm.rvs() + np.random.normal() + stats.uniform.rvs(random_state=None))\n",
     "an array": f"import numpy as np\nring = np.zeros(5)\n{USE}    ring[:-1] = ring[1:]\n    ring[-1] = now\n    return float(ring.mean())\n",

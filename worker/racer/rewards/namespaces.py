@@ -93,7 +93,7 @@ class Modules:
         """An attribute that the view does not have yet."""
         if name == "__all__":
             return [each for each in getattr(module, name, dir(module)) if each[0] != "_" and each not in FILES]
-        if name in FILES:
+        if name in FILES or (name[:1] == "_" and name[:2] != "__"):
             raise Forbidden(f"{module.__name__}.{name} can't be used in a reward function")
         value = getattr(module, name)
         if isinstance(value, ModuleType):
@@ -211,22 +211,18 @@ class Program:
     def __init__(self, source: str, file: str) -> None:
         tree = ast.parse(source, file)
         self._code = compile(tree, file, "exec", dont_inherit=True)
-        self._draws = any(_imports_drawing(node) for node in ast.walk(tree))
+        self._draws = any(_imports_scipy(node) for node in ast.walk(tree))
 
     def car(self) -> Car:
         """Run the file in a new namespace."""
         return Car(self._code, draws=self._draws)
 
 
-def _imports_drawing(node: ast.AST) -> bool:
-    """Whether a part of a file names a package of scipy that draws numbers from NumPy's generator."""
-    if isinstance(node, ast.Import | ast.ImportFrom):
-        names = [f"{getattr(node, 'module', '')}.{alias.name}" for alias in node.names]
-        return any("scipy" in name and part in name.split(".") for name in names for part in _DRAWING)
-    return isinstance(node, ast.Attribute) and node.attr in _DRAWING
-
-
-_DRAWING = ("stats", "optimize", "cluster")
+def _imports_scipy(node: ast.AST) -> bool:
+    """Whether a part of a file imports from scipy, of which many functions draw numbers from NumPy's own generator."""
+    if isinstance(node, ast.Import):
+        return any(alias.name.partition(".")[0] == "scipy" for alias in node.names)
+    return isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "scipy"
 
 
 def _new_state() -> Any:
