@@ -12,6 +12,7 @@ from pathlib import Path
 
 from shared_store.layout import Store
 from shared_store.texts import IN_DEFINITION, size_in_definition
+from shared_store.wording import shown
 from worker.racer.rewards.guard import check, read_file
 from worker.racer.rewards.samples import FINE_OVAL, Course
 from worker.racer.rewards.translation import Outside, translate
@@ -27,7 +28,6 @@ def main() -> int:
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument(
         "--config",
-        type=json.loads,
         metavar="JSON",
         help='track and obstacles of the task, such as {"track": "chicane"}: the samples are of them; by default of an oval',
     )
@@ -38,7 +38,13 @@ def main() -> int:
     if asked.config is not None:
         from worker.racer.rewards.courses import courses_for  # it takes numpy
 
-        courses, unknown = courses_for(asked.config, Store(asked.store) if asked.store else None)
+        try:
+            config = json.loads(asked.config)
+        except (ValueError, RecursionError):
+            config = None
+        if not isinstance(config, dict):
+            sys.exit(f'--config: expected a JSON object such as {{"track": "chicane"}}, found {shown(asked.config)}')
+        courses, unknown = courses_for(config, Store(asked.store) if asked.store else None)
     for path in asked.files:
         for line in unknown:
             print(f"{path}: {line}", file=sys.stderr)

@@ -111,17 +111,18 @@ def told_result(result: Any) -> str:
     """
     if result is None:
         return "it returned None; return a number on every way through the function"
-    kind = type(result).__name__
-    if isinstance(result, bool) or kind in ("bool", "bool_"):
-        return f"it returned {result}, a truth value; return a number such as float({result})"
-    if not isinstance(result, int | float) and not hasattr(result, "dtype"):
-        return f"it returned a {kind}; return a number"
-    if getattr(result, "shape", ()) != ():
+    name, kind = type(result).__name__, getattr(getattr(result, "dtype", None), "kind", "")
+    if kind and getattr(result, "shape", ()) != ():
         return f"it returned an array of shape {result.shape}; return one number"
+    if isinstance(result, bool) or kind == "b":
+        return f"it returned {result}, a truth value; return a number such as float({result})"
+    if not isinstance(result, int | float) and kind not in ("i", "u", "f"):
+        what = f"an array of {result.dtype}" if name == "ndarray" else f"a {name}"
+        return f"it returned {what}; return a number"
     try:
         value = float(result)
     except (TypeError, ValueError, OverflowError):
-        return f"it returned a {kind} that is no float"
+        return f"it returned a {name} that is no float"
     if not math.isfinite(value):
         return f"it returned {value}; return a finite number"
     if abs(value) > LARGEST_REWARD:

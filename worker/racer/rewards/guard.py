@@ -49,7 +49,6 @@ _LONGEST = 400
 Note = Callable[[str], object]
 """Is called with a line for the user."""
 _SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())  # noqa: SIM905
-_OWN = {"self", "cls"}
 
 
 def check(path: Path, courses: Sequence[Course] = (OVAL,), note: Note | None = None) -> Problem | None:
@@ -239,19 +238,15 @@ def _attribute(node: ast.Attribute, imported: dict[str, str]) -> Iterator[tuple[
     while isinstance(base, ast.Attribute):
         base = base.value
     of_module = isinstance(base, ast.Name) and base.id in imported
-    own = isinstance(node.value, ast.Name) and node.value.id in _OWN
     dunder = name.startswith("__") and name != "__init__"
-    hidden = name.startswith("_") and not name.startswith("__") and not own
+    hidden = name.startswith("_") and of_module  # that of an object of the file's own is no package's
     if dunder or hidden or name in _SYSTEM or name == "tofile" or (of_module and name in FILES):
         yield "FORBIDDEN", f"the attribute {name} can't be used in a reward function", node.lineno
 
 
 def _function(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]]:
     found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "reward_function"]
-    if len(found) > 1:
-        told = f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}"
-        yield "TEST_FAILURE", told, found[1].lineno
-    for node in found:
+    for node in found[-1:]:  # which Python takes
         if not _takes_one(node.args) and not node.decorator_list:
             yield "TEST_FAILURE", "reward_function takes one argument: def reward_function(params)", node.lineno
     if "reward_function" not in _bound(code):

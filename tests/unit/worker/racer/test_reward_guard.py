@@ -37,7 +37,6 @@ def forbidden(line: int, what: str) -> str:
 
 
 MISTYPED = ": TEST_FAILURE: there is no def reward_function(params); did you mean reward?"
-TWICE = ":3: TEST_FAILURE: reward_function is defined 2 times; the first is in line 1"
 LONG = ": SYNTAX_ERROR: 140,045 characters; a reward function has at most 140,000"
 MANY = ": SYNTAX_ERROR: 120,015 words, signs and lines; a reward function has at most 60,000"
 BESIDE = ":1: IMPORT_ERROR: a reward function is one file: it can't import from beside it"
@@ -66,7 +65,7 @@ ARGUMENTS = ":1: TEST_FAILURE: reward_function takes one argument: def reward_fu
         (f"{HEAD}return ().__class__.__bases__", forbidden(2, "the attribute __bases__")),
         ("def reward(params):\n    return 1.0", MISTYPED),
         ("def reward_function(params, other):\n    return 1.0", ARGUMENTS),
-        (f"{HEAD}return 1.0\n{HEAD}return 2.0", TWICE),
+        (f"{HEAD}return 1.0\ndef reward_function(params, x, y=1):\n    return 1", ARGUMENTS.replace(":1:", ":3:")),
         (f"{HEAD}break\n    return 1", ":2: SYNTAX_ERROR: 'break' outside loop"),
         ("def reward_function(params, x, y=1):\n    return 1", ARGUMENTS),
         (f"{HEAD}return float(len(dir(params)))", forbidden(2, "dir")),
@@ -101,6 +100,8 @@ LARGE = "it returned -100000.5; a reward is from -100,000 to 100,000, as on AWS"
         (1, "start", TRUTH, "return params['is_crashed'] or 0.5 > 1"),
         (1, "finish", "it returned inf; return a finite number", "return params['progress'] == 100 and 1e999 or 1"),
         (1, "start", "it returned a str; return a number", "return '1'"),
+        (1, "start", "it returned a complex; return a number", "return 1j"),
+        (2, "start", r"ValueError: a b\x1b[31m", r"raise ValueError('a\nb\x1b[31m')"),
         (1, "start", "it returned a generator; return a number", "yield 1"),
         (1, "start", LARGE, "return -100000.5"),
         (
@@ -117,6 +118,47 @@ def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_li
     line: int, sample: str, message: str, body: str
 ) -> None:
     assert told(f"{HEAD}{body}") == f"r.py:{line}: TEST_FAILURE: the sample '{sample}': {message}"
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("np.array(True)", "it returned True, a truth value; return a number such as float(True)"),
+        ("np.bool_(False)", TRUTH),
+        ("np.str_('1')", "it returned a str_; return a number"),
+        ("np.array('1')", "it returned an array of <U1; return a number"),
+        ("np.complex128(1)", "it returned a complex128; return a number"),
+        ("np.ones(1)", "it returned an array of shape (1,); return one number"),
+    ],
+)
+def test_a_value_of_numpy_that_is_no_number_is_no_reward(value: str, message: str) -> None:
+    assert told(f"import numpy as np\n{HEAD}return {value}") == f"r.py:2: TEST_FAILURE: the sample 'start': {message}"
+    assert told(f"import numpy as np\n{HEAD}return np.array(1.5) + np.int64(2) * np.uint8(1)") == ""
+
+
+def test_an_exception_that_cannot_be_shown_is_named_with_its_line() -> None:
+    source = f"class Odd(Exception):\n    def __str__(self):\n        return [][0]\n{HEAD}raise Odd()\n"
+    why = "Odd: its message can't be shown, since its __str__ raises IndexError"
+    assert told(source) == f"r.py:5: TEST_FAILURE: the sample 'start': {why}"
+
+
+def test_of_two_definitions_the_last_counts_and_underscores_of_own_objects_are_taken() -> None:
+    twice = f"{HEAD}return None\n{HEAD}return 2.0"
+    assert told(twice) == ""
+    own = f"class Car:\n    def __init__(self):\n        self._last = 1.0\ncar = Car()\n{HEAD}return car._last"
+    assert told(own) == ""
+    hidden = f"import random\nbox = [random]\n{HEAD}r = box[0]\n    return r._inst.random()"
+    assert told(hidden) == "r.py:5: FORBIDDEN: the sample 'start': random._inst can't be used in a reward function"
+
+
+@pytest.mark.parametrize("config", ["[1]", "{", "3", "null"])
+def test_a_configuration_of_the_check_that_is_no_mapping_is_refused_in_one_line(
+    config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["rewards", str(tmp_path / "r.py"), "--config", config])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == f'--config: expected a JSON object such as {{"track": "chicane"}}, found {config!r}'
 
 
 @pytest.mark.parametrize(
