@@ -22,6 +22,8 @@ TYPES = ("discrete", "continuous")
 CAMERA = "FRONT_FACING_CAMERA"
 CAMERAS = (CAMERA, "STEREO_CAMERAS", "LEFT_CAMERA", "observation")
 """DeepRacer's cameras, of which a car has one; the simulated car has the first, and the last is its name in the oldest files."""
+_LEFT_OUT = {"STEREO_CAMERAS": "; its policy sees no depth from two images", "LEFT_CAMERA": ", in its middle"}
+"""What notes say of the cameras that the simulated car does not have."""
 LIDARS = {
     "LIDAR": {"sectors": 64, "rays": 1, "levels": 0},
     "SECTOR_LIDAR": {"sectors": 8, "rays": 8, "levels": 1},
@@ -157,9 +159,9 @@ def _sensors(sensors: Any) -> tuple[str | None, list[str]]:
         if len(several) > 1:
             raise Refused(("sensor",), f"a car has one {kind}, and there are {' and '.join(several)}")
     cameras = [
-        f"the simulated car has one front camera in the place of {sensor}; its policy sees no depth from two images"
+        f"the simulated car has one front camera in the place of {sensor}{_LEFT_OUT[sensor]}"
         for sensor in sensors
-        if sensor in CAMERAS[1:3]
+        if sensor in _LEFT_OUT
     ]
     return next((sensor for sensor in sensors if sensor in LIDARS), None), cameras
 
@@ -208,15 +210,16 @@ def _range(name: str, ends: Any, limits: tuple[float, float], unit: str, notes: 
     """The ends within the limits, with a note for one that is clipped."""
     where = ("action_space", name)
     _check_keys(where, ends, ("low", "high"))
-    clipped = []
-    for end in ("low", "high"):
-        asked = _number((*where, end), ends[end], unit)
-        clipped.append(_clipped(asked, limits))
-        if clipped[-1] != asked:
-            notes.append(f"{name}.{end} is {asked:g} {unit}, out of the car's range, and becomes {clipped[-1]:g}")
-    low, high = clipped
+    asked = [_number((*where, end), ends[end], unit) for end in ("low", "high")]
+    low, high = (_clipped(each, limits) for each in asked)
     if low >= high:
-        raise Refused(where, f"low is {low:g} and high is {high:g}; low must be less")
+        wrong = f"low is {asked[0]:g} and high is {asked[1]:g}"
+        if asked[0] < asked[1]:
+            raise Refused(where, f"{wrong}; the car's range is {limits[0]:g} to {limits[1]:g} {unit}")
+        raise Refused(where, f"{wrong}; low must be less")
+    for end, each, becomes in zip(("low", "high"), asked, (low, high), strict=True):
+        if becomes != each:
+            notes.append(f"{name}.{end} is {each:g} {unit}, out of the car's range, and becomes {becomes:g}")
     return low, high
 
 

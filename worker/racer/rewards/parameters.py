@@ -66,7 +66,7 @@ PARAMETERS = (
     Parameter("is_reversed", "bool", "one", "", "Whether the car drives against the direction of the track"),
     Parameter("is_crashed", "bool", "one", "", "Whether the car has hit an object"),
     Parameter("is_offtrack", "bool", "one", "", "Whether no wheel is on the road"),
-    Parameter("progress", "float", "one", "%", "Share of the lap that is done", (-100.0, 100.0)),
+    Parameter("progress", "float", "one", "%", "Share of the lap that is done", (None, 100.0)),
     Parameter("steps", "int", "one", "", "Control steps since the episode began", (1, None)),
     Parameter("speed", "float", "one", "m/s", "Speed that the action asks for", (0.0, 5.0)),
     Parameter(
@@ -212,7 +212,9 @@ def table() -> str:
     lines = ["| key | type | unit | values | what it is |", "|---|---|---|---|---|"]
     for each in PARAMETERS:
         least, most = ("" if bound is None else f"{bound:g}" for bound in each.limits)
-        values = f"{least} to {most}" if least and most else f"from {least}" if least else ""
+        values = (
+            f"{least} to {most}" if least and most else f"from {least}" if least else f"up to {most}" if most else ""
+        )
         note = "" if each.documented else " (not documented by AWS)"
         lines.append(f"| `{each.name}` | `{each.type}` | {each.unit} | {values} | {each.meaning}{note} |")
     return "\n".join(lines) + "\n"

@@ -184,7 +184,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     ),
     f"{LOW}: expected a list of 2 to 30 actions, found 1, which AWS refuses, too": space([STILL]),
     f"{LOW}: expected a list of 2 to 30 actions, found 31, which AWS refuses, too": {"action_space": [STILL] * 31},
-    f"{LOW}.speed: low is 4 and high is 4; low must be less": space(
+    f"{LOW}.speed: low is 5 and high is 6; the car's range is 0.1 to 4 m/s": space(
         {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 5, "high": 6}}
     ),
     "config.action_space: expected the path or the content of a model_metadata.json, found 5": {"action_space": 5},
@@ -244,9 +244,12 @@ def test_actions_out_of_the_car_s_range_are_clipped_as_aws_s_simulator_does_with
 
 
 def test_a_camera_or_an_algorithm_of_a_metadata_file_that_the_job_does_not_have_is_noted() -> None:
-    for sensor in ("STEREO_CAMERAS", "LEFT_CAMERA"):
+    for sensor, more in (
+        ("STEREO_CAMERAS", "; its policy sees no depth from two images"),
+        ("LEFT_CAMERA", ", in its middle"),
+    ):
         assert noted({**DISCRETE, "sensor": ["LIDAR", sensor]}) == [
-            f"action_space: the simulated car has one front camera in the place of {sensor}; its policy sees no depth from two images"
+            f"action_space: the simulated car has one front camera in the place of {sensor}{more}"
         ]
         config = RacerConfig(action_space={**DISCRETE, "sensor": ["LIDAR", sensor]})
         assert Racer.sketch(config).bundle_documents("ppo")["model_metadata.json"]["sensor"] == ["LIDAR"]
