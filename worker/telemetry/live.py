@@ -76,10 +76,11 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
                 break
             recording.interrupt("the training died; the recording goes on with its next attempt")
             activity.say(f"the training of run {run.name} died; waiting for its next attempt on this machine …")
-            before_it = segment.layout
+            layout = segment.layout
             try:
                 segment = asking.attach(patience, stop, activity)
-                if replace(segment.layout, rows=before_it.rows) != before_it:
+                there = replace(segment.layout, rows=layout.rows, worlds=layout.worlds)
+                if there != layout or episodes * asking.worlds != wanted:
                     raise UserError(f"run {run.name}: its training went on with other worlds")
             except UserError as error:
                 if stop:
