@@ -234,7 +234,7 @@ def test_a_league_is_created_by_a_form_and_wrong_rules_are_told(console: Console
 def test_a_model_is_raced_and_its_race_entered_once_it_has_ended(console: Console, store: Store) -> None:
     visitor = console.visitor()
     assert [each for each in visitor.page("/leagues/cup").all("input", list="models")]
-    assert "may use job queue lab only" in console.visitor("lab").refusal("/leagues/cup/races", model="fast@2")
+    assert "model fast does not exist" in console.visitor("lab").refusal("/leagues/cup/races", 404, model="fast@2")
     for model, words in (("", "model: choose one"), ("fast@x", "model: choose one"), ("fats", "did you mean fast?")):
         refused = visitor.submit("/leagues/cup/races", model=model)
         assert words in refused.json()["message"]

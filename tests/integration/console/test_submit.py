@@ -283,7 +283,7 @@ def test_a_reward_function_that_is_tried_tells_nothing_of_the_server(console: Co
             "problem"
         ]
         assert problem["message"].endswith(
-            "r.py:6: TEST_FAILURE: the sample 'start': ValueError: [], on track oval with 133 waypoints"
+            "r.py:5: FORBIDDEN: the sample 'start': inspect can't be used in a reward function, on track oval with 133 waypoints"
         )
 
 
