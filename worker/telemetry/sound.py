@@ -96,12 +96,13 @@ class SoundRecords:
 
     def _records(self, data: mmap.mmap, size: int) -> Iterator[McapRecord]:
         place = len(_MAGIC) if data[: len(_MAGIC)] == _MAGIC else 0
+        summary = _summary(data, size)
         while place < size:
+            self._ended |= place == summary
             if (read := self._try(data, place, size)) is None:
                 end = next((each for each in places(data, place + 1) if self._is_sound(data, each, size)), size + 1)
-                if end > size and (end := self._last(data, place, size)) > size:
+                if end > size and (end := self._last(data, place, size, summary)) > size:
                     self.cut = size - place
-                    self.damaged += data[size - len(_MAGIC) :] == _MAGIC  # it was finished
                     return
                 self._lose(data, place, end)
             else:
@@ -134,8 +135,10 @@ class SoundRecords:
         probe._checked = self._checked
         return probe._try(data, place, size) is not None
 
-    def _last(self, data: mmap.mmap, place: int, size: int) -> int:
+    def _last(self, data: mmap.mmap, place: int, size: int, summary: int) -> int:
         """Where the damage ends that begins at a place, with no sound record behind it; more than ``size`` if it is a cut alone."""
+        if data[size - len(_MAGIC) :] == _MAGIC:  # it was finished
+            return summary if place < summary else size
         if self._is_cut(data, place, size):
             return size + 1
         ends = [end for _, end in _bounds(data, place, size) if end < size]
@@ -267,6 +270,14 @@ class SoundRecords:
         lost += [f"attachment {name}".strip() for name in self._lost_attachments]
         places = f"damaged at {counted(self.damaged, 'place')} ({counted(self.unreadable, 'byte')})"
         return f"{places}: {' and '.join(lost)} lost" if lost else f"{places}: nothing is known to be lost"
+
+
+def _summary(data: mmap.mmap, size: int) -> int:
+    """Where the summary of a finished file begins; 0 where there is none, or it is damaged."""
+    if size < 37 + len(_MAGIC):
+        return 0
+    start, crc = struct.unpack_from("<Q", data, size - 28)[0], struct.unpack_from("<I", data, size - 12)[0]
+    return start if 0 < start < size - 37 and zlib.crc32(data[start : size - 12]) == crc else 0
 
 
 def _bounds(data: mmap.mmap, place: int, size: int) -> list[tuple[int, int]]:
