@@ -98,7 +98,7 @@ class SoundRecords:
         place = len(_MAGIC) if data[: len(_MAGIC)] == _MAGIC else 0
         summary = _summary(data, size)
         while place < size:
-            self._ended |= place == summary
+            self._ended |= place == summary > 0
             if (read := self._try(data, place, size)) is None:
                 end = next((each for each in places(data, place + 1) if self._is_sound(data, each, size)), size + 1)
                 if end > size and (end := self._last(data, place, size, summary)) > size:

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 
 from tests.support.worker.in_process import call_worker
 from tests.training.worker.test_recording import Recorded
+from worker.errors import UserError
 from worker.telemetry.live import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
@@ -189,6 +190,9 @@ def test_what_can_not_be_counted_is_an_unknown_number(whole: Path, tmp_path: Pat
     (start, _), (end, _) = chunks_of(whole)[3:5]
     losses, _ = kept_of(data[:start] + bytes(end - start) + data[end:], tmp_path)
     assert "an unknown number of messages lost" in losses
+    (tmp_path / "zeros.mcap.partial").write_bytes(bytes(5000))
+    with pytest.raises(UserError, match="an unknown number of messages lost; there is no control step"):
+        recover(tmp_path / "zeros.mcap.partial")
     _, end = next(records_of(data, 9))
     losses, (_, _, attachments) = kept_of(data[: end - 1] + b"\0" + data[end:], tmp_path)
     assert "attachment job.json lost" in losses and len(attachments) == len(attachments_of(whole)) - 1
