@@ -10,6 +10,7 @@ import errno
 import os
 
 from shared_store.cgroups import CONTROLLER, find_group, is_delegated
+from shared_store.entered import entered
 
 _JOB = "job"
 
@@ -63,7 +64,7 @@ def make_memory_group(path: str, limit: int) -> None:
 
 def entering(path: str) -> list[str]:
     """A command that enters the group and becomes the command after it."""
-    return ["/bin/sh", "-c", 'echo 0 > "$0"; exec "$@"', f"{path}/cgroup.procs"]
+    return entered(f"{path}/cgroup.procs")
 
 
 def killed_for_memory(path: str) -> bool:

@@ -11,7 +11,7 @@ import typer
 
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec, tell_note
-from orchestrator.cli.progress import summary
+from orchestrator.cli.progress import await_end, summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
@@ -133,7 +133,7 @@ def evaluate(
             "race" if race else "evaluate",
         )
         job = submit_spec(client, spec, f"evaluate {source}")["jobId"]
-        code = see_through(client, job, _only_errors if as_json else _told)
+        code = see_through(client, job, await_end if as_json else _told)
         if code == 0 and (as_json or output is not None):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
             summary = next(each for each in found if each.get("job") == job)
@@ -208,12 +208,6 @@ def _told(client: Client, job: str) -> int:
     for line in client.logs(job, follow=True):
         if line["rank"] == 0:
             echo(line["text"])
-    return _ended(client, job)
-
-
-def _only_errors(client: Client, job: str) -> int:
-    for _ in client.logs(job, follow=True):
-        pass
     return _ended(client, job)
 
 

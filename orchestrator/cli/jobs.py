@@ -220,7 +220,9 @@ def stop(
 
 
 def _can_go_on(detail: Mapping[str, Any]) -> bool:
-    """Whether a job's run can be resumed: it has a checkpoint, or runs a command from YAML."""
+    """Whether a job's run can be resumed: it comes from YAML, is no array, and has a checkpoint or runs a command."""
+    if not detail["spec"] or detail["children"]:
+        return False
     return bool((detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]))
 
 

@@ -65,10 +65,17 @@ def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:
     return next((node for node in nodes if node.get("error")), None)
 
 
-def summary(client: Client, job_id: str) -> int:
-    """Print how a job ended and where its results are; returns the command's exit code."""
+def await_end(client: Client, job_id: str) -> int:
+    """Wait for a job's end without a word on standard output; a failure is told on standard error. Returns the command's exit code."""
+    for _ in client.logs(job_id, follow=True):
+        pass
+    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id, err=True)
+
+
+def summary(client: Client, job_id: str, err: bool = False) -> int:
+    """Print how a job ended and where its results are, or on standard error; returns the command's exit code."""
     detail = client.get(f"/api/jobs/{job_id}")
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, stderr=err)
     succeeded = detail["status"] == "SUCCEEDED"
     colour = "green" if succeeded else "red"
     reason = "" if succeeded else f": {one_line(detail['statusReason'])}"

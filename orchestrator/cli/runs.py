@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, store_here, tell_note
-from orchestrator.cli.progress import follow
+from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.serving import CpusOption, StoreOption, found_or_own, see_through
 from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
@@ -70,9 +70,9 @@ def resume(
         code = None
         if is_own:
             echo("no other controller is running: this command is the controller until the job ends", err=True)
-            code = see_through(client, resumed["jobId"])
+            code = see_through(client, resumed["jobId"], await_end if as_json else follow)
         elif follow_:
-            code = follow(client, resumed["jobId"])
+            code = (await_end if as_json else follow)(client, resumed["jobId"])
     if code is not None:
         raise typer.Exit(code)
 

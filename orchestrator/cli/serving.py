@@ -73,7 +73,7 @@ def see_through(client: Client, job: str, follow: Callable[[Client, str], int] =
     try:
         return follow(client, job)
     except KeyboardInterrupt:
-        echo("\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)")
+        echo("\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)", err=True)
         client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
         follow(client, job)
         return 130

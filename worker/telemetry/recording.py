@@ -20,7 +20,7 @@ from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.rows import Rows
-from worker.telemetry.sound import CHANNELS, CHECKSUM, checksum
+from worker.telemetry.sound import CHANNELS, LIBRARY, with_checksum
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -109,7 +109,7 @@ class Recording:
         try:
             self._file = self.partial.open("wb")
             self._writer = writer_to(self._file)
-            self._writer.start("ros2", "muster")
+            self._writer.start("ros2", LIBRARY)
             self._attach(attachments)
             self._begin()
             self._flush()
@@ -260,7 +260,7 @@ class Recording:
             "end": cause,
             "complete": "true" if self._whole[world] else "false",
         }
-        self._writer.add_metadata("episode", {**known, CHECKSUM: checksum(known)})
+        self._writer.add_metadata("episode", with_checksum("episode", known))
         self.say(
             f"world {world}: episode {fields['episode']} ended by {cause} after {counted(int(steps), 'step')}, return {total:.4g}"
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from worker.errors import UserError
 from worker.telemetry.recording import CHUNK, PARTIAL, writer_to
-from worker.telemetry.sound import SoundRecords
+from worker.telemetry.sound import LIBRARY, SoundRecords, with_checksum
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _copy(records: SoundRecords, target: Path) -> tuple[int, int]:
     count = steps = size = 0
     with target.open("wb") as made:
         writer = writer_to(made)
-        writer.start("ros2", "muster")
+        writer.start("ros2", LIBRARY)
         for record in records:
             if isinstance(record, Schema):
                 if record.id not in schemas:
@@ -91,6 +91,6 @@ def _copy(records: SoundRecords, target: Path) -> tuple[int, int]:
             elif isinstance(record, Attachment):
                 writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
             elif isinstance(record, Metadata):
-                writer.add_metadata(record.name, record.metadata)
+                writer.add_metadata(record.name, with_checksum(record.name, record.metadata))
         writer.finish()
     return count, steps

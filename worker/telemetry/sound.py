@@ -7,12 +7,27 @@ import json
 import mmap
 import struct
 import zlib
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shared_store.wording import counted
 from worker.telemetry import messages
+from worker.telemetry.shapes import (
+    ATTACHMENT,
+    CHUNK,
+    CHUNK_BODY,
+    COMPRESSION,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    INDEX,
+    METADATA,
+    fits,
+    identify,
+    places,
+)
 
 if TYPE_CHECKING:
     from mcap.data_stream import ReadDataStream
@@ -20,23 +35,21 @@ if TYPE_CHECKING:
 
 CHANNELS = "channels.json"
 """Name of the attachment that repeats the table of channels, for a file with a damaged first chunk."""
-CHECKSUM = "crc32"
-"""Key of an episode's metadata: the checksum of the others, since MCAP has none there."""
+LIBRARY = "muster 2"
+"""Library in the header of a recording in which all metadata have a checksum."""
+_UNCHECKED = "muster"
+"""Library of earlier recordings, whose metadata have none that holds."""
+_CHECKSUM = "crc32"
+"""Key of the metadata's checksum, since MCAP has none there."""
 _MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _CHUNK, _INDEX, _ATTACHMENT, _METADATA, _DATA_END = 1, 2, 6, 7, 9, 12, 15
-_OPCODES = range(1, 16)
-_INDEX_BYTES = 9 + 2 + 4
-"""Bytes of a chunk's index of one channel before its entries, of 16 bytes."""
-_COMPRESSION = b"\x04\x00\x00\x00zstd"
-_BEFORE_COMPRESSION = 9 + 8 + 8 + 8 + 4
-"""Bytes of a chunk before the name of its compression: opcode, length, two times, size and checksum of its content."""
 _LARGEST_CHUNK = 1 << 28
 """Bytes of a chunk's content; one message, such as a robot's meshes, may make a chunk long."""
 
 
-def checksum(metadata: dict[str, str]) -> str:
-    """The value of :data:`CHECKSUM` for an episode's metadata without it."""
-    return f"{zlib.crc32(json.dumps(sorted(metadata.items())).encode()):08x}"
+def with_checksum(name: str, values: dict[str, str]) -> dict[str, str]:
+    """Metadata of this name with these values, and their checksum in place of any that they have."""
+    own = {key: value for key, value in values.items() if key != _CHECKSUM}
+    return {**own, _CHECKSUM: f"{zlib.crc32(json.dumps([name, sorted(own.items())]).encode()):08x}"}
 
 
 class SoundRecords:
@@ -63,8 +76,15 @@ class SoundRecords:
         self.path = path
         self.found = self.whole = False
         self.damaged = self.lost = self.unreadable = self.cut = 0
+        self._lost_attachments: list[str] = []
+        self._lost_metadata = 0
+        self._uncounted = self._pending = self._behind = False
+        """Whether a chunk is lost that no index counts, one whose indexes may follow, and anything since the last sound chunk."""
         self._known: set[int] = set()
         self._schemas: set[int] = set()
+        self._listed: defaultdict[int, list[int]] = defaultdict(list)
+        """Times of the last sound chunk's messages by channel."""
+        self._checked, self._ended = True, False
 
     def __iter__(self) -> Iterator[McapRecord]:
         with self.path.open("rb") as file:
@@ -72,93 +92,155 @@ class SoundRecords:
                 return
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 yield from self._records(data, size)
+                self._uncounted |= self._pending
 
     def _records(self, data: mmap.mmap, size: int) -> Iterator[McapRecord]:
-        self._known, self._schemas = set(), set()
         place = len(_MAGIC) if data[: len(_MAGIC)] == _MAGIC else 0
-        counting = False
+        summary = _summary(data, size)
         while place < size:
-            opcode, end = _bounds(data, place, size)
-            try:
-                records = self._read(opcode, data[place + 9 : end]) if end <= size else None
-            except Exception:  # zstandard, struct and mcap raise what they meet in damaged bytes
-                records = None
-            if records is None:
-                end = self._next(data, place, end, size)
-                if end > size:
+            self._ended |= place == summary > 0
+            if (read := self._try(data, place, size)) is None:
+                end = next((each for each in places(data, place + 1) if self._is_sound(data, each, size)), size + 1)
+                if end > size and (end := self._last(data, place, size, summary)) > size:
                     self.cut = size - place
-                    self.damaged += data[size - len(_MAGIC) :] == _MAGIC  # it was finished
                     return
-                self.damaged, self.unreadable = self.damaged + 1, self.unreadable + end - place
-                counting = opcode == _CHUNK  # the indexes behind it count its messages
+                self._lose(data, place, end)
             else:
-                if opcode == _INDEX and counting:
-                    self.lost += (end - place - _INDEX_BYTES) // 16
-                counting = counting and opcode != _CHUNK
-                self.found |= bool(records) or opcode == _HEADER
+                opcode, end, records = read
+                if opcode == INDEX:
+                    self._count(data, place, end)
+                elif opcode == CHUNK:
+                    self._uncounted |= self._pending
+                    self._pending = self._behind = False
+                self.found |= bool(records) or opcode == HEADER
                 yield from records
-                if opcode == _FOOTER:
+                if opcode == FOOTER:
                     self._end(data, place, size)
                     return
             place = end
 
+    def _try(self, data: mmap.mmap, place: int, size: int) -> tuple[int, int, list[McapRecord]] | None:
+        """Opcode, end and content of the record at a place; None where none can be read."""
+        for opcode, end in _bounds(data, place, size):
+            if end <= size:
+                try:
+                    return opcode, end, self._read(opcode, data[place + 9 : end])
+                except Exception:  # zstandard, struct and mcap raise what they meet in damaged bytes
+                    continue
+        return None
+
+    def _is_sound(self, data: mmap.mmap, place: int, size: int) -> bool:
+        """Whether a record that can be read begins here."""
+        probe = SoundRecords(self.path)
+        probe._checked = self._checked
+        return probe._try(data, place, size) is not None
+
+    def _last(self, data: mmap.mmap, place: int, size: int, summary: int) -> int:
+        """Where the damage ends that begins at a place, with no sound record behind it; more than ``size`` if it is a cut alone."""
+        if data[size - len(_MAGIC) :] == _MAGIC:  # it was finished
+            return summary if place < summary else size
+        if self._is_cut(data, place, size):
+            return size + 1
+        ends = [end for _, end in _bounds(data, place, size) if end < size]
+        begun = [each for each in (*ends, *places(data, place + 1)) if self._is_cut(data, each, size)]
+        return min(begun, default=size)
+
+    def _is_cut(self, data: mmap.mmap, place: int, size: int) -> bool:
+        """Whether a record begins here that the end of the file cuts off."""
+        opcode, length = data[place], int.from_bytes(data[place + 1 : place + 9], "little")
+        if place + 9 > size:
+            return opcode in (HEADER, CHUNK, INDEX, ATTACHMENT, METADATA, DATA_END) or self._ended
+        return place + 9 + length > size and fits(opcode, length, data[place + 9 : place + 9 + length], self._ended)
+
+    def _lose(self, data: mmap.mmap, place: int, end: int) -> None:
+        """Count what is lost between two places."""
+        self.damaged, self.unreadable, self._behind = self.damaged + 1, self.unreadable + end - place, True
+        if self._ended:
+            return  # the summary repeats what stands before it
+        opcode, name = identify(data[place:end])
+        if opcode == ATTACHMENT:
+            self._lost_attachments += [name] if name != CHANNELS else []
+        elif opcode == METADATA:
+            self._lost_metadata += 1
+        elif opcode not in (INDEX, HEADER, DATA_END):
+            self._uncounted |= self._pending
+            self._pending = True
+
+    def _count(self, data: mmap.mmap, place: int, end: int) -> None:
+        """Count the messages of an index whose chunk is lost. One that contradicts a sound chunk is damaged itself."""
+        channel, _ = struct.unpack_from("<HI", data, place + 9)
+        times = [time for time, _ in struct.iter_unpack("<QQ", data[place + 15 : end])]
+        if sorted(times) == sorted(self._listed.get(channel, [])):
+            return
+        if self._behind:
+            self.lost += len(times)
+            self._pending = False
+        else:
+            self.damaged, self.unreadable = self.damaged + 1, self.unreadable + end - place
+
     def _end(self, data: mmap.mmap, footer: int, size: int) -> None:
         """Compare the checksums of a finished file's summary and of all that stands before it."""
         start, _, of_summary = struct.unpack_from("<QQI", data, footer + 9)
-        data_end = start - 13
-        sound = size == footer + 29 + len(_MAGIC) and 0 < data_end < footer and data[footer + 29 :] == _MAGIC
+        data_end, tail = start - 13, data[footer + 29 :]
+        sound = 0 < data_end < footer and _MAGIC.startswith(tail)
         if sound:
             of_data = int.from_bytes(data[data_end + 9 : start], "little")
             sound = zlib.crc32(data[start : footer + 25]) == of_summary
             sound &= of_data in (0, zlib.crc32(data[:data_end]))
         if not sound and not self.damaged:
             self.damaged = 1  # where nothing of the recording is, such as in an index
-        self.whole = not self.damaged
+        self.whole = not self.damaged and tail == _MAGIC
 
     def _read(self, opcode: int, body: bytes) -> list[McapRecord]:
         """What a record holds. Raises whatever its damaged bytes cause."""
-        from mcap.records import Attachment, Metadata
+        from mcap.data_stream import RecordBuilder
+        from mcap.records import Attachment, Header, Metadata
 
-        if opcode == _CHUNK:
+        if opcode == CHUNK:
             return self._chunk(body)
-        if opcode == _ATTACHMENT:
+        _require(fits(opcode, len(body), body, self._ended))
+        if opcode == ATTACHMENT:
             _require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"))
             attachment = Attachment.read(_stream(body))
             return self._channels(attachment.data) if attachment.name == CHANNELS else [attachment]
-        if opcode == _METADATA:
+        if opcode == METADATA:
             metadata = Metadata.read(_stream(body))
-            values = {key: value for key, value in metadata.metadata.items() if key != CHECKSUM}
-            _require(metadata.metadata.get(CHECKSUM, checksum(values)) == checksum(values))
+            metadata.write(builder := RecordBuilder())
+            _require(builder.end()[9:] == body)
+            _require(not self._checked or metadata.metadata == with_checksum(metadata.name, metadata.metadata))
             return [metadata]
-        if opcode == _INDEX:
-            _require(len(body) - 6 == struct.unpack_from("<I", body, 2)[0] and len(body) % 16 == 6)
-        elif opcode == _HEADER:
-            _stream(body).read_prefixed_string()
-        elif opcode in (_FOOTER, _DATA_END):
-            _require(len(body) == {_FOOTER: 20, _DATA_END: 4}[opcode])
-        else:
-            _require(opcode in _OPCODES)  # of the summary
+        if opcode == HEADER:
+            self._checked = Header.read(_stream(body)).library != _UNCHECKED
+        self._ended |= opcode == DATA_END
         return []
 
     def _chunk(self, body: bytes) -> list[McapRecord]:
         """The records of a chunk in which every message has a known channel; others are counted as lost."""
+        import zstandard
         from mcap.records import Channel, Chunk, Message, Schema
         from mcap.stream_reader import breakup_chunk
 
-        chunk = Chunk.read(_stream(body))
-        _require(chunk.compression == "zstd" and 0 < chunk.uncompressed_size <= _LARGEST_CHUNK)
-        _require(len(body) == _BEFORE_COMPRESSION - 9 + len(_COMPRESSION) + 8 + len(chunk.data))
-        kept = []
-        for record in breakup_chunk(chunk, validate_crc=True):
+        start, end, size, crc = struct.unpack_from("<QQQI", body)
+        _require(body[28 : 28 + len(COMPRESSION)] == COMPRESSION and 0 < size <= _LARGEST_CHUNK)
+        frame = body[CHUNK_BODY:]  # not by the length before it: if the record's own differs, the frame decides
+        _require(zstandard.get_frame_parameters(frame).content_size == size)
+        decompressor = zstandard.ZstdDecompressor().decompressobj()
+        content = decompressor.decompress(frame)
+        _require(decompressor.eof and not decompressor.unused_data and len(content) == size)
+        _require(zlib.crc32(content) == crc)
+        kept, self._listed = [], defaultdict(list)
+        for record in breakup_chunk(Chunk("", content, end, start, crc, size)):
             if isinstance(record, Schema):
                 self._schemas.add(record.id)
             elif isinstance(record, Channel):
                 if record.schema_id not in self._schemas:
                     continue  # the repeated table brings both
                 self._known.add(record.id)
-            elif isinstance(record, Message) and record.channel_id not in self._known:
-                self.lost += 1
-                continue
+            elif isinstance(record, Message):
+                self._listed[record.channel_id].append(record.log_time)
+                if record.channel_id not in self._known:
+                    self.lost += 1
+                    continue
             kept.append(record)
         return kept
 
@@ -177,61 +259,36 @@ class SoundRecords:
                 made.append(Channel(message_encoding="cdr", **known))
         return made
 
-    def _next(self, data: mmap.mmap, place: int, end: int, size: int) -> int:
-        """Where the next record begins after a damaged one that seems to end at ``end``; more than ``size`` where there is none."""
-        if end == size or (end < size and (self._is_sound(data, end, size) or _is_cut(data, end, size))):
-            return end
-        search = place + 1
-        while (found := data.find(_COMPRESSION, search)) >= 0:
-            if (begin := found - _BEFORE_COMPRESSION) > place and self._is_sound(data, begin, size):
-                return begin
-            search = found + 1
-        return size + 1
-
-    def _is_sound(self, data: mmap.mmap, place: int, size: int) -> bool:
-        """Whether a record that can be read begins here."""
-        opcode, end = _bounds(data, place, size)
-        if end > size:
-            return False
-        probe = SoundRecords(self.path)
-        try:
-            probe._read(opcode, data[place + 9 : end])
-        except Exception:
-            return False
-        return True
-
     def losses(self) -> str:
         """What is lost, in words; empty where it is the end of a file that was cut short, or nothing."""
         if not self.damaged:
             return ""
+        lost = [f"at least {counted(self.lost, 'message')}"] if self.lost else []
+        if self._uncounted:
+            lost.append(f"an unknown number of {'further messages' if lost else 'messages'}")
+        lost += [f"the record of {counted(self._lost_metadata, 'episode')}"] if self._lost_metadata else []
+        lost += [f"attachment {name}".strip() for name in self._lost_attachments]
         places = f"damaged at {counted(self.damaged, 'place')} ({counted(self.unreadable, 'byte')})"
-        return (
-            f"{places}: at least {counted(self.lost, 'message')} lost"
-            if self.lost
-            else f"{places}: no message is known to be lost"
-        )
+        return f"{places}: {' and '.join(lost)} lost" if lost else f"{places}: nothing is known to be lost"
 
 
-def _bounds(data: mmap.mmap, place: int, size: int) -> tuple[int, int]:
-    """Opcode and end of the record at a place. A chunk is known by its compression, too, if its opcode or length is damaged."""
+def _summary(data: mmap.mmap, size: int) -> int:
+    """Where the summary of a finished file begins; 0 where there is none, or it is damaged."""
+    if size < 37 + len(_MAGIC):
+        return 0
+    start, crc = struct.unpack_from("<Q", data, size - 28)[0], struct.unpack_from("<I", data, size - 12)[0]
+    return start if 0 < start < size - 37 and zlib.crc32(data[start : size - 12]) == crc else 0
+
+
+def _bounds(data: mmap.mmap, place: int, size: int) -> list[tuple[int, int]]:
+    """Opcode and end of the record that may be at a place. A chunk is known by its compression, too, and has its length twice."""
     if place + 9 > size:
-        return 0, size + 1
-    inner = place + _BEFORE_COMPRESSION + len(_COMPRESSION)
-    if data[place + _BEFORE_COMPRESSION : inner] == _COMPRESSION and inner + 8 <= size:
-        end = inner + 8 + struct.unpack_from("<Q", data, inner)[0]
-        if end <= size:
-            return _CHUNK, end
-    return data[place], place + 9 + struct.unpack_from("<Q", data, place + 1)[0]
-
-
-def _is_cut(data: mmap.mmap, place: int, size: int) -> bool:
-    """Whether a record begins here that the end of the file cuts off."""
-    opcode, end = _bounds(data, place, size)
-    return (
-        data[place] in _OPCODES
-        and (place + 9 > size or size < end < place + _LARGEST_CHUNK)
-        and opcode in (0, data[place])
-    )
+        return []
+    bounds = [(data[place], place + 9 + struct.unpack_from("<Q", data, place + 1)[0])]
+    inner = place + 9 + CHUNK_BODY
+    if data[inner - 8 - len(COMPRESSION) : inner - 8] == COMPRESSION and inner <= size:
+        bounds += [(CHUNK, bounds[0][1]), (CHUNK, inner + struct.unpack_from("<Q", data, inner - 8)[0])]
+    return list(dict.fromkeys(bounds))
 
 
 def _stream(body: bytes) -> ReadDataStream:

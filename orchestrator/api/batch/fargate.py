@@ -77,7 +77,7 @@ def _check_on_fargate(container: Mapping[str, Any], where: str) -> None:
     linux = container.get("linuxParameters") or {}
     given = [
         *(key for key in _ONLY_EC2 if container.get(key)),
-        *(f"linuxParameters {key}" for key in _ONLY_EC2_LINUX if linux.get(key) is not None),
+        *(f"linuxParameters {key}" for key in _ONLY_EC2_LINUX if linux.get(key) not in (None, [])),
         *(f"volume {each.get('name')!r} of the host" for each in container.get("volumes") or [] if each.get("host")),
     ]
     if given:

@@ -51,7 +51,7 @@ def check_members(container: Mapping[str, Any], where: str) -> None:
             raise ClientError(
                 f"{where}: volume {volume.get('name')!r} names no directory: give host.sourcePath or efsVolumeConfiguration"
             )
-    if (user := container.get("user")) is not None and not _USER.fullmatch(user):
+    if (user := container.get("user")) and not _USER.fullmatch(user):
         raise ClientError(
             f"{where}: user {user[:60]!r}: a name or number, and after a colon a group, in small letters, digits, _ and -"
         )

@@ -100,6 +100,11 @@ def test_a_job_on_ec2_must_not_have_members_of_fargate(batch: Batch, member: str
         batch.register("ec2-bad", "container", containerProperties={**CONTAINER, member: MEMBERS[member]})
 
 
+def test_empty_members_say_nothing(batch: Batch) -> None:
+    empty = {"user": "", "linuxParameters": {"devices": [], "tmpfs": []}}
+    batch.register("fargate-empty", "container", containerProperties={**CONTAINER, **empty}, **FARGATE)
+
+
 def test_an_override_and_a_gang_can_t_leave_fargate(batch: Batch) -> None:
     arn = batch.register("fargate-override", "container", containerProperties=CONTAINER, **FARGATE)
     with refused("no MEMORY 64 with VCPU 0.25"):

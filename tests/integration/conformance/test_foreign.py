@@ -262,3 +262,20 @@ def test_a_definition_without_image_or_resources_is_refused_at_once(batch: Batch
         batch.register("lacking", "container", containerProperties=given)
     with refused("Error executing request, Exception : ", message):
         batch.multinode("lacking", "", ranges=[{"targetNodes": "0:", "container": given}])
+
+
+def test_variables_with_names_that_no_shell_has_reach_the_job(batch: Batch) -> None:
+    env = {"my.var": "1", "A b": "2", "BASH_FUNC_x%%": "() { :; }"}
+    script = f"import os; print([os.environ.get(each) for each in {list(env)}])"
+    definition = batch.register(
+        "names",
+        "container",
+        containerProperties={
+            "image": "any",
+            "command": ["python3", "-c", script],
+            "environment": [{"name": name, "value": value} for name, value in env.items()],
+            "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "128"}],
+        },
+    )
+    job = batch.submit(definition)
+    assert batch.wait(job)["status"] == "SUCCEEDED" and batch.lines(job) == [str(list(env.values()))]

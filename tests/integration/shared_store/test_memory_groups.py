@@ -83,5 +83,21 @@ def test_a_rank_whose_group_is_gone_starts_all_the_same(tmp_path: Path) -> None:
     assert ended.returncode == 7 and "cgroup.procs" in ended.stderr
 
 
+def test_the_environment_is_passed_on_as_it_is(tmp_path: Path) -> None:
+    """Also variables with names that a shell can't have, and those that it sets."""
+    (tmp_path / "cgroup.procs").touch()
+    sent = {
+        "my.var": "1",
+        "A b": "2",
+        "BASH_FUNC_x%%": "() { :; }",
+        "IFS": ":",
+        "PPID": "7",
+        "PATH": os.environ["PATH"],
+    }
+    ended = subprocess.run([*entering(str(tmp_path)), "env", "-0"], env=sent, stdout=subprocess.PIPE, text=True)
+    assert dict(each.split("=", 1) for each in ended.stdout.split("\0")[:-1]) == sent
+    assert (tmp_path / "cgroup.procs").read_text() == "0"
+
+
 def test_what_the_doctor_says_is_so(group: str) -> None:
     assert limits_memory(own_group())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,10 +12,12 @@ from mcap.reader import make_reader
 
 from tests.support.worker.in_process import call_worker
 from tests.training.worker.test_recording import Recorded
+from worker.errors import UserError
 from worker.telemetry.live import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
 from worker.telemetry.replay import Replay
+from worker.telemetry.sound import CHANNELS
 
 Messages = dict[str, list[tuple[int, bytes]]]
 LARGEST = 110
@@ -38,9 +42,26 @@ def messages_of(path: Path) -> Messages:
     return found
 
 
-def metadata_of(path: Path) -> list[dict[str, str]]:
+def metadata_of(path: Path) -> list[tuple[str, dict[str, str]]]:
     with path.open("rb") as file:
-        return [each.metadata for each in make_reader(file).iter_metadata()]
+        return [(each.name, each.metadata) for each in make_reader(file).iter_metadata()]
+
+
+def attachments_of(path: Path) -> list[tuple[object, ...]]:
+    """All but the table of channels."""
+    with path.open("rb") as file:
+        found = [each for each in make_reader(file).iter_attachments() if each.name != CHANNELS]
+        return [(each.name, each.media_type, each.log_time, each.create_time, each.data) for each in found]
+
+
+def records_of(data: bytes, opcode: int) -> Iterator[tuple[int, int]]:
+    """Offset and end of each record of a kind, in a whole file or one that is cut."""
+    place = 8
+    while place + 9 < len(data) - 8:
+        end = place + 9 + struct.unpack_from("<Q", data, place + 1)[0]
+        if data[place] == opcode:
+            yield place, end
+        place = end
 
 
 def chunks_of(path: Path) -> list[tuple[int, int]]:
@@ -51,8 +72,11 @@ def chunks_of(path: Path) -> list[tuple[int, int]]:
     return [(each.chunk_start_offset, each.chunk_length) for each in summary.chunk_indexes]
 
 
-def recovered(damaged: bytes, folder: Path, original: Messages) -> tuple[int, int, str]:
-    """Recover bytes by the command: exit code, number of messages kept, lines. Each message is one of the original."""
+def recovered(damaged: bytes, folder: Path, original: Messages, whole: Path | None = None) -> tuple[int, int, str]:
+    """Recover bytes by the command: exit code, number of messages kept, lines. Each message is one of the original.
+
+    So are the metadata and attachments, where the original's path is given.
+    """
     partial, target = folder / "f.mcap.partial", folder / "f.mcap"
     target.unlink(missing_ok=True)
     partial.write_bytes(damaged)
@@ -63,6 +87,9 @@ def recovered(damaged: bytes, folder: Path, original: Messages) -> tuple[int, in
     kept = messages_of(target)
     for topic, rows in kept.items():
         assert set(rows) <= set(original[topic]), topic
+    if whole is not None:
+        assert all(each in metadata_of(whole) for each in metadata_of(target))
+        assert all(each in attachments_of(whole) for each in attachments_of(target))
     return done.returncode, sum(map(len, kept.values())), done.stdout + done.stderr
 
 
@@ -72,7 +99,7 @@ def test_flipped_bits_never_become_values_and_cost_one_chunk_at_most(whole: Path
     for _ in range(60):
         flipped = bytearray(data)
         flipped[chance.randrange(8, len(data) - 8)] ^= 1 << chance.randrange(8)
-        code, kept, lines = recovered(bytes(flipped), tmp_path, original)
+        code, kept, lines = recovered(bytes(flipped), tmp_path, original, whole)
         assert code == 1 and "damaged at 1 place" in lines and kept >= total - LARGEST, lines
 
 
@@ -85,9 +112,90 @@ def test_flipped_bits_of_a_cut_file_are_found_too(whole: Path, tmp_path: Path) -
     for _ in range(60):
         flipped = bytearray(cut)
         flipped[chance.randrange(begin, len(cut) - 200)] ^= 1 << chance.randrange(8)
-        code, kept, lines = recovered(bytes(flipped), tmp_path, original)
+        code, kept, lines = recovered(bytes(flipped), tmp_path, original, whole)
         # an index of a chunk holds nothing that is kept
         assert kept == without or (code == 1 and kept >= without - LARGEST), lines
+
+
+def kept_of(data: bytes, folder: Path) -> tuple[str, tuple[object, ...]]:
+    """Losses, and all that a recovered file has."""
+    (folder / "f.mcap").unlink(missing_ok=True)
+    (folder / "f.mcap.partial").write_bytes(data)
+    made = recover(folder / "f.mcap.partial")
+    assert made is not None
+    return made.losses, (messages_of(made.path), metadata_of(made.path), attachments_of(made.path))
+
+
+def test_any_flipped_byte_of_an_episode_costs_that_episode_alone_and_is_named(whole: Path, tmp_path: Path) -> None:
+    data = whole.read_bytes()
+    cut = data[: chunks_of(whole)[-2][0] + 100]
+    place, end = next(records_of(cut, 12))
+    losses, (messages, metadata, attachments) = kept_of(cut, tmp_path)
+    assert not losses and len(metadata) > 1
+    for at in range(place, end):
+        flipped = bytearray(cut)
+        flipped[at] ^= 1 << at % 8
+        losses, kept = kept_of(bytes(flipped), tmp_path)
+        assert kept == (messages, metadata[1:], attachments), at - place
+        assert "damaged at 1 place" in losses and "the record of 1 episode lost" in losses, at - place
+
+
+@pytest.mark.parametrize("opcode", [6, 7, 9, 12])
+def test_a_flipped_opcode_or_length_costs_one_record_at_most_and_never_silently(
+    whole: Path, tmp_path: Path, opcode: int
+) -> None:
+    data = whole.read_bytes()
+    cut = data[: chunks_of(whole)[-2][0] + 100]
+    before = kept_of(cut, tmp_path)[1]
+    for place, end in list(records_of(cut, opcode))[:4]:
+        if end > len(cut):
+            continue
+        for at in range(place, place + 9):
+            flipped = bytearray(cut)
+            flipped[at] ^= 1 << at % 3
+            losses, kept = kept_of(bytes(flipped), tmp_path)
+            assert losses or kept == before
+            if opcode in (6, 7):  # a chunk has its length twice, and an index holds nothing
+                assert kept == before, losses
+            missing = [len(old) - len(new) for old, new in zip(before[1:], kept[1:], strict=True)]
+            assert sum(missing) <= 1 and kept[0] == before[0], losses
+
+
+def test_a_length_that_leads_to_another_sound_record_hides_none(whole: Path, tmp_path: Path) -> None:
+    """That of a chunk, in its record, in itself or in both, so that it seems to reach over the next one; that of an index."""
+    data = whole.read_bytes()
+    chunks, before = chunks_of(whole), None
+    cut = data[: chunks[-2][0] + 100]
+    before = kept_of(cut, tmp_path)[1]
+    start, reach = chunks[2][0], chunks[4][0]
+    for outer, inner in ((True, False), (False, True), (True, True)):
+        changed = bytearray(cut)
+        if outer:
+            struct.pack_into("<Q", changed, start + 1, reach - start - 9)
+        if inner:
+            struct.pack_into("<Q", changed, start + 45, reach - start - 53)
+        losses, (messages, *others) = kept_of(bytes(changed), tmp_path)
+        assert others == list(before[1:])
+        lost = sum(map(len, before[0].values())) - sum(map(len, messages.values()))
+        assert lost == 0 or (outer and inner and f"at least {lost} messages lost" in losses)
+    index = next(place for place, _ in records_of(cut, 7) if place > start)
+    changed = bytearray(cut)
+    struct.pack_into("<Q", changed, index + 1, reach - index - 9)
+    losses, kept = kept_of(bytes(changed), tmp_path)
+    assert kept == before and "nothing is known to be lost" in losses
+
+
+def test_what_can_not_be_counted_is_an_unknown_number(whole: Path, tmp_path: Path) -> None:
+    data = whole.read_bytes()
+    (start, _), (end, _) = chunks_of(whole)[3:5]
+    losses, _ = kept_of(data[:start] + bytes(end - start) + data[end:], tmp_path)
+    assert "an unknown number of messages lost" in losses
+    (tmp_path / "zeros.mcap.partial").write_bytes(bytes(5000))
+    with pytest.raises(UserError, match="an unknown number of messages lost; there is no control step"):
+        recover(tmp_path / "zeros.mcap.partial")
+    _, end = next(records_of(data, 9))
+    losses, (_, _, attachments) = kept_of(data[: end - 1] + b"\0" + data[end:], tmp_path)
+    assert "attachment job.json lost" in losses and len(attachments) == len(attachments_of(whole)) - 1
 
 
 def test_a_page_of_zeros_costs_its_chunks_and_their_messages_are_counted(whole: Path, tmp_path: Path) -> None:

@@ -9,7 +9,14 @@ from orchestrator.cli.jobs import lost_iterations, next_step, slow_iteration
 
 def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[str, Any]:
     progress = {"iteration": done, "iteration_seconds": seconds} if done else None
-    told = {"name": "ant", "kind": "train", "status": "RUNNING", "progress": progress, "results": {"iteration": saved}}
+    told = {
+        "name": "ant",
+        "kind": "train",
+        "status": "RUNNING",
+        "progress": progress,
+        "results": {"iteration": saved},
+        "children": None,
+    }
     return {**told, **facts}
 
 
@@ -31,7 +38,16 @@ def test_a_job_that_is_over_says_what_can_follow() -> None:
     )
     assert next_step(training(7, 7, status="FAILED", **facts)) == "; continue with: muster resume ant-1"
     assert next_step(training(0, 0, status="FAILED", **{**facts, "results": {}})) == ""
-    assert next_step({"kind": "command", "status": "FAILED", "run": "c-1", "results": None}) == (
-        "; continue with: muster resume c-1"
-    )
-    assert next_step({"kind": "command", "status": "SUCCEEDED", "run": "c-1", "results": None}) == ""
+    command = {
+        "kind": "command",
+        "status": "FAILED",
+        "run": "c-1",
+        "results": None,
+        "spec": {"command": ["true"]},
+        "children": None,
+    }
+    assert next_step(command) == "; continue with: muster resume c-1"
+    assert next_step({**command, "status": "SUCCEEDED"}) == ""
+    assert (
+        next_step({**command, "spec": None}) == next_step({**command, "children": [{"index": 0}]}) == ""
+    )  # of the Batch API
