@@ -62,7 +62,7 @@ def references(spec: Mapping[str, Any] | None) -> list[Reference]:
         Reference(f"{section}.config.{field}", value["file"], value["sha256"])
         for section in _SECTIONS
         for field, value in _config(spec, section)
-        if _is_reference(value)
+        if is_reference(value)
     ]
 
 
@@ -103,7 +103,7 @@ def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str
     """
     result = dict(config)
     for field, value in config.items():
-        if _is_reference(value):
+        if is_reference(value):
             text = read(directory, Reference(f"{where}.{field}", value["file"], value["sha256"]))
             result[field] = {"file": value["file"], "text": text}
     return result
@@ -169,10 +169,11 @@ def _config(spec: Mapping[str, Any] | None, section: str) -> Iterator[tuple[str,
 
 def is_file(value: Any) -> bool:
     """Whether a value of a configuration is the content of a file: its text, or the digest of that."""
-    return _is_reference(value) or (isinstance(value, Mapping) and value.keys() == {"file", "text"})
+    return is_reference(value) or (isinstance(value, Mapping) and value.keys() == {"file", "text"})
 
 
-def _is_reference(value: Any) -> bool:
+def is_reference(value: Any) -> bool:
+    """Whether a value of a configuration stands for a text by its digest."""
     return (
         isinstance(value, Mapping)
         and value.keys() == {"file", "sha256"}

@@ -248,3 +248,15 @@ def test_a_run_s_function_is_tried_anew_on_another_track() -> None:
             with_files(document, "evaluation of r", task="Racer", base=racer["train"]["config"])
     boxes = {"evaluate": {"config": {"obstacles": [{"distance": 3.0}]}}}
     assert with_files(boxes, "evaluation of r", task="Racer", base=racer["train"]["config"]) == boxes
+
+
+def test_a_long_function_of_a_run_is_fetched_and_tried_anew_on_another_track() -> None:
+    kept = {"file": "mine.py", "sha256": digest_of(FAR)}
+    racer = {"train": {"task": "Racer", "config": {"track": "chicane", "reward_function": kept}}}
+    texts, changes, notes = {digest_of(FAR): FAR}, ["train.config.track=oval"], list[str]()
+    refused = refusal(changes_with_files, lambda: racer, changes, no_text, text_of=texts.get, error=SpecError)
+    assert refused.endswith(SHORT)
+    with pytest.raises(SpecError, match="on track oval"):
+        with_files({"race": {"track": "oval"}}, "r", task="Racer", base=racer["train"]["config"], text_of=texts.get)
+    assert changes_with_files(lambda: racer, changes, no_text, note=notes.append) == changes
+    assert notes == ["mine.py: its text is not in the run: it is not tried here, but on the job's nodes"]
