@@ -407,7 +407,7 @@ def test_a_group_with_streams_of_another_queue_is_deleted_by_keys_with_all_queue
     world.server.wait(job)
     refused = world.send("robots", "DeleteLogGroup", logGroupName=group)
     assert (
-        refused.status_code == 400 and "has streams of jobs in other queues" in refused.text and job not in refused.text
+        refused.status_code == 403 and "has streams of jobs in other queues" in refused.text and job not in refused.text
     )
     [stream] = world.send("lab", "DescribeLogStreams", logGroupName=group).json()["logStreams"]
     assert job in stream["logStreamName"]
