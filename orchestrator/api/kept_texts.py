@@ -39,6 +39,7 @@ def keep_again(reconciler: Reconciler, run: Run, spec: Mapping[str, Any] | None)
             source = reconciler.texts.source(session, reference)
             is_known = session.get(KeptText, reference.sha256) is not None
         if is_known and _is_there(source, reference):
+            reconciler.texts.prolong(reference.sha256)
             continue
         try:
             text = read(run.texts, reference)
