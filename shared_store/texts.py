@@ -61,7 +61,7 @@ def size_in_definition(value: Any) -> int:
 def references(spec: Mapping[str, Any] | None) -> list[Reference]:
     """The texts that a job's spec names by their digests."""
     return [
-        Reference(f"{section}.config.{field}", value["file"], value["sha256"])
+        Reference(f"{section}.config.{field}", value.get("file", field), value["sha256"])
         for section in _SECTIONS
         for field, value in _config(spec, section)
         if is_reference(value)
@@ -110,8 +110,9 @@ def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str
     result = dict(config)
     for field, value in config.items():
         if is_reference(value):
-            text = read(directory, Reference(f"{where}.{field}", value["file"], value["sha256"]))
-            result[field] = {"file": value["file"], "text": text}
+            name = value.get("file", field)
+            text = read(directory, Reference(f"{where}.{field}", name, value["sha256"]))
+            result[field] = {"file": name, "text": text}
     return result
 
 
@@ -179,11 +180,12 @@ def is_file(value: Any) -> bool:
 
 
 def is_reference(value: Any) -> bool:
-    """Whether a value of a configuration stands for a text by its digest."""
+    """Whether a value of a configuration stands for a text by its digest; the name of the file may be missing, and the text empty."""
     return (
         isinstance(value, Mapping)
-        and value.keys() == {"file", "sha256"}
-        and isinstance(value["file"], str)
+        and {"sha256"} <= value.keys() <= {"file", "sha256", "text"}
+        and value.get("text", "") == ""
+        and isinstance(value.get("file", ""), str)
         and isinstance(value["sha256"], str)
         and _DIGEST.fullmatch(value["sha256"]) is not None
     )

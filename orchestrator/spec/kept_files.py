@@ -138,19 +138,20 @@ def _check_again(
             if field in config or not changed:
                 continue
             try:
-                _check_text(_with_text(base.get(field), text_of, note), field, _Checked(how, whole, store, note))
+                _check_text(_with_text(base.get(field), field, text_of, note), field, _Checked(how, whole, store, note))
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', changed[0]), source, lines)}{error}") from None
 
 
-def _with_text(value: Any, text_of: TextOf, note: Note | None) -> Any:
+def _with_text(value: Any, field: str, text_of: TextOf, note: Note | None) -> Any:
     """A field with its text in the place of its digest, where that is to be had."""
     if not is_reference(value):
         return value
+    name = value.get("file", field)
     if (text := text_of(value["sha256"])) is not None:
-        return {"file": value["file"], "text": text}
+        return {"file": name, "text": text}
     if note is not None:
-        note(f"{value['file']}: its text is not in the run: it is not tried here, but on the job's nodes")
+        note(f"{name}: its text is not in the run: it is not tried here, but on the job's nodes")
     return value
 
 
