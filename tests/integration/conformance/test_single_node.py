@@ -239,7 +239,9 @@ def test_a_dependency_waits_for_success_and_failure_propagates(batch: Batch, tmp
     after_both = batch.submit(plain, dependsOn=[{"jobId": well}, {"jobId": badly}])
     below = batch.submit(plain, dependsOn=[{"jobId": after_both}])
     assert batch.wait(after_well, "PENDING")["dependsOn"] == [{"jobId": well}]
-    assert batch.wait(below, "PENDING")["statusReason"] == f"waits for the success of job {after_both}"
+    assert (
+        batch.wait(below, "PENDING")["statusReason"] == f"waits for the success of job one-depends ({after_both[:8]})"
+    )
     gate(tmp_path, "go")
     assert batch.wait(after_well)["status"] == "SUCCEEDED"
     for job, failed in ((after_both, badly), (below, after_both)):
