@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,9 +76,15 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
                 break
             recording.interrupt("the training died; the recording goes on with its next attempt")
             activity.say(f"the training of run {run.name} died; waiting for its next attempt on this machine …")
+            layout = segment.layout
             try:
                 segment = asking.attach(patience, stop, activity)
+                there = replace(segment.layout, rows=layout.rows, worlds=layout.worlds)
+                if there != layout or episodes * asking.worlds != wanted:
+                    raise UserError(f"run {run.name}: its training went on with other worlds")
             except UserError as error:
+                if stop:
+                    break
                 path, ended = recording.finish(), recording.ended(episodes)
                 raise UserError(f"{error}; {path} has {ended} of {counted(wanted, 'episode')}") from None
         path, ended = recording.finish(), recording.ended(episodes)

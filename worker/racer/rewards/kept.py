@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -13,9 +12,6 @@ from shared_store.wording import Refused
 from worker.racer.rewards.guard import LARGEST, read, read_file
 from worker.racer.rewards.problems import RewardRefused
 from worker.tasks.config import STRICT
-
-_read = lru_cache(maxsize=8)(read)
-"""A submission makes a configuration several times, and parsing the longest text takes a second."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -36,7 +32,7 @@ class RewardFile:
     def __post_init__(self) -> None:
         if self.sha256 and self.text:
             raise Refused((), "it has both a text and a sha256; leave one of them out")
-        if not self.sha256 and (problem := _read(self.text, self.file)):
+        if not self.sha256 and (problem := read(self.text, self.file)):
             raise Refused((), str(problem))
 
 

@@ -166,7 +166,7 @@ def _libraries() -> Iterator[str]:
             folders += map(os.path.dirname, re.findall(r"(/\S+\.so\S*)\n", maps.read()))
     for folder in set(folders) - {""}:
         with contextlib.suppress(OSError):
-            yield from (each.path for each in os.scandir(folder) if ".so" in each.name)
+            yield from (each.path for each in os.scandir(folder) if ".so" in each.name and each.is_file())
 
 
 def _restrict(libc: ctypes.CDLL, version: int, files: list[str], listed: list[str]) -> bool:
