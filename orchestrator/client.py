@@ -110,6 +110,15 @@ class Client:
         """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
         return self._request("POST", path, body, seconds=seconds)
 
+    def run_text(self, run: str, sha256: str) -> str | None:
+        """A long text of a run's jobs; None where the run has it not. Raises ApiError, Unreachable."""
+        try:
+            return self._answer("GET", f"/api/runs/{named(run)}/texts/{sha256}").text
+        except ApiError as error:
+            if error.status == 404:
+                return None
+            raise
+
     def keep_text(self, text: str) -> None:
         """Have the store keep a long text for a job that names it by its SHA-256; again does no harm. Raises ApiError, Unreachable."""
         self._request("PUT", f"/api/texts/{digest_of(text)}", content=text.encode())
@@ -183,6 +192,18 @@ class Client:
         seconds: float = 30,
         content: bytes | None = None,
     ) -> Any:
+        """The JSON of an answer; arguments as :meth:`_answer`."""
+        return self._answer(method, path, body, query, seconds, content).json()
+
+    def _answer(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        query: dict[str, Any] | None = None,
+        seconds: float = 30,
+        content: bytes | None = None,
+    ) -> httpx.Response:
         """``body``: JSON; ``content``: a body as it is."""
         headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if path.endswith(_SUBMISSIONS) else {}
 
@@ -211,7 +232,7 @@ class Client:
             raise _unnamable(path) from None
         if answer.is_error:
             self._raise(answer)
-        return answer.json()
+        return answer
 
     @staticmethod
     def _raise(answer: httpx.Response) -> None:

@@ -83,6 +83,7 @@ class Server:
         webhooks: str | None = None,
         account: str | None = None,
         region: str | None = None,
+        temporary: bool = False,
     ) -> None:
         """Take the lock, the port, the engines, the store and the database, in this order; nothing runs until :meth:`start`.
 
@@ -92,6 +93,7 @@ class Server:
         None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
         first, or to the one whose jobs in it are not over.
         ``account``, ``region``: of all ARNs (:mod:`orchestrator.control.account`); None: as before.
+        ``temporary``: it goes away with a command that started it; who follows a job then starts another one.
         ``adopt_store``: take what is at the store's path, although the database knows another store.
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
@@ -101,6 +103,7 @@ class Server:
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
         """
+        self._temporary = temporary
         _check_token(token)
         _check_proxies(trusted_proxies)
         told = _read_webhooks(webhooks)
@@ -124,7 +127,7 @@ class Server:
                 stack.callback(found.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
-                    arns.settle(recognise_account(session, account, region))
+                    arns.settle(recognise_account(session, account, region, temporary))
                     identity = recognise(session, self.store, adopt_store)
                     nodes.arrange(in_order(session, nodes.names))
                     ensure_compute_environments(session, nodes.names)
@@ -182,18 +185,15 @@ class Server:
             target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True
         )
 
-    def start(self, temporary: bool = False) -> None:
-        """Start the controller and the server, and tell commands on this machine where it is.
-
-        ``temporary``: it goes away with a command that started it; who follows a job then starts another one.
-        """
+    def start(self) -> None:
+        """Start the controller and the server, and tell commands on this machine where it is."""
         self.bus.open()
         self.peers.start()
         self.reconciler.start()
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
-        self._lock.publish(self.url, temporary, arns.here().region)
+        self._lock.publish(self.url, self._temporary, arns.here().region)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""

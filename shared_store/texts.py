@@ -21,7 +21,9 @@ from shared_store.files import DamagedFile, open_regular, write_atomic
 LARGEST = 1 << 20
 """Bytes of a text (UTF-8)."""
 IN_DEFINITION = 20 << 10
-"""Bytes that a text may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
+"""Bytes that a spec may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
+_OF_REFERENCE = 256
+"""Bytes of a text that takes no more room in a definition than its digest."""
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _HALF = re.compile("[\ud800-\udfff]")
 """A half of a character, which JSON can name and no file can hold."""
@@ -59,34 +61,38 @@ def size_in_definition(value: Any) -> int:
 def references(spec: Mapping[str, Any] | None) -> list[Reference]:
     """The texts that a job's spec names by their digests."""
     return [
-        Reference(f"{section}.config.{field}", value["file"], value["sha256"])
+        Reference(f"{section}.config.{field}", value.get("file", field), value["sha256"])
         for section in _SECTIONS
         for field, value in _config(spec, section)
-        if _is_reference(value)
+        if is_reference(value)
     ]
 
 
 def beside(spec: Mapping[str, Any]) -> tuple[dict[str, Any], dict[Reference, str]]:
-    """A job's spec with references in the place of its long texts, and those texts."""
+    """A job's spec with references in the place of its long texts, and those texts: the longest first, until it fits into a definition."""
     result, texts = dict(spec), dict[Reference, str]()
-    for section in _SECTIONS:
-        shortened, found = referring(dict(_config(spec, section)), f"{section}.config")
-        if found:
-            result[section] = {**result[section], "config": shortened}
-            texts |= found
+    found = [
+        (size_in_definition(value), section, field, value)
+        for section in _SECTIONS
+        for field, value in _config(spec, section)
+        if isinstance(value, Mapping) and value.keys() <= {"file", "text"} and isinstance(value.get("text"), str)
+    ]
+    for size, section, field, value in sorted(found, key=lambda each: each[0], reverse=True):
+        if size <= _OF_REFERENCE or _HALF.search(value["text"]):
+            continue
+        if _size_of(result) <= IN_DEFINITION:
+            break
+        reference = Reference(f"{section}.config.{field}", str(value.get("file") or field), digest_of(value["text"]))
+        kept = {"file": reference.file, "sha256": reference.sha256}
+        result[section] = {**result[section], "config": {**result[section]["config"], field: kept}}
+        texts[reference] = value["text"]
     return result, texts
 
 
-def referring(config: Mapping[str, Any], where: str) -> tuple[dict[str, Any], dict[Reference, str]]:
-    """A task's configuration, the spec's ``where``, with references in the place of its long texts, and those texts."""
-    result, texts = dict(config), {}
-    for field, value in config.items():
-        text = value.get("text") if isinstance(value, Mapping) and value.keys() <= {"file", "text"} else None
-        if isinstance(text, str) and size_in_definition(value) > IN_DEFINITION and not _HALF.search(text):
-            reference = Reference(f"{where}.{field}", str(value.get("file") or field), digest_of(text))
-            result[field] = {"file": reference.file, "sha256": reference.sha256}
-            texts[reference] = text
-    return result, texts
+def _size_of(spec: Mapping[str, Any]) -> int:
+    """Bytes of a definition that depend on its spec: that itself, and what the definition has of it once more."""
+    again = {key: spec[key] for key in ("environment", "secrets", "command") if key in spec}
+    return size_in_definition(spec) + len(json.dumps(again))
 
 
 def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str, Any]:
@@ -103,9 +109,10 @@ def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str
     """
     result = dict(config)
     for field, value in config.items():
-        if _is_reference(value):
-            text = read(directory, Reference(f"{where}.{field}", value["file"], value["sha256"]))
-            result[field] = {"file": value["file"], "text": text}
+        if is_reference(value):
+            name = value.get("file", field)
+            text = read(directory, Reference(f"{where}.{field}", name, value["sha256"]))
+            result[field] = {"file": name, "text": text}
     return result
 
 
@@ -169,14 +176,16 @@ def _config(spec: Mapping[str, Any] | None, section: str) -> Iterator[tuple[str,
 
 def is_file(value: Any) -> bool:
     """Whether a value of a configuration is the content of a file: its text, or the digest of that."""
-    return _is_reference(value) or (isinstance(value, Mapping) and value.keys() == {"file", "text"})
+    return is_reference(value) or (isinstance(value, Mapping) and value.keys() == {"file", "text"})
 
 
-def _is_reference(value: Any) -> bool:
+def is_reference(value: Any) -> bool:
+    """Whether a value of a configuration stands for a text by its digest; the name of the file may be missing, and the text empty."""
     return (
         isinstance(value, Mapping)
-        and value.keys() == {"file", "sha256"}
-        and isinstance(value["file"], str)
+        and {"sha256"} <= value.keys() <= {"file", "sha256", "text"}
+        and value.get("text", "") == ""
+        and isinstance(value.get("file", ""), str)
         and isinstance(value["sha256"], str)
         and _DIGEST.fullmatch(value["sha256"]) is not None
     )

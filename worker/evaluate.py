@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.outcomes import EX_TEMPFAIL
 from shared_store.races import NO_RACER, TRIALS, race_changes, rules_of
 from shared_store.settings import merged
-from shared_store.texts import keep, referring
+from shared_store.texts import beside, keep
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
 
@@ -98,10 +98,12 @@ def main(kind: str = "evaluate") -> int:
             print(result, flush=True)
         known = {"keep": job.section.get("keep", True), **_circumstances(facts)}
         driven = laps.race(played, rules_of(job.section), seed, facts) if laps else None
-        shown, texts = referring(changes, f"{kind}.config")
+        shown, texts = beside({kind: {"config": changes}})
         for text in texts.values():  # such as a reward function, which explains this evaluation later
             keep(run.texts, text.encode())
-        summary = result.write(run, job.id, driven, iteration=checkpoint.iteration, config=shown, **known)
+        summary = result.write(
+            run, job.id, driven, iteration=checkpoint.iteration, config=shown[kind]["config"], **known
+        )
         print("\n".join(lines(summary)), flush=True)
         print(f"written: {run.evaluations / summary['table']} and .json", flush=True)
     gang.close()

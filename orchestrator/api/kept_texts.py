@@ -16,7 +16,7 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import now
 from orchestrator.persistence.own_models import KeptText
 from shared_store.layout import Run
-from shared_store.texts import Reference, TextError, read, references, resolved_spec
+from shared_store.texts import Reference, TextError, beside, read, references, resolved_spec
 
 
 def check_texts(context: Context, gang: GangSpec) -> None:
@@ -27,15 +27,19 @@ def check_texts(context: Context, gang: GangSpec) -> None:
 
 
 def keep_again(reconciler: Reconciler, run: Run, spec: Mapping[str, Any] | None) -> None:
-    """Keep the texts of a run for a job that continues or clones it, where the store has them no more. On a thread of the store.
+    """Keep the texts of a job that continues or clones a run, where the store has them not or no more. On a thread of the store.
 
     Raises TextRefused, Unavailable. What the run lacks, too, is refused when the job is submitted.
     """
-    for reference in references(spec):
+    short, long = beside(spec or {})
+    for text in long.values():  # beside a change it has no room in the definition any more
+        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
+    for reference in references(short):
         with reconciler.database.session() as session:
             source = reconciler.texts.source(session, reference)
             is_known = session.get(KeptText, reference.sha256) is not None
         if is_known and _is_there(source, reference):
+            reconciler.texts.prolong(reference.sha256)
             continue
         try:
             text = read(run.texts, reference)

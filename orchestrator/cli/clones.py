@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -66,6 +67,7 @@ def clone(
                     (lambda text: None) if dry_run else client.keep_text,
                     store_here,
                     tell_note,
+                    partial(client.run_text, run),
                 ),
                 *on_queue(set_, elsewhere),
             ],

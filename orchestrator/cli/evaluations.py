@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -166,7 +167,9 @@ def _spec(
         place = str(client.get("/api/capacity")["store"])
         return place if Path(place).is_dir() else None
 
-    whole = with_files(changed, source, task=task, base=base, store=store, note=tell_note)
+    whole = with_files(
+        changed, source, task=task, base=base, store=store, note=tell_note, text_of=partial(client.run_text, run)
+    )
     return validate(whole, source)
 
 

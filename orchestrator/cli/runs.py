@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -52,7 +53,12 @@ def resume(
             "nodes": nodes,
             "set": [
                 *changes_with_files(
-                    lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_, client.keep_text, store_here, tell_note
+                    lambda: client.get(f"/api/runs/{named(run)}")["spec"],
+                    set_,
+                    client.keep_text,
+                    store_here,
+                    tell_note,
+                    partial(client.run_text, run),
                 ),
                 *elsewhere,
                 *accepted,

@@ -150,14 +150,14 @@ def serve(
     account_id: Annotated[
         str | None,
         typer.Option(
-            help="AWS account in all ARNs, 12 digits; 000000000000 by default. The first start settles it.",
+            help="AWS account in all ARNs, 12 digits; 000000000000 by default. The first `muster serve` settles it.",
             show_default=False,
         ),
     ] = None,
     region: Annotated[
         str | None,
         typer.Option(
-            help="AWS region in all ARNs; us-east-1 by default. The first start settles it. Nothing runs there.",
+            help="AWS region in all ARNs; us-east-1 by default. The first `muster serve` settles it. Nothing runs there.",
             show_default=False,
         ),
     ] = None,
@@ -244,11 +244,15 @@ def controller(store: str | None, cpus: float | None, engines: Sequence[str] = (
 def found_or_own(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[tuple[Client, bool]]:
     """A client of this home directory's controller, and whether this command started that, since none was running.
 
-    One is started only where there may be runs: with a given store, or in a home directory that a controller had. Raises Unreachable.
+    One is started only where there may be runs: with a given store, or in a home directory that a controller had. Raises Unreachable, ServerError.
     """
     is_own = not os.environ.get("MUSTER_URL") and local_url() is None
     if is_own and store is None and not (muster_home() / "muster.db").is_file():
         Client.connect()  # raises Unreachable, with what to do
+    if is_own and store is not None and not (Path(store).expanduser() / "store.json").is_file():
+        raise ServerError(
+            f"--store {store}: there is no store here (no store.json), so no run; name the store of the run"
+        )
     with controller(store, cpus, engines) as connect:
         yield connect(), is_own
 
@@ -275,14 +279,14 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
     from orchestrator.server import Server
 
     try:
-        server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",))
+        server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",), temporary=True)
     except ControllerRuns as error:
         if url is None:
             raise
         raise Unreachable(
             f"the controller at {url} does not answer: it may be frozen or busy; its jobs run on"
         ) from error
-    server.start(temporary=True)
+    server.start()
     try:
         with Client(server.url, server.access.own_token) as client:  # it may require a key that this command lacks
             yield client

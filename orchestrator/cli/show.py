@@ -90,7 +90,10 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     array = detail["job"].get("arrayProperties", {})
     if "statusSummary" in array:  # the children have runs and nodes, not the array
         facts["run"] = None
-        facts["children"] = f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:0"
+        first = detail["children"][0]["index"] if detail["children"] else 0  # one that failed comes first
+        facts["children"] = (
+            f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:{first}"
+        )
     if progress := detail["progress"]:
         total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
         shown = shown_metrics(progress).replace("  ", ", ")

@@ -1,14 +1,17 @@
-"""The account and the region in a controller's ARNs: chosen at its first start and kept, since clients remember ARNs."""
+"""The account and the region in a controller's ARNs: chosen at the first ``muster serve`` and kept, since clients remember ARNs."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
 
+from sqlalchemy import String, cast, func, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import UsageError
-from orchestrator.persistence.own_models import KnownAccount
+from orchestrator.engines.installed import ENGINES
+from orchestrator.persistence.models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
+from orchestrator.persistence.own_models import KnownAccount, LogGroup
 
 
 @dataclass(frozen=True)
@@ -25,22 +28,29 @@ class Account:
 DEFAULT = Account("000000000000", "us-east-1")
 
 
-def recognise(session: Session, account: str | None, region: str | None) -> Account:
-    """The account of this database, which is remembered at the first start.
+def recognise(session: Session, account: str | None, region: str | None, temporary: bool = False) -> Account:
+    """The account of this database, which is remembered at the first start of a controller that is not temporary.
+
+    Where clients of the Batch API have made something before, they know the ARNs of :data:`DEFAULT`, and it stays.
 
     Args:
         session: On the database.
         account: The id that was asked for; None: as before, at the first start that of :data:`DEFAULT`.
         region: The same.
+        temporary: The controller is that of a command, such as ``muster run``.
 
     Raises:
         UsageError: They are malformed, or not those of the first start.
     """
     known = session.get(KnownAccount, 1)
+    if known is None and (not temporary or _has_clients(session)):
+        first = (
+            (DEFAULT.id, DEFAULT.region) if _has_clients(session) else (account or DEFAULT.id, region or DEFAULT.region)
+        )
+        known = KnownAccount(id=1, account=first[0], region=first[1])
+        session.add(known)
     wanted = account or (known.account if known else DEFAULT.id), region or (known.region if known else DEFAULT.region)
-    if known is None:
-        session.add(KnownAccount(id=1, account=wanted[0], region=wanted[1]))
-    elif wanted != (known.account, known.region):
+    if known is not None and wanted != (known.account, known.region):
         option = f"--account-id {wanted[0][:40]}" if wanted[0] != known.account else f"--region {wanted[1][:60]}"
         raise UsageError(
             f"{option}: this controller has the ARNs of account {known.account} in {known.region} since its first start, and its "
@@ -48,7 +58,23 @@ def recognise(session: Session, account: str | None, region: str | None) -> Acco
         )
     if not re.fullmatch("[0-9]{12}", wanted[0]):
         raise UsageError(f"--account-id {wanted[0][:40]}: expected 12 digits, such as 123456789012")
-    return Account(*wanted, _partition(wanted[1]))
+    found = Account(*wanted, _partition(wanted[1]))
+    if found != DEFAULT and known in session.new:  # the definitions of jobs that temporary controllers had
+        before, after = (f"arn:{each.partition}:batch:{each.region}:{each.id}:" for each in (DEFAULT, found))
+        session.execute(update(Job).values(definition=func.replace(Job.definition, before, after)))
+    return found
+
+
+def _has_clients(session: Session) -> bool:
+    """Whether there is anything that Muster's own commands do not make."""
+    made = (
+        select(JobDefinition.name).where(cast(JobDefinition.document, String).not_like("%MUSTER_SPEC%")),
+        select(JobQueue.name).where(JobQueue.name.not_in(["default", *ENGINES])),
+        select(ComputeEnvironment.name).where(ComputeEnvironment.name.not_in(list(ENGINES))),
+        select(SchedulingPolicy.name),
+        select(LogGroup.name),
+    )
+    return any(session.scalar(each.limit(1)) is not None for each in made)
 
 
 def _partition(region: str) -> str:

@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 from orchestrator.control.clock import Clock
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.job import WAITING, Status
+from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import Job
 
 _NAMED = 3
@@ -34,7 +35,8 @@ def settle(session: Session, job: Job, clock: Clock) -> None:
             job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
         elif pending:
             others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
-            job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
+            first = session.get_one(Job, pending[0])
+            job.move(Status.PENDING, f"waits for the success of job {named(first.name, first.id)}{others}")
         else:
             job.move(Status.RUNNABLE, WAITING)
     elif job.status == Status.RUNNABLE:

@@ -1,6 +1,7 @@
 """The long texts of jobs, in the store from their upload until nothing needs them (:mod:`shared_store.texts`).
 
-A text is kept while an active job definition or a job that has not ended names it, and for some days after it was uploaded or named last.
+A text is kept while a job that has not ended names it, or an active job definition of a Batch client, and for some days after it was
+uploaded or named last. A definition that a submission of Muster's made counts as little as any other part of its job that has ended.
 The run of a job has a copy of its own from the first attempt on. Controllers that share a store have a folder each.
 """
 
@@ -14,7 +15,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from sqlalchemy import String, cast, delete, func, select
+from sqlalchemy import String, and_, cast, func, not_, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
@@ -34,6 +35,8 @@ DAYS = 7
 """For which a text is kept that nothing names."""
 A_DAY = 32 << 20
 """Bytes of texts that one key may upload in 24 hours."""
+OF_SUBMISSION = "MUSTER_DIRECTORY"
+"""Variable that only the definitions have which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""
 _SWEEP_INTERVAL, _FIRST_SWEEP = 3600.0, 60.0
 """Seconds between two looks for texts that nothing needs, and until the first one."""
 _MS_A_DAY = 24 * 3600 * 1000
@@ -112,6 +115,11 @@ class KeptTexts:
                 session.merge(row)
         return digest
 
+    def prolong(self, digest: str) -> None:
+        """Keep a text as long as one that was named now."""
+        with self._writing, self._database.session() as session:
+            session.execute(update(KeptText).where(KeptText.sha256 == digest).values(used_at=now()))
+
     def source(self, session: Session, reference: Reference) -> Path:
         """The folder of a text, whether it is there or not."""
         row = session.get(KeptText, reference.sha256)
@@ -129,13 +137,16 @@ class KeptTexts:
         try:
             with self._changing:
                 with self._writing, self._database.session() as session:
-                    _forget_unneeded(session, now() - DAYS * _MS_A_DAY)
+                    unneeded = _forget_unneeded(session, now() - DAYS * _MS_A_DAY)
+                for folder, name in unneeded:
+                    (self._store.texts / folder / name).unlink(missing_ok=True)
+                    deleted.append(name)
                 with self._database.session() as session:
                     kept = set(session.scalars(select(KeptText.sha256).where(KeptText.folder == self._folder)))
-                folder = self._store.texts / self._folder
+                own = self._store.texts / self._folder
                 with contextlib.suppress(FileNotFoundError):
-                    for name in set(os.listdir(folder)) - kept:
-                        (folder / name).unlink(missing_ok=True)
+                    for name in set(os.listdir(own)) - kept:
+                        (own / name).unlink(missing_ok=True)
                         deleted.append(name)
         except (OSError, DatabaseError) as error:
             log.warning("texts that no job needs any more can't be deleted now (%s); trying again in an hour", error)
@@ -163,17 +174,21 @@ def _digest(data: bytes) -> str:
         raise TextRefused("it is not a text (UTF-8)") from None
 
 
-def _forget_unneeded(session: Session, moment: int) -> None:
-    """Delete the rows of texts that were used before ``moment`` [ms] and that nothing names."""
-    old = set(session.scalars(select(KeptText.sha256).where(KeptText.used_at < moment)))
-    if old:
-        session.execute(delete(KeptText).where(KeptText.sha256.in_(old - _named(session))))
+def _forget_unneeded(session: Session, moment: int) -> list[tuple[str, str]]:
+    """Delete the rows of texts that were used before ``moment`` [ms] and that nothing names; returns folder and digest of each."""
+    old = session.scalars(select(KeptText).where(KeptText.used_at < moment)).all()
+    named = _named(session) if old else set()
+    unneeded = [row for row in old if row.sha256 not in named]
+    for row in unneeded:
+        session.delete(row)
+    return [(row.folder, row.sha256) for row in unneeded]
 
 
 def _named(session: Session) -> set[str]:
-    """The digests in active definitions and in jobs that have not ended."""
+    """The digests in active definitions of Batch clients and in jobs that have not ended."""
+    submitted = cast(JobDefinition.document, String).contains(OF_SUBMISSION, autoescape=True)
     columns = (
-        (JobDefinition.document, JobDefinition.status == "ACTIVE"),
+        (JobDefinition.document, and_(JobDefinition.status == "ACTIVE", not_(submitted))),
         (Job.own_node_properties, Job.status.not_in(TERMINAL)),
     )
     found: set[str] = set()

@@ -141,6 +141,10 @@ _OF_AWS = re.compile(r"[A-Z][A-Za-z]*Error: ")
 """Beginning of a reason for which AWS ended a container, or could not start it: OutOfMemoryError, CannotPullContainerError, …"""
 
 
+_NO_PROGRAM = "can't start '"
+"""Beginning of a supervisor's reason for a program that does not exist or can't be executed."""
+
+
 def container_reason(reason: str | None, status_reason: str | None) -> str | None:
     """``container.reason`` as AWS gives it: an ordinary exit has none.
 
@@ -150,6 +154,8 @@ def container_reason(reason: str | None, status_reason: str | None) -> str | Non
     """
     if status_reason and status_reason.startswith(_LOST_HOST):
         return status_reason
+    if reason and reason.startswith(_NO_PROGRAM):
+        return f"CannotStartContainerError: {reason}"
     return reason if reason and _OF_AWS.match(reason) else None
 
 

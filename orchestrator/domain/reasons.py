@@ -28,3 +28,9 @@ class Reason:
     def code(self) -> str:
         """What the AWS Batch API states beyond ``words``: AWS's code, or AWS's own words. Empty where both state the same."""
         return "" if self.aws == self.words else self.aws.removesuffix(f" - {self.words}")
+
+
+def named(name: str, job: str) -> str:
+    """A job in words, such as ``ant (1f2e3d4c)``, and ``ant:3 (1f2e3d4c:3)`` for an array's child."""
+    head, sign, index = job.partition(":")
+    return f"{name}{sign}{index} ({head[:8]}{sign}{index})"

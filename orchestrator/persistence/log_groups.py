@@ -13,16 +13,16 @@ from orchestrator.persistence.models import Job, Node
 from orchestrator.persistence.own_models import LogGroup
 
 MOST = 1000
-"""Log groups of a controller."""
+"""Log groups of a key."""
 
 
-def check_room(session: Session, names: Collection[str]) -> None:
-    """Raise RequestError where those of the groups that do not exist yet would be too many."""
+def check_room(session: Session, names: Collection[str], owner: str | None) -> None:
+    """Raise RequestError where those of the groups that do not exist yet would be too many for their owner, a key."""
     if not (more := _missing(session, names)):
         return
-    there = session.scalar(select(func.count()).select_from(LogGroup)) or 0
+    there = session.scalar(select(func.count()).where(LogGroup.owner == owner)) or 0
     if there + len(more) > MOST:
-        raise RequestError(f"there are {there} log groups, and {MOST} at most; delete some, or log to {LOG_GROUP}")
+        raise RequestError(f"{owner} has {there} log groups, and may have {MOST}; delete some, or log to {LOG_GROUP}")
 
 
 def add_missing(session: Session, names: Collection[str], owner: str | None) -> None:

@@ -114,7 +114,8 @@ def shortage(wanted: Resources, free: Resources) -> str:
     """What is missing: ``1 of 2 CPUs, 512 MiB of 1 GiB short``; empty if enough is free in all."""
     parts = []
     if free.cpus + EPSILON < wanted.cpus:
-        parts.append(f"{_number(wanted.cpus - max(0.0, free.cpus))} of {count_of(wanted.cpus, 'CPU')}")
+        lack = wanted.cpus - max(0.0, free.cpus)
+        parts.append(f"{_number(lack) if lack >= 0.01 else 'less than 0.01'} of {count_of(wanted.cpus, 'CPU')}")
     if free.gpus < wanted.gpus:
         parts.append(f"{wanted.gpus - max(0, free.gpus)} of {count_of(wanted.gpus, 'GPU')}")
     if free.memory < wanted.memory:

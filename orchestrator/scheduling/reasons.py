@@ -10,7 +10,7 @@ from math import inf
 from typing import Protocol
 
 from orchestrator.domain.gang import Shape
-from orchestrator.domain.reasons import Reason
+from orchestrator.domain.reasons import Reason, named
 from orchestrator.domain.resources import EPSILON, Resources
 from orchestrator.scheduling.free_resources import FreeResources
 from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
@@ -115,7 +115,7 @@ class WaitReport:
         if before is None:
             return False, Reason.coded(NO_ROOM, self._lack(shape, cache.possible(shape)[0]))
         wants = f"{needs(before.job.shape)}{self._start(before, ' and starts by ')}"
-        name = _named(before.job.name, before.job.job)
+        name = named(before.job.name, before.job.job)
         return True, Reason.plain(f"behind job {name}, which {wants}{self._hint(shape, cache)}")
 
     @cached_property
@@ -152,7 +152,7 @@ class WaitReport:
         awaited = preempted or list(reservation.awaits)
         if not awaited:
             return ""
-        names = [_named(each.name, each.job) for each in awaited[-_NAMED:]]
+        names = [named(each.name, each.job) for each in awaited[-_NAMED:]]
         others = len(awaited) - len(names)
         who = ", ".join(names) + (f" and {others} more" if others else "")
         who = f"job{'s' if len(awaited) > 1 else ''} {who}"
@@ -181,10 +181,6 @@ class WaitReport:
         if seconds < 1 or not any(self._resources.allocation(shape, ce, unknown) for ce in ces):
             return kept
         return f"{kept}: with a timeout of at most {seconds} s it could start"
-
-
-def _named(name: str, job: str) -> str:
-    return f"{name} ({job[:8]})"
 
 
 def _ordinal(number: int) -> str:

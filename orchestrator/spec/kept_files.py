@@ -22,11 +22,13 @@ from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import place_of
 from shared_store.file_fields import KeptFile, kept_files
 from shared_store.settings import setting_at
-from shared_store.texts import IN_DEFINITION, LARGEST, beside, size_in_definition
+from shared_store.texts import IN_DEFINITION, LARGEST, beside, is_reference, size_in_definition
 
 _SECTIONS = ("train", "evaluate", "race")
 Note = Callable[[str], object]
 """Is called with a line for the user."""
+TextOf = Callable[[str], str | None]
+"""The long text of a run by its SHA-256; None: it is not there."""
 Place = Callable[[], str | None]
 """The path of the store in which a job finds what its configuration names, asked where a check needs it; None: not on this machine."""
 
@@ -40,6 +42,7 @@ def with_files(
     base: Mapping[str, Any] | None = None,
     store: Place = lambda: None,
     note: Note | None = None,
+    text_of: TextOf = lambda _: None,
 ) -> dict[str, Any]:
     """A job's document with the content of the files that its task's configuration names in the place of their paths.
 
@@ -54,6 +57,7 @@ def with_files(
             check depends on.
         store: Where checks find what the configuration names.
         note: Called with each line that a check has for the user.
+        text_of: Is called with the digest of a long text in ``base`` that is checked anew.
 
     Raises:
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
@@ -67,7 +71,7 @@ def with_files(
                 raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
             values = result[section]
             result[section] = {**values, "config": {**values["config"], field: content}}
-    _check_again(document, source, lines or {}, task, base or {}, store, note)
+    _check_again(document, source, lines or {}, task, base or {}, store, note, text_of)
     return result
 
 
@@ -118,6 +122,7 @@ def _check_again(
     base: Mapping[str, Any],
     store: Place,
     note: Note | None,
+    text_of: TextOf,
 ) -> None:
     """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
     for section in _SECTIONS:
@@ -133,9 +138,21 @@ def _check_again(
             if field in config or not changed:
                 continue
             try:
-                _check_text(base.get(field), field, _Checked(how, whole, store, note))
+                _check_text(_with_text(base.get(field), field, text_of, note), field, _Checked(how, whole, store, note))
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', changed[0]), source, lines)}{error}") from None
+
+
+def _with_text(value: Any, field: str, text_of: TextOf, note: Note | None) -> Any:
+    """A field with its text in the place of its digest, where that is to be had."""
+    if not is_reference(value):
+        return value
+    name = value.get("file", field)
+    if (text := text_of(value["sha256"])) is not None:
+        return {"file": name, "text": text}
+    if note is not None:
+        note(f"{name}: its text is not in the run: it is not tried here, but on the job's nodes")
+    return value
 
 
 def _whole(values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
@@ -174,11 +191,12 @@ def changes_with_files(
     keep: Callable[[str], object],
     store: Place = lambda: None,
     note: Note | None = None,
+    text_of: TextOf = lambda _: None,
 ) -> list[str]:
     """``--set`` assignments for a run that is resumed or cloned, with the content of files as :func:`with_files`.
 
-    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``store`` and
-    ``note`` as of :func:`with_files`.
+    ``spec_of_run`` is called where its task has to be known, ``keep`` with each long text, whose digest the assignment has. ``store``,
+    ``note`` and ``text_of`` as of :func:`with_files`.
 
     Raises:
         SpecError: As :func:`with_files`.
@@ -192,7 +210,7 @@ def changes_with_files(
     task, config = (setting_at(changed, key) for key in ("train.task", "train.config"))
     if isinstance(config, Mapping) and isinstance(task, str):
         new = {field: value for field, value in config.items() if value != before.get(field)}
-        _check_again({"train": {"config": new}}, "--set", {}, task, before, store, note)
+        _check_again({"train": {"config": new}}, "--set", {}, task, before, store, note, text_of)
     return [_embedded(each, task, config, keep, store, note) for each in given]
 
 

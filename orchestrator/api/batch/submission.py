@@ -138,7 +138,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     fargate.check_platform(document, properties, f"job definition {definition.name}")
     fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     _check_secrets(context, queue, gang)
-    log_groups.check_room(context.session, gang.log_groups)
+    log_groups.check_room(context.session, gang.log_groups, permissions.current_identity.get().name)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     copy = context.making or context.teacher

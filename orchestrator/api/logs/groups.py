@@ -130,7 +130,7 @@ _Place = tuple[Session, Store]
 
 def create_log_group(place: _Place, request: dict[str, Any]) -> None:
     """CreateLogGroup: the caller's own, empty."""
-    session, name = place[0], request["logGroupName"]
+    session, name, owner = place[0], request["logGroupName"], permissions.current_identity.get().name
     check_log_group("logGroupName", name)
     tags = request.get("tags") or {}
     check_tags(tags)
@@ -144,10 +144,10 @@ def create_log_group(place: _Place, request: dict[str, Any]) -> None:
     if name == LOG_GROUP or session.get(LogGroup, name) is not None:
         raise present("log group", name)
     try:
-        log_groups.check_room(session, [name])
+        log_groups.check_room(session, [name], owner)
     except RequestError as error:
         raise LogsError("LimitExceededException", str(error)) from None
-    session.add(LogGroup(name=name, owner=permissions.current_identity.get().name, tags=tags))
+    session.add(LogGroup(name=name, owner=owner, tags=tags))
 
 
 def delete_log_group(place: _Place, request: dict[str, Any]) -> None:
@@ -157,6 +157,11 @@ def delete_log_group(place: _Place, request: dict[str, Any]) -> None:
         permissions.check(Operation.DELETE_LOG_GROUP, LogGroup(name=LOG_GROUP))
         raise invalid(f"log group {LOG_GROUP} can't be deleted: jobs that name no group log there")
     group = _group(session, name, Operation.DELETE_LOG_GROUP)
+    if (queues := permissions.visible_queues()) is not None:
+        logged = select(Node.job_id).join(Job, Job.id == Node.job_id).where(Node.log_group == group.name)
+        if session.scalar(logged.where(Job.queue.not_in(queues)).limit(1)) is not None:
+            words = f"log group {group.name} has streams of jobs in other queues; ask for a key with all queues"
+            raise permissions.Refusal("AccessDeniedException", f"{Operation.DELETE_LOG_GROUP} is refused: {words}")
     session.execute(update(Node).where(Node.log_group == group.name).values(log_group=""))
     session.delete(group)
 

@@ -178,6 +178,8 @@ def _resume(
         if earlier := _answered(Context(session, reconciler, idempotency_key), found, checkpoints):
             return earlier
         document = spec_of(session, found)
+    with suppress(SpecError, ClientError):  # refused below, with its reason
+        document = override(document or {}, changes.all())
     keep_again(reconciler, run, document)
     chosen = choose(run, changes.checkpoint)
     if chosen is not None:

@@ -22,6 +22,7 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
 from botocore.parsers import ResponseParserError
 
+from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.resources import Resources
@@ -317,7 +318,7 @@ class AwsBatchEngine:
         status, container = detail["status"], detail.get("container") or {}
         address = next((each.get("privateIpv4Address", "") for each in container.get("networkInterfaces") or []), "")
         over = status in TERMINAL or watched.straggled
-        log = self._follow(handle, watched, index, container.get("logStreamName"), over)
+        log = self._follow(handle, watched, index, container, over)
         if not over:
             if status == "RUNNING":
                 return NodeStatus(NodePhase.RUNNING, address)
@@ -343,11 +344,14 @@ class AwsBatchEngine:
         record(handle, (log.outcome if log else None) or outcome)
         return True
 
-    def _follow(self, handle: Handle, watched: _Watched, index: int, stream: str | None, over: bool) -> NodeLog | None:
+    def _follow(
+        self, handle: Handle, watched: _Watched, index: int, container: Mapping[str, Any], over: bool
+    ) -> NodeLog | None:
         """The copy of a node's log; None where the supervisor writes it to the store that is here, too."""
         with self._lock:  # a gang that is being stopped is looked at by two threads
             logs = watched.logs = watched.logs or self._copies(handle)
-        node = logs.saw(index, stream, over)
+        options = (container.get("logConfiguration") or {}).get("options") or {}
+        node = logs.saw(index, options.get("awslogs-group", LOG_GROUP), container.get("logStreamName"), over)
         return node if node.copied else None
 
     def _copies(self, handle: Handle) -> GangLogs:
@@ -357,7 +361,7 @@ class AwsBatchEngine:
             NodeLog(*log_of(handle, index), supervised, copied=not (supervised and shared))
             for index, supervised in enumerate(handle.facts["supervised"])
         ]
-        logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
+        logs = GangLogs(self._logs, nodes, self.config.poll, self.config.quiet)
         logs.start(handle.gang)
         return logs
 

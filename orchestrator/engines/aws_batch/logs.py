@@ -37,6 +37,8 @@ class NodeLog:
     supervised: bool
     copied: bool = True
     """False where the supervisor writes it to the store that is here, too."""
+    group: str = ""
+    """Name of its log group."""
     stream: str | None = None
     """Name of the stream; None until the node has one."""
     token: str | None = None
@@ -108,7 +110,6 @@ class GangLogs:
 
     client: Any
     """Of CloudWatch Logs."""
-    group: str
     nodes: list[NodeLog]
     poll: float
     """Seconds between two rounds."""
@@ -124,10 +125,11 @@ class GangLogs:
         self._thread = threading.Thread(target=self._follow, name=f"log {name}", daemon=True)
         self._thread.start()
 
-    def saw(self, index: int, stream: str | None, ended: bool) -> NodeLog:
-        """AWS's facts about a node: the name of its stream, and whether it has ended."""
+    def saw(self, index: int, group: str, stream: str | None, ended: bool) -> NodeLog:
+        """AWS's facts about a node: its log group, the name of its stream, and whether it has ended."""
         node = self.nodes[index]
-        node.stream = stream or node.stream
+        if stream:
+            node.group, node.stream = group, stream
         if ended and node.ended is None:
             node.ended = time.monotonic()
             self._wake.set()
@@ -163,7 +165,7 @@ class GangLogs:
             if node.stream is not None:
                 node.open()
             while node.stream is not None and not self._closed:
-                request = {"logGroupName": self.group, "logStreamName": node.stream, "startFromHead": True}
+                request = {"logGroupName": node.group, "logStreamName": node.stream, "startFromHead": True}
                 if node.token:
                     request["nextToken"] = node.token
                 page = self.client.get_log_events(**request, limit=_PAGE)

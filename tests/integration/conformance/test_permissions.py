@@ -19,6 +19,7 @@ from orchestrator.domain.errors import ApiError
 from tests.support.conformance.fuzz_requests import GROUP_ARN
 from tests.support.conformance.permissions_world import KEYS, MARK, SECRET, TOKEN, World, definition
 from tests.support.conformance.streams import GROUP
+from tests.support.definitions import container, multinode
 
 OWN_WRITE = "+ + + - - - -"
 """What belongs to the queue robots is changed: ``+`` is carried out, ``-`` is refused."""
@@ -393,3 +394,21 @@ def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> N
     job = world.clients["admin"].batch("SubmitJob", **older)["jobId"]
     world.server.wait(job, "SUCCEEDED")
     assert world.clients["robots"].get("/api/runs/older")["queue"] == "robots"
+
+
+def test_a_group_with_streams_of_another_queue_is_deleted_by_keys_with_all_queues_alone(world: World) -> None:
+    group = f"/{world.fresh()}"
+    assert world.send("robots", "CreateLogGroup", logGroupName=group).status_code == 200
+    logged = container(["echo", "logged"])
+    logged["logConfiguration"] = {"logDriver": "awslogs", "options": {"awslogs-group": group}}
+    name = world.fresh()
+    world.clients["lab"].batch("RegisterJobDefinition", **multinode(name, logged))
+    job = world.clients["lab"].batch("SubmitJob", jobName=name, jobQueue="lab", jobDefinition=name)["jobId"]
+    world.server.wait(job)
+    refused = world.send("robots", "DeleteLogGroup", logGroupName=group)
+    assert (
+        refused.status_code == 403 and "has streams of jobs in other queues" in refused.text and job not in refused.text
+    )
+    [stream] = world.send("lab", "DescribeLogStreams", logGroupName=group).json()["logStreams"]
+    assert job in stream["logStreamName"]
+    assert world.send("admin", "DeleteLogGroup", logGroupName=group).status_code == 200

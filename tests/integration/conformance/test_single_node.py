@@ -188,9 +188,9 @@ def test_child_i_waits_for_child_i(batch: Batch, tmp_path: Path) -> None:
     last = batch.submit(batch.single("one-last", "true"), dependsOn=[{"jobId": second}])
     assert batch.wait(f"{second}:0")["status"] == "SUCCEEDED"
     held = batch.describe(f"{second}:1")
-    assert held["status"] == "PENDING" and f"{first}:1" in held["statusReason"]
+    assert held["status"] == "PENDING" and f"one-before:1 ({first[:8]}:1)" in held["statusReason"]
     assert held["dependsOn"] == [{"jobId": f"{first}:1", "type": "N_TO_N"}]
-    assert batch.describe(last)["status"] == "PENDING" and second in batch.describe(last)["statusReason"]
+    assert batch.describe(last)["status"] == "PENDING" and second[:8] in batch.describe(last)["statusReason"]
     gate(tmp_path, "go")
     assert batch.wait(last)["status"] == "SUCCEEDED"
     times = [batch.describe(each) for each in (f"{first}:1", f"{second}:1", last)]
@@ -239,7 +239,9 @@ def test_a_dependency_waits_for_success_and_failure_propagates(batch: Batch, tmp
     after_both = batch.submit(plain, dependsOn=[{"jobId": well}, {"jobId": badly}])
     below = batch.submit(plain, dependsOn=[{"jobId": after_both}])
     assert batch.wait(after_well, "PENDING")["dependsOn"] == [{"jobId": well}]
-    assert batch.wait(below, "PENDING")["statusReason"] == f"waits for the success of job {after_both}"
+    assert (
+        batch.wait(below, "PENDING")["statusReason"] == f"waits for the success of job one-depends ({after_both[:8]})"
+    )
     gate(tmp_path, "go")
     assert batch.wait(after_well)["status"] == "SUCCEEDED"
     for job, failed in ((after_both, badly), (below, after_both)):
@@ -280,6 +282,18 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         assert (detail["status"], codes) == ("FAILED", [12] * attempts), conditions
         shown = [{**each, "action": each["action"].upper()} for each in conditions]
         assert detail["retryStrategy"] == {"attempts": 3, "evaluateOnExit": shown}, "in the model's case"
+
+
+def test_a_program_that_does_not_exist_has_aws_s_reason_and_rules_match_it(batch: Batch) -> None:
+    rules = [{"onReason": "CannotStartContainerError*", **END}]
+    job = batch.submit(
+        batch.single("one-missing", "true"),
+        containerOverrides={"command": ["no-such-program"]},
+        retryStrategy={"attempts": 3, "evaluateOnExit": rules},
+    )
+    detail = batch.wait(job)
+    assert detail["container"]["reason"].startswith("CannotStartContainerError: can't start 'no-such-program': ")
+    assert len(detail["attempts"]) == 1
 
 
 def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tmp_path: Path) -> None:

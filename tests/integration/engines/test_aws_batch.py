@@ -241,6 +241,23 @@ def test_an_image_without_muster_runs_as_it_is(bench: AwsBench) -> None:
     assert bench.outcome(0).exit_code == 4
 
 
+@pytest.mark.parametrize("options", [{"awslogs-group": "/fleet/robots"}, {"awslogs-stream-prefix": "fleet"}, None])
+def test_the_log_of_a_node_is_read_from_its_own_log_group(
+    aws: Serving, tmp_path: Path, options: dict[str, str] | None
+) -> None:
+    """AWS's own group holds the log of a container whose options name none; the stack's group, that of one without options."""
+    bench = AwsBench(aws, tmp_path, log_group="/of/the/stack")
+    log = {"logConfiguration": {"logDriver": "awslogs", "options": options}} if options else {}
+    handle = bench.launch(
+        bench.gang(
+            "echo mine", 1, native=False, containers=[{"image": "busybox", **log}], title=f"g{len(str(options))}"
+        )
+    )
+    bench.ended(handle)
+    wait_for(lambda: "mine" in bench.log(), 10, "its log")
+    bench.close()
+
+
 def test_gangs_that_come_and_go_double_no_line_of_another(bench: AwsBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
     script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"

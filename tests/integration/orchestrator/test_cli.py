@@ -408,3 +408,11 @@ def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
         "http://127.0.0.1:9",
     ):
         assert any(said in line for line in lines), said
+
+
+def test_a_resume_without_a_controller_makes_no_store(tmp_path: Path) -> None:
+    missing = tmp_path / "stroe"
+    done = call_muster("resume", "ant-1f2e3d4c", "--store", str(missing), home=tmp_path / "home")
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert f"--store {missing}: there is no store here" in done.stderr.replace("\n", " ")
+    assert not missing.exists()

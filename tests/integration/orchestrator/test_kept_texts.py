@@ -71,7 +71,9 @@ def test_a_definition_is_registered_once_its_text_is_uploaded_and_the_run_has_a_
     run = server.wait(job, "SUCCEEDED")["run"]
     assert server.log(job)[0] == "text True"
     assert httpx.get(f"{server.url}/api/runs/{run}/texts/{digest_of(text)}").text == text
+    assert server.client.run_text(run, digest_of(text)) == text
     assert httpx.get(f"{server.url}/api/runs/{run}/texts/{'0' * 64}").status_code == 404
+    assert server.client.run_text(run, "0" * 64) is None
     kept(server)[digest_of(text)].unlink()
     assert "the store keeps no such text" in refused(
         server, "SubmitJob", jobName="again", jobQueue="default", jobDefinition="reads"

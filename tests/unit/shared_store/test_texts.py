@@ -98,3 +98,27 @@ def test_another_file_replaces_a_file_whole_in_whichever_form() -> None:
     short, long = {"reward_function": SHORT}, beside(spec(LONG))[0]["train"]["config"]
     assert merged(short, long)["reward_function"] == {"file": "long.py", "sha256": DIGEST}
     assert merged(long, short)["reward_function"] == SHORT
+
+
+def test_a_text_goes_beside_a_job_that_does_not_fit_with_it_and_the_longest_goes_first() -> None:
+    medium, short = ({"file": f"{size}.py", "text": "x" * size} for size in (12_000, 3_000))
+    actions = {"action_space": [{"steering_angle": angle, "speed": 1.0} for angle in range(200)]}
+    whole = spec(medium)
+    whole["train"]["config"] |= {"other": short}
+    assert beside(whole) == (whole, {})
+    whole["train"]["config"] |= actions
+    shortened, found = beside(whole)
+    assert [each.file for each in found] == ["12000.py"] and shortened["train"]["config"]["other"] == short
+    whole = {**spec(medium), "environment": {"NOTE": "n" * 5000}}
+    assert [each.file for each in beside(whole)[1]] == ["12000.py"], "a definition has the environment twice"
+
+
+@pytest.mark.parametrize("value", [{"sha256": DIGEST}, {"sha256": DIGEST, "text": ""}])
+def test_a_digest_without_a_name_or_with_an_empty_text_stands_for_the_text(
+    value: dict[str, str], tmp_path: Path
+) -> None:
+    [found] = references(spec(value))
+    assert (found.file, found.sha256) == ("reward_function", DIGEST)
+    texts.keep(tmp_path, LONG["text"].encode())
+    config = texts.resolved({"reward_function": value}, tmp_path, "train.config")
+    assert config == {"reward_function": {"file": "reward_function", "text": LONG["text"]}}

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrator.api import arns
 from orchestrator.control.account import DEFAULT, Account, recognise
+from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.domain.errors import UsageError
+from orchestrator.persistence.models import Job, JobDefinition, JobQueue
+from orchestrator.persistence.own_models import LogGroup
 from orchestrator.persistence.session import Database
+from tests.support.orchestrator.rows import job
 
 
 @pytest.fixture
@@ -65,3 +70,38 @@ def test_every_arn_has_the_account_the_region_and_its_partition() -> None:
             arns.plain_name("arn:aws:batch:us-east-1:000000000000:job-queue/q", "job-queue")
     finally:
         arns.settle(DEFAULT)
+
+
+def temporary(database: Database) -> Account:
+    with database.session() as session:
+        return recognise(session, None, None, temporary=True)
+
+
+def definition(name: str, environment: list[dict[str, str]]) -> JobDefinition:
+    return JobDefinition(name=name, revision=1, document={"containerProperties": {"environment": environment}})
+
+
+def test_a_temporary_controller_settles_nothing_and_its_jobs_go_along(database: Database) -> None:
+    assert temporary(database) == DEFAULT
+    with database.session() as session:
+        ensure_compute_environments(session, ["local", "docker"])
+        session.add(definition("own", [{"name": "MUSTER_SPEC", "value": "{}"}]))
+        session.add(job("j", definition="arn:aws:batch:us-east-1:000000000000:job-definition/own:1"))
+    mine = start(database, "123456789012", "cn-north-1")
+    assert mine == temporary(database) == Account("123456789012", "cn-north-1", "aws-cn")
+    with database.session() as session:
+        found = session.get_one(Job, "j").definition
+    assert found == "arn:aws-cn:batch:cn-north-1:123456789012:job-definition/own:1"
+
+
+@pytest.mark.parametrize(
+    "made",
+    [definition("theirs", []), JobQueue(name="robots", compute_environments=["local"]), LogGroup(name="/g", tags={})],
+)
+def test_what_a_batch_client_has_made_meanwhile_settles_it(database: Database, made: Any) -> None:
+    temporary(database)
+    with database.session() as session:
+        session.add(made)
+    with pytest.raises(UsageError, match="000000000000 in us-east-1 since its first start"):
+        start(database, "123456789012")
+    assert start(database) == DEFAULT

@@ -20,12 +20,16 @@ from orchestrator.persistence import models
 from orchestrator.persistence.models import Job, JobDefinition
 from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.session import Database
+from orchestrator.spec.compile import compile_definition, long_texts
+from orchestrator.spec.model import validate
 from shared_store.layout import Store
 from shared_store.texts import LARGEST, digest_of
 from tests.support.refusals import refusal
 
 TEXT = "def reward_function(params):\n    return 1.0\n"
 DIGEST = digest_of(TEXT)
+LONG = {"file": "long.py", "text": TEXT + "#" * (30 << 10)}
+_TRAIN = {"task": "Racer", "worlds": 4, "iterations": 1, "config": {"reward_function": LONG}}
 
 
 @pytest.fixture
@@ -104,6 +108,33 @@ def test_a_text_stays_while_an_active_definition_or_a_job_that_has_not_ended_nam
             job.status = Status.SUCCEEDED
         session.get(JobDefinition, ("active", 1)).status = "INACTIVE"  # type: ignore[union-attr]
     assert sorted(texts.sweep()) == sorted([active, running])
+
+
+def test_a_definition_of_muster_s_own_submission_holds_no_text_once_its_jobs_have_ended(
+    texts: KeptTexts, store: Store, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = validate({"name": "own", "train": _TRAIN}, "job.yaml")
+    compiled = compile_definition(spec, "/here")
+    [digest] = [texts.keep(text.encode(), "key a") for text in long_texts(spec)]
+    facts = {"queue": "default", "definition": "own:1", "request": {}, "run": "own-1"}
+    with database.session() as session:
+        session.add(JobDefinition(name="own", revision=1, document=compiled))
+        session.add(Job(id="j", name="own", status=Status.RUNNING, node_properties=compiled["nodeProperties"], **facts))
+    later(monkeypatch, 100)
+    assert texts.sweep() == [] and kept(store) == [digest]
+    with database.session() as session:
+        session.get_one(Job, "j").status = Status.SUCCEEDED
+    assert texts.sweep() == [digest] and kept(store) == []
+
+
+def test_a_text_of_an_earlier_folder_goes_with_its_row(
+    texts: KeptTexts, store: Store, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    earlier = KeptTexts(database, store, "before", threading.Lock())
+    old, used = earlier.keep(TEXT.encode(), "key a"), earlier.keep(b"used", "key a")
+    later(monkeypatch, DAYS + 1)
+    texts.prolong(used)
+    assert texts.sweep() == [old] and os.listdir(store.texts / "before") == [used]
 
 
 def test_the_look_for_what_nothing_needs_is_made_soon_after_a_start_and_then_rarely(

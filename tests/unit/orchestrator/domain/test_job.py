@@ -167,6 +167,7 @@ def test_on_aws_only_the_main_node_matters_and_a_gang_never_goes_on_without_it()
         ("container exited with code 2", None, None),
         ("exit 0, outcome not written (OSError: x)", None, None),
         *((f"{name}Error: x", None, f"{name}Error: x") for name in ("OutOfMemory", "CannotPullContainer")),
+        ("can't start 'x': not there", None, "CannotStartContainerError: can't start 'x': not there"),
         ("the supervisor died", "Host EC2 (instance a) terminated.", "Host EC2 (instance a) terminated."),
     ],
 )

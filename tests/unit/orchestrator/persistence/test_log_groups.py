@@ -31,13 +31,14 @@ def names(session: Session) -> list[str]:
     return list(session.scalars(select(LogGroup.name).order_by(LogGroup.name)))
 
 
-def test_there_is_room_for_a_thousand_groups_and_for_those_that_are_there(session: Session) -> None:
-    log_groups.check_room(session, ["/a"])
-    session.add_all(LogGroup(name=f"/{number}") for number in range(log_groups.MOST))
-    log_groups.check_room(session, ["/1", "/2"])
-    log_groups.check_room(session, [])
-    with pytest.raises(RequestError, match="there are 1000 log groups, and 1000 at most"):
-        log_groups.check_room(session, ["/1", "/a"])
+def test_each_key_has_room_for_a_thousand_groups_and_for_those_that_are_there(session: Session) -> None:
+    log_groups.check_room(session, ["/a"], "key alice")
+    session.add_all(LogGroup(name=f"/{number}", owner="key alice") for number in range(log_groups.MOST))
+    log_groups.check_room(session, ["/1", "/2"], "key alice")
+    log_groups.check_room(session, [], "key alice")
+    with pytest.raises(RequestError, match="key alice has 1000 log groups, and may have 1000"):
+        log_groups.check_room(session, ["/1", "/a"], "key alice")
+    log_groups.check_room(session, ["/a"], "key bob")
 
 
 def test_a_new_attempt_records_where_each_node_logs_and_makes_a_deleted_group_again(session: Session) -> None:

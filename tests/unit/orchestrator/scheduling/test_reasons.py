@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from orchestrator.domain.reasons import Reason
+from orchestrator.domain.reasons import Reason, named
+from orchestrator.domain.resources import Resources
 from orchestrator.scheduling.decide import decide
 from orchestrator.scheduling.fit import fit
+from orchestrator.scheduling.placement import shortage
 from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue, Snapshot
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
@@ -194,3 +196,11 @@ def test_no_timeout_is_advised_where_another_reservation_without_a_known_time_is
     places = [environment("p", ("a",)), environment("q", ("b",))]
     decided = Pass([host("a"), host("b")], waiting, held, queues, places)
     assert decided.reason("wide").endswith("; it would fit now, but on what is kept for that job")
+
+
+def test_a_child_of_an_array_is_named_with_its_index_and_no_shortage_is_of_nothing() -> None:
+    assert (
+        named("arr", "aa97f6c7-1111:12") == "arr:12 (aa97f6c7:12)" and named("ant", "aa97f6c7-1111") == "ant (aa97f6c7)"
+    )
+    wanted, free = Resources(cpus=2, memory=1), Resources(cpus=1.996, memory=1)
+    assert shortage(wanted, free) == "less than 0.01 of 2 CPUs short"

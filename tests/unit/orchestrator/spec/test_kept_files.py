@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from orchestrator.api.http import limits
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec import file as specfile
 from orchestrator.spec import kept_files, strict_yaml
@@ -108,7 +109,7 @@ def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Pat
 def test_a_text_that_does_not_fit_into_a_definition_is_kept_beside_the_job_and_the_submitter_is_told(
     directory: Path,
 ) -> None:
-    (directory / "mine.py").write_text(GOOD + "#" * (IN_DEFINITION - 400))
+    (directory / "mine.py").write_text(GOOD + "#" * (IN_DEFINITION - 2000))
     short = specfile.load("job.yaml")
     assert (long_texts(short), short.notes) == ([], ())
     text = GOOD + "#" * IN_DEFINITION
@@ -248,3 +249,28 @@ def test_a_run_s_function_is_tried_anew_on_another_track() -> None:
             with_files(document, "evaluation of r", task="Racer", base=racer["train"]["config"])
     boxes = {"evaluate": {"config": {"obstacles": [{"distance": 3.0}]}}}
     assert with_files(boxes, "evaluation of r", task="Racer", base=racer["train"]["config"]) == boxes
+
+
+def test_a_long_function_of_a_run_is_fetched_and_tried_anew_on_another_track() -> None:
+    kept = {"file": "mine.py", "sha256": digest_of(FAR)}
+    racer = {"train": {"task": "Racer", "config": {"track": "chicane", "reward_function": kept}}}
+    texts, changes, notes = {digest_of(FAR): FAR}, ["train.config.track=oval"], list[str]()
+    refused = refusal(changes_with_files, lambda: racer, changes, no_text, text_of=texts.get, error=SpecError)
+    assert refused.endswith(SHORT)
+    with pytest.raises(SpecError, match="on track oval"):
+        with_files({"race": {"track": "oval"}}, "r", task="Racer", base=racer["train"]["config"], text_of=texts.get)
+    assert changes_with_files(lambda: racer, changes, no_text, note=notes.append) == changes
+    assert notes == ["mine.py: its text is not in the run: it is not tried here, but on the job's nodes"]
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_file_that_fits_alone_is_kept_beside_a_job_that_is_long_without_it(directory: Path) -> None:
+    actions = [{"index": i, "steering_angle": i - 15, "speed": 1.0 + i / 20} for i in range(30)]
+    (directory / "space.json").write_text(json.dumps({"action_space": actions}))
+    (directory / "mine.py").write_text(GOOD + "#" * 16_800)
+    tracks = f"train.config.track={json.dumps([f'random:{seed}' for seed in range(16)])}"
+    changes = ["train.config.action_space=space.json", tracks, f"environment.NOTE={'n' * 900}"]
+    spec = specfile.load("job.yaml", changes)
+    definition = compile_definition(spec, str(directory))
+    assert len(json.dumps(definition)) <= limits.LARGEST["registerjobdefinition"]
+    assert len(long_texts(spec)) == 1 and "kept beside the job" in str(spec.notes)
