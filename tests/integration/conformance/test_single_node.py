@@ -173,7 +173,10 @@ def test_children_come_one_by_one_in_a_sequential_array(batch: Batch, tmp_path: 
     batch.wait(f"{job}:0", "RUNNING")
     for index in (1, 2):
         held = batch.describe(f"{job}:{index}")
-        assert held["status"] == "PENDING" and f"{job}:{index - 1}" in held["statusReason"]
+        assert (
+            held["status"] == "PENDING"
+            and f"one-sequential:{index - 1} ({job[:8]}:{index - 1})" in held["statusReason"]
+        )
     gate(tmp_path, "go")
     assert batch.wait(job)["status"] == "SUCCEEDED"
     order = (tmp_path / "log").read_text().splitlines()
