@@ -99,16 +99,17 @@ class Client:
 
     def batch(self, operation: str, **request: Any) -> dict[str, Any]:
         """An AWS Batch operation, such as ``SubmitJob``, with its members as keywords. Raises ApiError, Unreachable."""
-        answer: dict[str, Any] = self._request("POST", f"/v1/{operation.lower()}", request)
+        answer: dict[str, Any] = self._answer("POST", f"/v1/{operation.lower()}", request).json()
         return answer
 
     def get(self, path: str, *, seconds: float = 30, **query: Any) -> Any:
         """GET of a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
-        return self._request("GET", path, query={k: v for k, v in query.items() if v is not None}, seconds=seconds)
+        known = {key: value for key, value in query.items() if value is not None}
+        return self._answer("GET", path, query=known, seconds=seconds).json()
 
     def post(self, path: str, body: dict[str, Any], *, seconds: float = 30) -> Any:
         """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
-        return self._request("POST", path, body, seconds=seconds)
+        return self._answer("POST", path, body, seconds=seconds).json()
 
     def run_text(self, run: str, sha256: str) -> str | None:
         """A long text of a run's jobs; None where the run has it not. Raises ApiError, Unreachable."""
@@ -121,7 +122,7 @@ class Client:
 
     def keep_text(self, text: str) -> None:
         """Have the store keep a long text for a job that names it by its SHA-256; again does no harm. Raises ApiError, Unreachable."""
-        self._request("PUT", f"/api/texts/{digest_of(text)}", content=text.encode())
+        self._answer("PUT", f"/api/texts/{digest_of(text)}", content=text.encode())
 
     def logs(self, job: str, **query: Any) -> Iterator[dict[str, Any]]:
         """The job's log lines. Raises ApiError, Unreachable.
@@ -182,18 +183,6 @@ class Client:
             raise self._unreachable(error) from None
         except httpx.InvalidURL:
             raise _unnamable(job) from None
-
-    def _request(
-        self,
-        method: str,
-        path: str,
-        body: Any = None,
-        query: dict[str, Any] | None = None,
-        seconds: float = 30,
-        content: bytes | None = None,
-    ) -> Any:
-        """The JSON of an answer; arguments as :meth:`_answer`."""
-        return self._answer(method, path, body, query, seconds, content).json()
 
     def _answer(
         self,

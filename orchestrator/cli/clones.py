@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue, store_here, tell_note
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue, store_of, tell_note
 from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
@@ -65,7 +65,7 @@ def clone(
                     lambda: client.get(f"/api/runs/{named(run)}")["spec"],
                     set_,
                     (lambda text: None) if dry_run else client.keep_text,
-                    store_here,
+                    partial(store_of, client),
                     tell_note,
                     partial(client.run_text, run),
                 ),

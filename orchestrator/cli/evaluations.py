@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, submit_spec, tell_note
+from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, store_of, submit_spec, tell_note
 from orchestrator.cli.progress import await_end, summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
@@ -162,13 +162,14 @@ def _spec(
     changed = override(document, [*worlds, *elsewhere])
     train = trained.get("train") or {}
     task, base = train.get("task"), train.get("config") or {}
-
-    def store() -> str | None:
-        place = str(client.get("/api/capacity")["store"])
-        return place if Path(place).is_dir() else None
-
     whole = with_files(
-        changed, source, task=task, base=base, store=store, note=tell_note, text_of=partial(client.run_text, run)
+        changed,
+        source,
+        task=task,
+        base=base,
+        store=partial(store_of, client),
+        note=tell_note,
+        text_of=partial(client.run_text, run),
     )
     return validate(whole, source)
 

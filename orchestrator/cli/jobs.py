@@ -121,9 +121,18 @@ def store_here(named: str | None = None) -> str | None:
     if os.environ.get("MUSTER_URL") or local_url():
         try:
             with Client.connect() as client:
-                place = Path(client.get("/api/capacity")["store"])
-        except (ApiError, ServerError, Unavailable, Unreachable):
+                return store_of(client)
+        except (ServerError, Unavailable, Unreachable):
             return None
+    return str(place) if place.is_dir() else None
+
+
+def store_of(client: Client) -> str | None:
+    """The path of the controller's store; None where it is not on this machine, or the controller does not say."""
+    try:
+        place = Path(client.get("/api/capacity")["store"])
+    except (ApiError, ServerError, Unavailable, Unreachable):
+        return None
     return str(place) if place.is_dir() else None
 
 

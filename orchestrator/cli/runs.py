@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, store_here, tell_note
+from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, store_of, tell_note
 from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.serving import CpusOption, StoreOption, found_or_own, see_through
 from orchestrator.cli.show import scored
@@ -56,7 +56,7 @@ def resume(
                     lambda: client.get(f"/api/runs/{named(run)}")["spec"],
                     set_,
                     client.keep_text,
-                    store_here,
+                    partial(store_of, client),
                     tell_note,
                     partial(client.run_text, run),
                 ),

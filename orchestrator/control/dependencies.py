@@ -63,9 +63,9 @@ def _failed_children(session: Session, array: Job, failed: int) -> str:
     """How many children failed, and the first of them by index, each with the start of its reason."""
     children = select(Job).where(Job.parent == array.id, Job.status == Status.FAILED)
     first = session.scalars(children.order_by(Job.array_index).limit(_NAMED)).all()
-    named = [f"{each.array_index} ({excerpt(' '.join(each.reason.words.split()), _LONGEST)})" for each in first]
-    others = [f"{failed - len(named)} more"] if failed > len(named) else []
-    return f"{failed} of {array.array_size} array jobs failed: {', '.join([*named, *others])}"
+    words = [f"{each.array_index} ({excerpt(' '.join(each.reason.words.split()), _LONGEST)})" for each in first]
+    others = [f"{failed - len(words)} more"] if failed > len(words) else []
+    return f"{failed} of {array.array_size} array jobs failed: {', '.join([*words, *others])}"
 
 
 def _state(session: Session, job_id: str) -> str:

@@ -56,6 +56,11 @@ class Shape:
         return sum(self.nodes[: self.minimum], Resources())
 
 
+FARGATE_MEMBERS = (
+    *("networkConfiguration", "fargatePlatformConfiguration", "platformVersion", "ephemeralStorage"),
+    "runtimePlatform",
+)
+"""Members of a container that are for Fargate; no engine reads them."""
 LOG_GROUP = "/aws/batch/job"
 """The log group of containers that name none."""
 

@@ -6,14 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from orchestrator.api.errors import ClientError
+from orchestrator.domain.gang import FARGATE_MEMBERS
 
 FARGATE = "FARGATE"
-MEMBERS = (
-    *("networkConfiguration", "fargatePlatformConfiguration", "platformVersion", "ephemeralStorage"),
-    "runtimePlatform",
-)
-"""Members of a container that are for Fargate; no engine reads them."""
-_ONLY_FARGATE = MEMBERS[:3]
+_ONLY_FARGATE = FARGATE_MEMBERS[:3]
 """Those that a job on EC2 must not have (AWS Batch API reference, ContainerProperties)."""
 _ONLY_EC2 = ("privileged", "ulimits", "instanceType", "vcpus", "memory")
 _ONLY_EC2_LINUX = ("devices", "sharedMemorySize", "tmpfs", "maxSwap", "swappiness")
@@ -131,5 +127,5 @@ def check_queue(name: str, documents: Sequence[Mapping[str, Any]], definition: M
 
 def without_effect(definition: Mapping[str, Any], containers: Iterable[Mapping[str, Any]]) -> list[str]:
     """The members of a Fargate job that no engine heeds, by name."""
-    given = {key for container in containers for key in MEMBERS if container.get(key)}
+    given = {key for container in containers for key in FARGATE_MEMBERS if container.get(key)}
     return sorted(given | ({"platformCapabilities"} if is_fargate(definition) else set()))

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
+from orchestrator.domain.gang import FARGATE_MEMBERS
 from orchestrator.engines.api import EngineError, Gang, NodePlan
 from orchestrator.engines.aws_batch.config import AwsConfig
 from shared_store import __version__
@@ -21,10 +22,7 @@ DIGEST, GANG = "muster:digest", "muster:gang"
 _MOST_RANGES = 5
 _TIMEOUT_SLACK = 600
 """Seconds after the controller's own timeout at which AWS ends an attempt whose controller is away."""
-_OURS = (
-    *("vcpus", "memory", "networkConfiguration", "fargatePlatformConfiguration", "platformVersion"),
-    *("ephemeralStorage", "runtimePlatform"),
-)
+_OURS = ("vcpus", "memory", *FARGATE_MEMBERS)
 """Members of a container that are not passed on: the placement says the first two, and a job on EC2 must not have Fargate's."""
 _NODE_FIELDS = ("node_index", "node_count", "main_index", "master_address", "address", "bus", "bus_token")
 
