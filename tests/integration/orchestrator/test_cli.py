@@ -277,7 +277,8 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     wait_for(lambda: "RUNNABLE" in running.stdout.readline(), 30, "the job waits")
     running.send_signal(signal.SIGTERM)  # is taken as Ctrl-C is
     said, errors = running.communicate(timeout=60 * PATIENCE)
-    assert (running.returncode, errors) == (130, ""), said
+    stopping = "\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)\n"
+    assert (running.returncode, errors) == (130, stopping), said
     assert "FAILED  cartpole (" in said and ": stopped with Ctrl-C" in said
     [job] = [each for each in json.loads(server.muster("list", "--json").stdout) if each["jobName"] == "cartpole"]
     never = f"job cartpole ({job['jobId'][:8]}) never started; submit it again"
