@@ -48,9 +48,9 @@ def recover(partial: Path) -> Recovered | None:
         if records.whole:
             return None
         if not steps:
-            why = records.losses() or (
-                "it ends before the first control step" if records.found else "it does not begin as an MCAP file does"
-            )
+            if not records.found:
+                raise UserError(f"{partial}: it has no readable record of an MCAP file; there is nothing to recover")
+            why = records.losses() or "it ends before the first control step"
             raise UserError(f"{partial}: {why}; there is no control step to recover")
         os.replace(hidden, target)
     except OSError as error:

@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import urllib.parse
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,6 +55,13 @@ class View:
     def below(self) -> list[psutil.Process]:
         return psutil.Process(self.process.pid).children(recursive=True)
 
+    @property
+    def stream(self) -> str:
+        """Of Rerun's server itself, for its own clients (gRPC); the page relays what a browser asks (gRPC-web)."""
+        (server,) = [each.cmdline() for each in self.below if each.name() == "rerun"]
+        address, port = (server[server.index(option) + 1] for option in ("--bind", "--port"))
+        return f"rerun+http://{address}:{port}/proxy"
+
     def interrupt(self) -> int:
         """Ctrl-C, as a terminal sends it to all of them; returns the exit code."""
         for each in self.below:
@@ -70,19 +76,13 @@ class View:
         self.process.wait()
 
 
-def stream_of(url: str) -> str:
-    """Where the page gets its data from."""
-    with urllib.request.urlopen(f"{url}/") as page:
-        return urllib.parse.parse_qs(urllib.parse.urlsplit(page.url).query)["url"][0]
-
-
-def saved(url: str, file: Path) -> dict[str, Any]:
-    """What a second client of Rerun's gets, by entity: tables with the rows of all chunks, after some seconds."""
+def saved(view: View, file: Path) -> dict[str, Any]:
+    """What a client of Rerun's server gets, by entity: tables with the rows of all chunks, after some seconds."""
     import pyarrow as pa
     from rerun.chunk import RrdReader
 
     client = subprocess.Popen(
-        [need_rerun(), stream_of(url), "--save", file, "--bind", "127.0.0.1", "--port", "auto"],
+        [need_rerun(), view.stream, "--save", file, "--bind", "127.0.0.1", "--port", "auto"],
         stderr=subprocess.DEVNULL,
     )
     size = wait_for(lambda: file.exists() and file.stat().st_size, 60, "the stream")
@@ -130,7 +130,7 @@ def rank_of(run: Run) -> psutil.Process:
 
 
 def test_frames_curve_and_log_of_a_training_arrive_at_20_hz_at_most(view: View, job: str, tmp_path: Path) -> None:
-    tables = saved(view.url, tmp_path / "view.rrd")
+    tables = saved(view, tmp_path / "view.rrd")
     frames = np.unique(tables["/tf"]["time"].to_numpy().astype(np.int64))
     assert len(frames) > 5 and (len(frames) - 1) / (np.ptp(frames) / 1e9) < 20.5
     assert tables["/tf"].num_rows == 5 * len(frames)  # cart and pole of two worlds, and what the eye follows
@@ -207,7 +207,7 @@ def test_a_checkpoint_s_policy_acts_until_its_episodes_are_over(server: Serving,
     assert found and int(found[1]) > 2
     view = View(server, run.name, "--worlds", "1")
     try:
-        tables = saved(view.url, tmp_path / "policy.rrd")
+        tables = saved(view, tmp_path / "policy.rrd")
         assert view.interrupt() == 0 and not [line for line in view.said if "Traceback" in line]
     finally:
         view.close()

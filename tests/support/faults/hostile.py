@@ -70,7 +70,7 @@ def grow(depth):
 grow(2)  # 39 processes
 time.sleep(0.3)
 """,
-        "^Essential container in task exited$",
+        "^done$",
     ),
     "escapes and fails": Case("escape(); sys.exit(3)", r"^main node: rank 0 exited with code 3"),
     "escapes and is stopped": Case("escape(); print('ready'); time.sleep(60)", "^hostile$", stop=True),
@@ -102,7 +102,7 @@ time.sleep(0.3)
     ),
     "floods its output": Case(
         "end = time.time() + 1\nwhile time.time() < end: os.write(1, b'y\\n' * 4096)",
-        "^Essential container in task exited$",
+        "^done$",
     ),
     "garbage for progress": Case(
         """
@@ -111,7 +111,7 @@ for junk in (b'[1]\\n1\\nnull\\n"x"\\n', b'{"iteration": "x"}\\n{"iteration": 1e
     os.write(fd, junk)
 escape()
 """,
-        "^Essential container in task exited$",
+        "^done$",
     ),
     "a huge error file": Case(
         """

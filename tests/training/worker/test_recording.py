@@ -262,7 +262,7 @@ def test_a_whole_recording_and_one_without_a_step_are_not_recovered_and_nothing_
 
 def test_a_file_other_than_a_recording_is_not_recovered(tmp_path: Path) -> None:
     (tmp_path / "text.mcap.partial").write_text("no recording")
-    with pytest.raises(UserError, match="does not begin as an MCAP file does"):
+    with pytest.raises(UserError, match="it has no readable record of an MCAP file"):
         recover(tmp_path / "text.mcap.partial")
     with pytest.raises(UserError, match="there is no such file"):
         recover(tmp_path / "nothing.mcap.partial")
