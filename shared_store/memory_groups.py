@@ -10,7 +10,6 @@ import errno
 import os
 
 from shared_store.cgroups import CONTROLLER, find_group, is_delegated
-from shared_store.entered import entered
 
 _JOB = "job"
 
@@ -60,11 +59,6 @@ def make_memory_group(path: str, limit: int) -> None:
         _write(f"{above}/cgroup.subtree_control", "+memory")
     os.makedirs(path, exist_ok=True)
     _limit(path, limit)
-
-
-def entering(path: str) -> list[str]:
-    """A command that enters the group and becomes the command after it."""
-    return entered(f"{path}/cgroup.procs")
 
 
 def killed_for_memory(path: str) -> bool:

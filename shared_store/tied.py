@@ -1,6 +1,7 @@
-"""Runs a command that dies with the process that started it: ``python -I -S tied.py PARENT IGNORED COMMAND ...``.
+"""Runs a command that dies with the process that started it: ``python -I -S tied.py PARENT IGNORED GROUP COMMAND ...``.
 
-It is a program of its own, not a ``preexec_fn``: Python must not run between fork and exec in a process with threads, since a thread
+It is no shell, which would drop variables of the environment that have names that it can't have itself, such as ``my.var``. It is a
+program of its own, not a ``preexec_fn``: Python must not run between fork and exec in a process with threads, since a thread
 that the child lacks may hold one of Python's locks (seen with CPython 3.11: child and parent wait forever). Linux only.
 """
 
@@ -20,14 +21,15 @@ _PR_SET_PDEATHSIG = 1
 _PR_SET_PTRACER = 0x59616D61
 
 
-def tied(command: Sequence[str], ignoring: Sequence[int] = ()) -> list[str]:
+def tied(command: Sequence[str], ignoring: Sequence[int] = (), group: str = "") -> list[str]:
     """The command line that runs ``command`` so that the kernel kills it when this process dies, however it dies.
 
     The signal is tied to the *thread* that forks (``prctl(2)``), so start it from one that lives as long as the process. All signals
-    have their default action, except those in ``ignoring``.
+    have their default action, except those in ``ignoring``. ``group`` is the directory of a control group that the command enters; where
+    it can't be entered, one line on standard error says so, and the command runs outside.
     """
     ignored = ",".join(str(int(number)) for number in ignoring)
-    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), ignored, *command]
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), ignored, group, *command]
 
 
 def start_tied(command: Sequence[str], ignoring: Sequence[int] = (), **options: Any) -> subprocess.Popen[bytes]:
@@ -57,9 +59,21 @@ def follow(parent: int) -> None:
         os._exit(1)
 
 
-def main(parent: str, ignored: str, *command: str) -> None:
+def enter(group: str) -> None:
+    """Enter the control group in this directory."""
+    try:
+        file = os.open(f"{group}/cgroup.procs", os.O_WRONLY)
+        os.write(file, b"0")
+        os.close(file)
+    except OSError as error:
+        print(f"{group}/cgroup.procs: {error.strerror}", file=sys.stderr, flush=True)
+
+
+def main(parent: str, ignored: str, group: str, *command: str) -> None:
     """Become ``command``; if that fails, exit with 127 and one line on standard error."""
     follow(int(parent))
+    if group:
+        enter(group)
     # Python ignores some, and a parent may: nohup SIGHUP, a shell SIGINT of what it runs in the background
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
         signal.signal(number, signal.SIG_IGN if str(int(number)) in ignored.split(",") else signal.SIG_DFL)

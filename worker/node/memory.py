@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from shared_store.contract import NodeContract
-from shared_store.memory_groups import entering, killed_for_memory, make_memory_group
+from shared_store.memory_groups import killed_for_memory, make_memory_group
 
 
 class MemoryLimit:
@@ -13,22 +13,20 @@ class MemoryLimit:
         """Make the control group that the contract names, if it names one."""
         self.limit = contract.memory_limit
         """MiB."""
-        self.prefix: list[str] = []
-        """Put before a rank's command: it enters the group. Empty for no limit."""
         self.problem = ""
         """Why there is no limit although the contract names one; empty where there is one, or none is wanted."""
-        self._group = contract.memory_group
+        self.group = contract.memory_group
+        """Directory of the control group that a rank's command enters; empty for no limit."""
         self._used_up = False
-        if self._group:
+        if self.group:
             try:
-                make_memory_group(self._group, self.limit << 20)
-                self.prefix = entering(self._group)
+                make_memory_group(self.group, self.limit << 20)
             except OSError as error:
                 self.problem = f"muster: memory is not limited to {self.limit} MiB: {error.strerror}: {error.filename}"
-                self._group = ""
+                self.group = ""
 
     def is_used_up(self) -> bool:
         """Whether the kernel has ended a process of the node for it."""
-        if self._group and not self._used_up:
-            self._used_up = killed_for_memory(self._group)
+        if self.group and not self._used_up:
+            self._used_up = killed_for_memory(self.group)
         return self._used_up

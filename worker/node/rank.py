@@ -95,6 +95,7 @@ class Rank:
         *,
         directory: Path | None = None,
         prefix: Sequence[str] = (),
+        group: str = "",
     ) -> None:
         """Start ``command`` in a session of its own, tied to this process's life. Raises OSError where it can't be started.
 
@@ -103,6 +104,7 @@ class Rank:
             env: All its variables.
             directory: Its working directory; None: that of this process.
             prefix: A command that becomes ``command``.
+            group: Directory of the control group that it enters; empty: none.
         """
         program = os.path.join(directory or "", command[0]) if "/" in command[0] else command[0]
         if shutil.which(program, path=env.get("PATH", os.defpath)) is None:
@@ -111,7 +113,7 @@ class Rank:
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._directory = directory
         self._process = subprocess.Popen(
-            tied([*prefix, *command]),
+            tied([*prefix, *command], group=group),
             cwd=directory,
             env={**env, "MUSTER_PROGRESS_FD": str(write_end)},
             pass_fds=(write_end,),

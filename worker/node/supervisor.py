@@ -167,7 +167,7 @@ class Supervisor:
             # what the user set in the job's environment stands; some variables are the supervisor's alone
             given = {name: value for name, value in found.environment.items() if name not in OWN_VARIABLES}
             env = {**shared, **given, **rank.environment()}
-            rank.start(self.command, env, directory=found.directory, prefix=[*self._memory.prefix, *found.prefix])
+            rank.start(self.command, env, directory=found.directory, prefix=found.prefix, group=self._memory.group)
             self.ranks.append(rank)
             for stream in ("o", "e"):
                 self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))

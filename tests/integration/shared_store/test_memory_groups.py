@@ -12,8 +12,9 @@ import pytest
 
 from shared_store.cgroups import own_group, remove_group
 from shared_store.contract import NodeContract
-from shared_store.memory_groups import entering, killed_for_memory, limits_memory, memory_group, memory_home
+from shared_store.memory_groups import killed_for_memory, limits_memory, memory_group, memory_home
 from shared_store.shim import shimmed
+from shared_store.tied import tied
 from tests.conftest import REPOSITORY
 from worker.node.memory import MemoryLimit
 
@@ -21,12 +22,13 @@ NAME = f"muster-test-memory-{os.getpid()}"
 SUPERVISOR = f"""
 import subprocess, sys
 sys.path.insert(0, {str(REPOSITORY)!r})
-from shared_store.memory_groups import entering, killed_for_memory, make_memory_group
+from shared_store.memory_groups import killed_for_memory, make_memory_group
+from shared_store.tied import tied
 path, *scripts = sys.argv[1:]
 make_memory_group(path, 64 << 20)
 large = bytearray(100 << 20)  # the supervisor's own is not the job's
 for script in scripts:
-    ended = subprocess.run([*entering(path), "sh", "-c", script])
+    ended = subprocess.run(tied(["sh", "-c", script], group=path))
     print(ended.returncode, killed_for_memory(path), flush=True)
 """
 
@@ -70,16 +72,18 @@ def test_a_group_that_can_t_be_made_is_said_and_limits_nothing(tmp_path: Path) -
     facts = {"node_index": 0, "node_count": 1, "main_index": 0, "master_address": "", "master_port": 1, "epoch": 1}
     contract = NodeContract(job="j", attempt=1, run="r", store="s", job_epoch=1, **facts)
     limit = MemoryLimit(contract)
-    assert (limit.prefix, limit.problem, limit.is_used_up()) == ([], "", False)
+    assert (limit.group, limit.problem, limit.is_used_up()) == ("", "", False)
     named = NodeContract(**{**vars(contract), "memory_group": str(tmp_path / "group"), "memory_limit": 64})
     limit = MemoryLimit(named)  # an ordinary directory has no limits
     path = tmp_path / "group" / "memory.limit_in_bytes"
     assert limit.problem == f"muster: memory is not limited to 64 MiB: No such file or directory: {path}"
-    assert (limit.prefix, limit.is_used_up(), killed_for_memory(str(tmp_path))) == ([], False, False)
+    assert (limit.group, limit.is_used_up(), killed_for_memory(str(tmp_path))) == ("", False, False)
 
 
 def test_a_rank_whose_group_is_gone_starts_all_the_same(tmp_path: Path) -> None:
-    ended = subprocess.run([*entering(str(tmp_path / "gone")), "sh", "-c", "exit 7"], stderr=subprocess.PIPE, text=True)
+    ended = subprocess.run(
+        tied(["sh", "-c", "exit 7"], group=str(tmp_path / "gone")), stderr=subprocess.PIPE, text=True
+    )
     assert ended.returncode == 7 and "cgroup.procs" in ended.stderr
 
 
@@ -91,10 +95,11 @@ def test_the_environment_is_passed_on_as_it_is(tmp_path: Path) -> None:
         "A b": "2",
         "BASH_FUNC_x%%": "() { :; }",
         "IFS": ":",
+        "LC_ALL": "C.UTF-8",  # Python adds LC_CTYPE where the locale is C
         "PPID": "7",
         "PATH": os.environ["PATH"],
     }
-    ended = subprocess.run([*entering(str(tmp_path)), "env", "-0"], env=sent, stdout=subprocess.PIPE, text=True)
+    ended = subprocess.run(tied(["env", "-0"], group=str(tmp_path)), env=sent, stdout=subprocess.PIPE, text=True)
     assert dict(each.split("=", 1) for each in ended.stdout.split("\0")[:-1]) == sent
     assert (tmp_path / "cgroup.procs").read_text() == "0"
 
