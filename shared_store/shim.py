@@ -124,7 +124,7 @@ def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
                 file.write("0")
         except OSError:
             pass  # without a group the shim itself finds the remaining processes
-    tied.main(str(shim), "", *command)
+    tied.main(str(shim), "", "", *command)
 
 
 def _wait(supervisor: int, watched: set[signal.Signals]) -> int:
