@@ -49,7 +49,7 @@ class Finding:
     what: str
     state: str
     """``ok``; ``absent``: optional and missing; ``bad``: required and broken."""
-    said: str
+    text: str
 
 
 def register(app: typer.Typer) -> None:
@@ -71,7 +71,7 @@ def doctor(
     else:
         console = Console(soft_wrap=True, highlight=False)
         for finding in findings:
-            console.print(f"{_MARKS[finding.state]} {finding.what:<16} {escape(finding.said)}")
+            console.print(f"{_MARKS[finding.state]} {finding.what:<16} {escape(finding.text)}")
     if any(finding.state == "bad" for finding in findings):
         raise typer.Exit(1)
 
@@ -107,8 +107,8 @@ def _packages(worker: bool) -> Finding:
         except importlib.metadata.PackageNotFoundError:
             missing.append(name)
     if missing:
-        said = f"{', '.join(missing)} not installed: controller and command only; pip install 'muster[worker]' to run nodes"
-        return Finding("packages", "bad" if worker else "absent", said)
+        text = f"{', '.join(missing)} not installed: controller and command only; pip install 'muster[worker]' to run nodes"
+        return Finding("packages", "bad" if worker else "absent", text)
     return Finding("packages", "ok", ", ".join(found))
 
 
@@ -122,13 +122,13 @@ def _directory(path: Path) -> str:
 
 def _store(path: Path) -> str:
     """A commit like Muster's: written, made durable, renamed, read back."""
-    said = _directory(path)
+    text = _directory(path)
     with tempfile.TemporaryDirectory(prefix=".doctor-", dir=path) as scratch:
         started = time.perf_counter()
         write_json(Path(scratch) / "commit", {"pid": os.getpid()})
         took = time.perf_counter() - started
         json.loads((Path(scratch) / "commit").read_text())
-    return f"{said}, a durable write takes {took * 1000:.1f} ms"
+    return f"{text}, a durable write takes {took * 1000:.1f} ms"
 
 
 def _shared_memory() -> Finding:
@@ -146,8 +146,8 @@ def _memory_limit() -> Finding:
         return Finding(
             "memory limit", "ok", "a controller started like this limits jobs of the Batch API on engine local"
         )
-    said = "engine local can't limit memory here: no control group; systemd-run --user --scope -p Delegate=yes muster serve"
-    return Finding("memory limit", "absent", said)
+    text = "engine local can't limit memory here: no control group; systemd-run --user --scope -p Delegate=yes muster serve"
+    return Finding("memory limit", "absent", text)
 
 
 def _controller() -> Finding:

@@ -1,1 +1,1 @@
-"""The racer: tracks, what a car on one is told about it, and reward functions."""
+"""The racer: tracks, what a car on one observes, and reward functions."""

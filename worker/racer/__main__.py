@@ -31,17 +31,17 @@ def list_tracks(order: Order) -> list[Order]:
     store, found = Store(order["store"]), []
     for name in PRESETS:
         track = make_preset(name)
-        found.append({**_told(order, track), "origin": {"preset": name}, "about": PRESETS[name].about})
+        found.append({**_facts(order, track), "origin": {"preset": name}, "about": PRESETS[name].about})
     for name in stored.names(store):
         try:
             track = resolve(name, store)
-            found.append({**stored.StoredTrack(store.tracks / name).facts(), **_told(order, track)})
+            found.append({**stored.StoredTrack(store.tracks / name).facts(), **_facts(order, track)})
         except (stored.TrackError, UserError) as error:
             found.append({"name": name, "problem": str(error)})
     return found
 
 
-def _told(order: Order, track: Track) -> Order:
+def _facts(order: Order, track: Track) -> Order:
     """Measures of a track; they come from its points, also where another version kept others beside them."""
     return {**track.facts(), **(_rings(track) if order.get("rings") else {})}
 
@@ -58,9 +58,9 @@ def show(order: Order) -> Order:
     track = resolve(order["name"], store)
     _write(order, _content(order, track))
     if track.name not in stored.names(store):
-        return _told(order, track)
+        return _facts(order, track)
     kept = stored.find(store, track.name)
-    return {**kept.facts(), **_told(order, track), "path": str(kept.path)}
+    return {**kept.facts(), **_facts(order, track), "path": str(kept.path)}
 
 
 def make(order: Order) -> Order:

@@ -31,7 +31,7 @@ RINGS = ("centre line", "inner border", "outer border")
 _BLOCK = 512
 """Segments that are compared with all others at once."""
 _TOLD = 1000
-"""Crossings of each block among which the one that is told is looked for."""
+"""Crossings of each block among which the one to report is looked for."""
 
 
 class BadTrack(UserError):

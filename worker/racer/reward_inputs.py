@@ -93,7 +93,7 @@ def sees_box(view: CameraView, pose: wp.vec3, box: wp.vec3, half: wp.vec2) -> bo
 
 
 @wp.func
-def told(truth: bool) -> float:
+def as_number(truth: bool) -> float:
     """A truth value as a number."""
     number = float(0.0)
     if truth:
@@ -116,15 +116,15 @@ def _tell(
     backwards = car.backwards[world]
     pose = car.poses[world]
     length = car.road.length[track]
-    numbers[ALL_WHEELS] = told(car.wheels[world] == 4)
+    numbers[ALL_WHEELS] = as_number(car.wheels[world] == 4)
     numbers[X] = car.fronts[world][0]
     numbers[Y] = car.fronts[world][1]
     numbers[HEADING] = wp.degrees(pose[2])
     numbers[DISTANCE] = car.distances[world]
-    numbers[LEFT] = told(car.left[world])
-    numbers[REVERSED] = told(backwards)
-    numbers[CRASHED] = told(car.crashed[world])
-    numbers[OFF_TRACK] = told(car.wheels[world] == 0)
+    numbers[LEFT] = as_number(car.left[world])
+    numbers[REVERSED] = as_number(backwards)
+    numbers[CRASHED] = as_number(car.crashed[world])
+    numbers[OFF_TRACK] = as_number(car.wheels[world] == 0)
     numbers[PROGRESS] = progress_of(world, car)
     numbers[STEPS] = float(car.steps[world])
     numbers[STEERING] = wp.degrees(car.commands[world][0])
@@ -157,11 +157,11 @@ def _tell(
         row[O_PLACE + 1] = box[1]
         row[O_ALONG] = along
         row[O_HEADING] = 0.0
-        row[O_LEFT] = told(side > 0.0)
+        row[O_LEFT] = as_number(side > 0.0)
         row[O_DISTANCE] = wp.abs(side)
         if number == car.next_obstacle[world]:
             seen = sees_box(view, pose, box, car.obstacle_half)
-    numbers[SEEN] = told(seen)
+    numbers[SEEN] = as_number(seen)
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class Racing:
         context: The worlds.
 
     Attributes:
-        arrays: What the cars' functions are told.
+        arrays: What the cars' functions read.
         reward: The function.
         called: Whether it is called: a trial step, before the worlds begin, is no step of a car.
     """
@@ -273,7 +273,7 @@ class Racing:
         wp.launch(_tell, dim=self._worlds, inputs=inputs, device=self._device)
 
     def settle(self) -> None:
-        """Nothing: what a car is told that was just placed, it is told after its first step."""
+        """Nothing: the function of a car that was just placed reads it after the first step."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """None."""

@@ -1,6 +1,6 @@
 """Tracks on the device, and where a point is on its track: :mod:`worker.racer.geometry` as Warp functions, for one point each.
 
-Several tracks lie one behind the other in the same arrays; every function is told which one is meant.
+Several tracks lie one behind the other in the same arrays; every function has an argument for the track.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def sim_trace(
     length: float,
     control_hz: float,
 ) -> Iterator[str]:
-    """The lines of one episode; where the car is is said of its front, angles are in degrees.
+    """The lines of one episode; positions are those of the front, angles are in degrees.
 
     The first row, ``prepare``, is the car at the start: tools count steps and time from there.
 

@@ -13,7 +13,7 @@ import warp as wp
 
 from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
 from worker.racer.rewards.problems import Failure
-from worker.racer.rewards.translation.translate import told
+from worker.racer.rewards.translation.translate import failure_message
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,5 +109,5 @@ def failures_of(race: Any) -> dict[int, tuple[str, Failure]]:
     errors, values, found = race.errors.numpy(), race.values.numpy(), dict[int, tuple[str, Failure]]()
     for car in np.flatnonzero(errors[:, 1]).tolist():
         code, count = errors[car].tolist()
-        found.setdefault(code, (told(code, float(values[car])), Failure(0, car)))[1].count += count
+        found.setdefault(code, (failure_message(code, float(values[car])), Failure(0, car)))[1].count += count
     return found

@@ -104,7 +104,7 @@ def line_of(error: BaseException, file: str) -> int:
     return line
 
 
-def told_result(result: Any) -> str:
+def result_problem(result: Any) -> str:
     """The fault of a function's return value; empty without one.
 
     A truth value is no reward: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
@@ -130,7 +130,7 @@ def told_result(result: Any) -> str:
     return ""
 
 
-def told_error(error: BaseException) -> str:
+def error_message(error: BaseException) -> str:
     """The message for an exception that a function raised."""
     if isinstance(error, Forbidden):
         return plain(str(error))

@@ -48,14 +48,14 @@ def courses_for(config: Mapping[str, Any], store: Store | None) -> tuple[tuple[C
     """
     notes, tracks = list[str](), []
     try:
-        wanted = configured(RacerConfig, config)
-        for name in wanted.tracks:
+        settings = configured(RacerConfig, config)
+        for name in settings.tracks:
             try:
                 tracks.append(resolve(name, store))
             except BadTrack as error:
                 notes.append(f"it is not tried on track {name}, but on the job's nodes ({error})")
         if tracks:
-            return courses_of(circuit_of(tracks, wanted.obstacles)), notes
+            return courses_of(circuit_of(tracks, settings.obstacles)), notes
     except Refused as error:
         notes.append(f"it is tried on an oval, not on the job's tracks ({error})")
         return (FINE_OVAL,), notes

@@ -42,7 +42,7 @@ _MOST_COUNTED = 100_000_000
 """Characters of a file that is too long; then the count ends."""
 _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
-_MOST_SAID = 64 << 10
+_MOST_OUTPUT = 64 << 10
 """Bytes that the process may answer."""
 _LONGEST = 400
 """Characters of a message."""
@@ -82,11 +82,11 @@ def read_file(path: Path) -> str:
             while count <= _MOST_COUNTED and (part := lines.read(1 << 20)):
                 count += len(part)
     except OSError as error:
-        told = f"the file can't be read: {error.strerror}"
-        raise RewardRefused(Problem("TEST_FAILURE", told, str(path))) from error
+        message = f"the file can't be read: {error.strerror}"
+        raise RewardRefused(Problem("TEST_FAILURE", message, str(path))) from error
     except (SyntaxError, UnicodeDecodeError, LookupError) as error:
-        told = f"the file is no text: {str(error).splitlines()[0]}"
-        raise RewardRefused(Problem("SYNTAX_ERROR", told, str(path))) from error
+        message = f"the file is no text: {str(error).splitlines()[0]}"
+        raise RewardRefused(Problem("SYNTAX_ERROR", message, str(path))) from error
     raise RewardRefused(_too_long(count, str(path)))
 
 
@@ -145,8 +145,8 @@ def read(source: str, file: str) -> Problem | None:
     if len(source) > LARGEST:
         return _too_long(len(source), file)
     if (tokens := len(re.findall(r"\w+|[^\w \t]", source))) > MOST_TOKENS:
-        told = f"{tokens:,} words, signs and lines; a reward function has at most {MOST_TOKENS:,}"
-        return Problem("SYNTAX_ERROR", told, file)
+        message = f"{tokens:,} words, signs and lines; a reward function has at most {MOST_TOKENS:,}"
+        return Problem("SYNTAX_ERROR", message, file)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -155,14 +155,14 @@ def read(source: str, file: str) -> Problem | None:
     except SyntaxError as error:
         return Problem("SYNTAX_ERROR", error.msg, file, error.lineno or 0)
     except (ValueError, RecursionError, MemoryError) as error:
-        told = str(error) if isinstance(error, ValueError) else "it is nested too deeply"
-        return Problem("SYNTAX_ERROR", told, file)
-    return next((Problem(kind, told, file, line) for kind, told, line in _findings(tree, code)), None)
+        message = str(error) if isinstance(error, ValueError) else "it is nested too deeply"
+        return Problem("SYNTAX_ERROR", message, file)
+    return next((Problem(kind, message, file, line) for kind, message, line in _findings(tree, code)), None)
 
 
 def _too_long(count: int, file: str) -> Problem:
-    told = f"{count:,}" if count <= _MOST_COUNTED else f"more than {_MOST_COUNTED:,}"
-    return Problem("SYNTAX_ERROR", f"{told} characters; a reward function has at most {LARGEST:,}", file)
+    message = f"{count:,}" if count <= _MOST_COUNTED else f"more than {_MOST_COUNTED:,}"
+    return Problem("SYNTAX_ERROR", f"{message} characters; a reward function has at most {LARGEST:,}", file)
 
 
 def _findings(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]]:
@@ -304,8 +304,8 @@ def try_out(
     if code is None:
         return Problem("TIMEOUT", f"{_last(lines)} did not end within {_PATIENCE:g} s", file)
     if not lines:
-        told = plain(errors.decode(errors="replace")[-300:], _LONGEST)
-        return Problem("TEST_FAILURE", f"the process that tries the function did not start: {told}", file)
+        message = plain(errors.decode(errors="replace")[-300:], _LONGEST)
+        return Problem("TEST_FAILURE", f"the process that tries the function did not start: {message}", file)
     found = lines[-1]
     if found.get("kind") == "":
         return None
@@ -336,24 +336,24 @@ def _answer(asked: bytes) -> tuple[bytes, bytes, int | None]:
         try:
             with contextlib.suppress(BrokenPipeError), process.stdin:
                 process.stdin.write(asked)
-            said = process.stdout.read(_MOST_SAID)
-            if len(said) == _MOST_SAID:
+            answer = process.stdout.read(_MOST_OUTPUT)
+            if len(answer) == _MOST_OUTPUT:
                 process.kill()
-            errors = process.stderr.read(_MOST_SAID)
+            errors = process.stderr.read(_MOST_OUTPUT)
             code = process.wait()
         finally:
             timer.cancel()
             process.kill()
-    return said, errors, None if late.is_set() else code
+    return answer, errors, None if late.is_set() else code
 
 
 def _read_line(line: str) -> dict[str, Any]:
     """A line of the answer; nothing where it is none."""
     try:
-        said = json.loads(line)
+        answer = json.loads(line)
     except (ValueError, RecursionError):
         return {}
-    return said if isinstance(said, dict) else {}
+    return answer if isinstance(answer, dict) else {}
 
 
 def _last(lines: list[dict[str, Any]]) -> str:

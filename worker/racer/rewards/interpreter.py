@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 ANEW = b"anew\n"
 _LOADING = 60.0
 """For the statements of the file, with its imports on a loaded machine [s]."""
-_MOST_TOLD = 20
+_MOST_FAILURES = 20
 """Different failures in an answer."""
 
 
@@ -74,19 +74,19 @@ def main() -> None:
             alarm.set(0)
         except BaseException as error:
             alarm.set(0)
-            told, count = confined.told_error(error), len(made)
+            message, count = confined.error_message(error), len(made)
             if isinstance(error, MemoryError) and made:
                 made.clear()
                 gc.collect()
-                told = f"{told} after {count} of {len(cars)} copies, one for each car: shorten its tables or have fewer worlds"
-            end(told, confined.line_of(error, file))
+                message = f"{message} after {count} of {len(cars)} copies, one for each car: shorten its tables or have fewer worlds"
+            end(message, confined.line_of(error, file))
         gc.enable()
         gc.freeze()  # what thousands of copies hold is not looked at again and again
         late = f"the function did not return within {seconds:g} s"
         return made
 
     alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
-    # where it does not hold, the guard has told it
+    # where it does not hold, the guard has refused it
     confined.confine(asked["memory"], keep=(steps.fileno(), out.fileno()))
     cars = range(asked["first"], asked["last"])
     with confined.printing(printed):
@@ -107,20 +107,20 @@ def main() -> None:
                 rows = [cells[place : place + of_object] for place in range(0, len(cells), of_object)]
                 params = parameters.parameters_of(row, rows, tracks[int(row[parameters.TRACK])])
                 printed.count = 0
-                told, line = "", 0
+                message, line = "", 0
                 result: Any = None
                 try:
                     alarm.set(seconds)
                     result = functions[car - cars.start].call(params)
                     alarm.set(0)
-                    told = confined.told_result(result)
+                    message = confined.result_problem(result)
                 except BaseException as error:
                     alarm.set(0)
-                    told, line = confined.told_error(error), confined.line_of(error, file)
-                rewards[car] = math.nan if told else float(result)
-                kind = problems.alike(told), line
-                if told and (kind in failures or len(failures) < _MOST_TOLD):
-                    failures.setdefault(kind, [told, line, car, 0])[3] += 1
+                    message, line = confined.error_message(error), confined.line_of(error, file)
+                rewards[car] = math.nan if message else float(result)
+                kind = problems.alike(message), line
+                if message and (kind in failures or len(failures) < _MOST_FAILURES):
+                    failures.setdefault(kind, [message, line, car, 0])[3] += 1
             answer(list(failures.values()))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 MOST_OBJECTS = 10
-"""Objects (obstacles and other cars) of which a car is told at most."""
+"""Objects (obstacles and other cars) that a function gets at most."""
 Point = tuple[float, float]
 
 
@@ -192,7 +192,7 @@ def row_of(params: Mapping[str, Any], track: int = 0) -> tuple[list[float], list
     """
     count = len(params["objects_location"])
     if count > MOST_OBJECTS:
-        raise ValueError(f"a car is told of at most {MOST_OBJECTS} objects, not of {count}")
+        raise ValueError(f"a function gets at most {MOST_OBJECTS} objects, not {count}")
     numbers = [0.0] * NUMBERS
     objects = [[0.0] * OBJECT_NUMBERS for _ in range(count)]
     for name, first in NUMBER_COLUMNS.items():

@@ -63,7 +63,7 @@ class RewardFunction:
         self.reason = "" if compiled else "Python workers were asked for"
         self.notes: tuple[str, ...] = ()
         self._kernel: Any = None
-        self._told: dict[int, str] = {}
+        self._messages: dict[int, str] = {}
         if compiled:
             self.function, self._kernel, self.reason, self.notes = compiled_function(source, file, device)
         self.race = race_arrays(worlds, tracks, device)
@@ -112,10 +112,10 @@ class RewardFunction:
             found = self._workers.failures
         else:
             found = {}
-            for code, (told, failure) in failures_of(self.race).items():
+            for code, (message, failure) in failures_of(self.race).items():
                 if code % 16 == LOOP:
                     raise RewardFailed(f"{self.file}:{code // 16}: car {failure.car}: {ERRORS[LOOP]}")
-                found[f"{self.file}: {self._told.setdefault(code, told)}"] = failure
+                found[f"{self.file}: {self._messages.setdefault(code, message)}"] = failure
         return dict(sorted(found.items(), key=lambda item: -item[1].count))
 
     def begin_anew(self) -> None:
@@ -125,7 +125,7 @@ class RewardFunction:
             RewardFailed: The Python workers can't load the file again.
         """
         self.race.errors.zero_()
-        self._told.clear()
+        self._messages.clear()
         if self._workers is not None:
             self._workers.begin_anew()
 
@@ -167,7 +167,7 @@ def compiled_function(source: str, file: str, device: str) -> tuple[Any, Any, st
     except Exception as error:  # Warp has no type for what a compiler refuses
         if "build failed" not in str(error):
             raise
-        told = one_line(error)
-        reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({told}): it runs in Python workers"
+        message = one_line(error)
+        reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({message}): it runs in Python workers"
         return None, None, reason, ()
     return function, kernel, "", translated.notes

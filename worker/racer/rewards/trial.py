@@ -63,14 +63,14 @@ def main() -> None:
                 alarm.set(limit)
                 result = car.call(params)
                 alarm.set(0)
-                if wrong := confined.told_result(result):
+                if wrong := confined.result_problem(result):
                     end("TEST_FAILURE", f"{now}: {wrong}", _last_line(car.function))
     except BaseException as error:
         alarm.set(0)
         kind = "IMPORT_ERROR" if isinstance(error, ImportError) else "TEST_FAILURE"
         if isinstance(error, namespaces.Forbidden):
             kind = "FORBIDDEN"
-        end(kind, f"{now}: {confined.told_error(error)}", confined.line_of(error, file))
+        end(kind, f"{now}: {confined.error_message(error)}", confined.line_of(error, file))
     tell(kind="", message="", line=0)
 
 

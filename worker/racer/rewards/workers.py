@@ -34,7 +34,7 @@ SECONDS = 2.0
 """For one call [s]."""
 _START, _COPY = 120.0, 5.0
 """For a process to start and import what the function imports, and for the copy of a car [s]."""
-_MOST_SAID = 1 << 20
+_MOST_OUTPUT = 1 << 20
 """Bytes of an answer."""
 _LONGEST = 300
 """Characters of a message."""
@@ -71,7 +71,7 @@ class Workers:
     The thread that makes the pool has to live as long as it: the kernel ends the processes with that thread.
 
     Attributes:
-        numbers: What the cars are told, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
+        numbers: What the functions read of the cars, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
         objects: Of their objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``, float32.
         failures: The calls that gave no reward so far, by their message.
         processes: The processes; none once they are ended.
@@ -167,7 +167,7 @@ class Workers:
         try:
             for process in self.processes:
                 assert process.stdin is not None
-                with contextlib.suppress(BrokenPipeError):  # its end is told when its answer is missing
+                with contextlib.suppress(BrokenPipeError):  # its end is reported when its answer is missing
                     process.stdin.write(line)
                     process.stdin.flush()
             self._answers(patience)
@@ -181,38 +181,38 @@ class Workers:
         for number, process in enumerate(self.processes):
             line = self._line(process, number, until)
             try:
-                said = _ANSWER.validate_json(line, strict=True)
+                answer = _ANSWER.validate_json(line, strict=True)
             except ValidationError:
-                told = "the process of the function answered what it never writes: the function wrote to its pipe"
-                raise RewardFailed(f"{self.file}: {self._cars(number)}: {told}") from None
-            if isinstance(said, _End):
-                place = f"{self.file}:{said.line}" if said.line else self.file
-                who = f"car {said.car}: " if said.car >= 0 else ""
-                raise RewardFailed(f"{place}: {who}{plain(said.message, _LONGEST)}")
-            for message, at, car, count in said:
-                told = plain(message, _LONGEST)
+                message = "the process of the function answered what it never writes: the function wrote to its pipe"
+                raise RewardFailed(f"{self.file}: {self._cars(number)}: {message}") from None
+            if isinstance(answer, _End):
+                place = f"{self.file}:{answer.line}" if answer.line else self.file
+                who = f"car {answer.car}: " if answer.car >= 0 else ""
+                raise RewardFailed(f"{place}: {who}{plain(answer.message, _LONGEST)}")
+            for error, at, car, count in answer:
+                message = plain(error, _LONGEST)
                 place = f"{self.file}:{at}" if at else self.file
-                first = self._first.setdefault(f"{at}: {alike(told)}", f"{place}: {told}")
+                first = self._first.setdefault(f"{at}: {alike(message)}", f"{place}: {message}")
                 self.failures.setdefault(first, Failure(0, car)).count += count
 
     def _line(self, process: subprocess.Popen[bytes], number: int, until: float) -> bytes:
         """An answer, whole."""
         assert process.stdout is not None
         cars = self._cars(number)
-        said, poll = b"", select.poll()
+        answer, poll = b"", select.poll()
         poll.register(process.stdout, select.POLLIN)
-        while not said.endswith(b"\n"):
+        while not answer.endswith(b"\n"):
             if not poll.poll(max(0.0, 1000.0 * (until - time.monotonic()))):
                 raise RewardFailed(f"{self.file}: {cars}: the function did not return, and its process takes no signal")
             part = os.read(process.stdout.fileno(), 1 << 16)
-            if len(said) > _MOST_SAID:
+            if len(answer) > _MOST_OUTPUT:
                 raise RewardFailed(f"{self.file}: {cars}: the function's process answers without end")
             if not part:
                 code = process.wait()
                 cause = f"signal {-code}" if code < 0 else f"exit code {code}"
                 raise RewardFailed(f"{self.file}: {cars}: the process of the function ended ({cause})")
-            said += part
-        return said
+            answer += part
+        return answer
 
     def _cars(self, number: int) -> str:
         """The cars of a process, in messages."""

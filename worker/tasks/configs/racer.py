@@ -221,7 +221,7 @@ class RacerConfig(TaskConfig):
                 raise Refused(("action_space", *error.path), error.words) from None
             self.lidar_of(self.actions())
         if self.has_other_rewards and len(self.obstacles) > MOST_OBJECTS:
-            words = f"a reward function is told of at most {MOST_OBJECTS} objects, and there are {len(self.obstacles)}"
+            words = f"a reward function gets at most {MOST_OBJECTS} objects, and there are {len(self.obstacles)}"
             raise Refused(("obstacles",), words)
 
     @property

@@ -235,7 +235,7 @@ def test_a_path_is_read_where_the_worlds_are_built(tmp_path: Path) -> None:
     there = r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: the sample 'start': it returned None"
     with pytest.raises(ValueError, match=there):
         Racer(RacerConfig(reward_function=str(file)), 1)
-    with pytest.raises(ValueError, match="a reward function is told of at most 10 objects, and there are 11"):
+    with pytest.raises(ValueError, match="a reward function gets at most 10 objects, and there are 11"):
         RacerConfig(reward_function=str(file), obstacles=(ObstacleConfig(1.0),) * 11)
 
 

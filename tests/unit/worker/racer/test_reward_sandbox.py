@@ -319,7 +319,8 @@ def test_a_package_that_is_not_one_of_the_five_is_not_there_and_of_those_the_way
     assert tried("import torch").endswith("the sample 'start': torch is not installed here")
     missing = ModuleNotFoundError("No module named 'shapely'", name="shapely")
     assert (
-        confined.told_error(missing) == "shapely is not installed here: pip install shapely (the extra 'worker' has it)"
+        confined.error_message(missing)
+        == "shapely is not installed here: pip install shapely (the extra 'worker' has it)"
     )
 
 

@@ -14,7 +14,7 @@ class Function:
     """A function of floats.
 
     Attributes:
-        make: From the arguments' C++ texts and what helpers are told of the line to the result.
+        make: From the arguments' C++ texts and what helpers get of the line to the result.
         counts: How many arguments it may have.
         may_fail: Whether it may report an error.
     """

@@ -109,9 +109,9 @@ class Program:
 
     def note(self, line: int, text: str) -> None:
         """Remember what is left out."""
-        told = f"line {line}: {text}"
-        if told not in self.notes:
-            self.notes.append(told)
+        note = f"line {line}: {text}"
+        if note not in self.notes:
+            self.notes.append(note)
 
     # values
 
@@ -305,7 +305,7 @@ class Program:
 
 
 def _check_harmless(statement: ast.stmt) -> None:
-    """Refuse a statement of the module that may change a value: what is constant could not be told."""
+    """Refuse a statement of the module that may change a value: what is constant would be unknown."""
     if isinstance(statement, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
         return
     for node in ast.walk(statement):

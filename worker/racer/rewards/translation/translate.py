@@ -84,7 +84,7 @@ def _translate(tree: ast.Module) -> Translated:
     return Translated("\n".join(lines) + "\n", tuple(program.notes))
 
 
-def told(code: int, value: float) -> str:
+def failure_message(code: int, value: float) -> str:
     """The meaning of an entry of ``errors``, in one line; ``value`` is that of the reward, where it was too large."""
     line, kind = divmod(code, 16)
     if kind == BEYOND:

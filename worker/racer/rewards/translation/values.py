@@ -77,7 +77,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Rows:
-    """A list whose length is known when it runs: waypoints, and what is told of objects.
+    """A list whose length is known when it runs: waypoints, and the objects.
 
     Attributes:
         name: The key of ``params``.
