@@ -21,6 +21,7 @@ from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import check_sources, hold_teacher
 from orchestrator.control.compute_environments import environments_of, queue_engines
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
@@ -235,7 +236,7 @@ def _check_run(context: Context, run: str, named: bool) -> None:
         raise ClientError(f"run {run} is being written by another job; choose another name")
     if holder:
         raise ClientError(
-            f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
+            f"run {run} is being written by job {reasons.named(holder.name, holder.id)}; stop it first: muster stop {reasons.short_id(holder.id)}"
         )
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
         there = context.run(run)
