@@ -14,7 +14,7 @@ from orchestrator import machine
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
-from orchestrator.domain.job import AWS_ENDINGS, RunTime, Status, check_transition
+from orchestrator.domain.job import AWS_CHILD_FAILED, AWS_ENDINGS, RunTime, Status, check_transition
 from orchestrator.domain.reasons import Reason
 from orchestrator.persistence.columns import Names, storable
 from orchestrator.persistence.gangs import gangs
@@ -219,6 +219,8 @@ class Job(Base):
         text = self.status_reason or ""
         if AWS_ENDINGS.search(text) and self.attempts:
             return Reason(self.attempts[-1].in_own_words(text), text)
+        if self.kind == "array" and self.status == Status.FAILED and self.stop_reason is None:
+            return Reason(text, AWS_CHILD_FAILED)
         return Reason.plain(text)
 
     @property
