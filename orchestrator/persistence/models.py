@@ -11,6 +11,7 @@ from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
 from orchestrator import machine
+from orchestrator.domain.attempt import NOT_STARTED
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
@@ -369,7 +370,7 @@ class Attempt(Base):
             return reason
         if main is None or not main.reason:
             return reason
-        own = main.reason if main.exit_code == 0 else f"main node: {main.reason}"
+        own = main.reason if main.exit_code == 0 else f"{'main node: ' if self.handle else NOT_STARTED}{main.reason}"
         return AWS_ENDINGS.sub(lambda _: own, reason)
 
     def node(self, index: int) -> Node | None:

@@ -317,6 +317,18 @@ def test_a_program_that_does_not_exist_has_aws_s_reasons_and_rules_match_them(
     assert "why:" in shown and "main node: can't start 'no-such-program': " in " ".join(shown.split())
 
 
+def test_a_gang_that_the_engine_refuses_has_aws_s_reasons(batch: Batch) -> None:
+    job = batch.submit(batch.single("one-nowhere", "true", env={"MUSTER_DIRECTORY": "/nowhere"}))
+    detail, own = batch.wait(job), "working directory /nowhere is not on this machine"
+    listed = batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
+    [summary] = [each for each in listed if each["jobId"] == job]
+    for each in (detail, *detail["attempts"], summary):
+        assert each["statusReason"] == "Task failed to start"
+        assert each["container"]["reason"] == f"CannotStartContainerError: {own}"
+        assert "exitCode" not in each["container"]
+    assert batch.server.client.get(f"/api/jobs/{job}")["statusReason"] == f"can't start the gang: {own}"
+
+
 def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tmp_path: Path) -> None:
     """The pattern that many clients use: again where the host went away, not where the program failed."""
     script = f"[ {ATTEMPT} = 1 ] || exit 3; echo $PPID > $GATE/pid.new; mv $GATE/pid.new $GATE/pid; exec sleep 600"
