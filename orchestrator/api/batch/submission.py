@@ -134,7 +134,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
     gang = rules.check_nodes(properties, document["type"])
-    _check_commands(context, queue, gang, definition.name)
+    _check_commands(context, queue, definition, properties, gang)
     fargate.check_platform(document, properties, f"job definition {definition.name}")
     fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     _check_secrets(context, queue, gang)
@@ -170,14 +170,22 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     return job, gang
 
 
-def _check_commands(context: Context, queue: JobQueue, gang: GangSpec, definition: str) -> None:
+def _check_commands(
+    context: Context, queue: JobQueue, definition: JobDefinition, properties: Mapping[str, Any], gang: GangSpec
+) -> None:
     """A node without a command runs that of its image, where its engine runs images. Raises ClientError."""
-    if all(node.command for node in gang.nodes):
+    open_node = next((node for node in gang.nodes if not node.command), None)
+    if open_node is None:
         return
     engine = context.reconciler.engine
     if without := engine.without_images(queue_engines(context.session, queue.name, engine.names[0])):
+        where = f"job definition {definition.name}"
+        if definition.document["type"] == "multinode":
+            ranges = properties["nodeRangeProperties"]
+            target = next(each["targetNodes"] for each in ranges if each["container"] is open_node.container)
+            where = f"node range {target[:20]} of {where}"
         raise ClientError(
-            f"job definition {definition} has no command, and engine {without[0]} of job queue {queue.name} runs no image, whose ENTRYPOINT "
+            f"{where} has no command, and engine {without[0]} of job queue {queue.name} runs no image, whose ENTRYPOINT "
             "and CMD could stand for one: give a command in the definition or in the overrides, or use a queue of an engine with images "
             "(docker, aws-batch)"
         )
