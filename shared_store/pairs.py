@@ -21,8 +21,8 @@ def are_paired(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
     Episodes of the same number have the same world, so a shorter evaluation's episodes are the first of a longer one's. An evaluation
     at the end of a training has no seed, and uses the training's worlds.
     """
-    same = all((new.get(key) or None) == (old.get(key) or None) for key in ("seed", "task", "config"))
-    return same and isinstance(new.get("seed"), int)
+    same = all(new.get(key) == old.get(key) for key in ("seed", "task"))
+    return same and (new.get("config") or None) == (old.get("config") or None) and isinstance(new.get("seed"), int)
 
 
 def read_returns(table: Path) -> list[float]:

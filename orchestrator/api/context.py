@@ -18,6 +18,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
@@ -193,7 +194,7 @@ def _absent(reconciler: Reconciler, name: str) -> ClientError:
         if job is not None and is_visible(job):
             over = Status(job.status).is_terminal
             what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
-            return ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
+            return ClientError(f"run {name} does not exist: job {reasons.named(job.name, job.id)} {what}", 404)
         named = find_job(session, name, visible_queues())
         if named is not None:
             return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)

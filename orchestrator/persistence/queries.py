@@ -47,12 +47,6 @@ def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, can
         session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
 
 
-def short_id(job: str) -> str:
-    """The start of a job's id, as commands show it; of an array's child with its index."""
-    parent, colon, index = job.partition(":")
-    return parent[:8] + colon + index
-
-
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
     """The job with this id, else the newest one with this name, else the one whose id starts so.
 

@@ -376,7 +376,7 @@ def test_the_command_may_come_with_the_submission(batch: Batch) -> None:
         {"targetNodes": "0:0", "container": container("true", {})},
         {"targetNodes": "1:", "container": properties},
     ]
-    with refused("job definition one-part has no command, and engine local"):
+    with refused("node range 1: of job definition one-part has no command, and engine local"):
         batch.submit(batch.multinode("one-part", "", ranges=ranges))
 
 

@@ -332,4 +332,5 @@ def test_episodes_are_paired_where_seed_task_and_changes_of_the_worlds_are_the_s
     for other in ({"seed": 8}, {"task": "Ant"}, {"config": {"angle_limit": 0.3}}):
         assert not are_paired(one, {**one, **other})
     of_a_training = {**one, "seed": None}
+    assert not are_paired({**one, "seed": 0}, of_a_training) and not are_paired(of_a_training, {**one, "seed": 0})
     assert not are_paired(of_a_training, of_a_training), "the ends of two trainings: each in its own worlds"

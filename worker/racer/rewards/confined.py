@@ -122,7 +122,7 @@ def result_problem(result: Any) -> str:
     try:
         value = float(result)
     except (TypeError, ValueError, OverflowError):
-        return f"it returned a {name} that is no float"
+        return "it returned a number beyond the range of a float"
     if not math.isfinite(value):
         return f"it returned {value}; return a finite number"
     if abs(value) > LARGEST_REWARD:

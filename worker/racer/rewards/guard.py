@@ -50,6 +50,16 @@ Note = Callable[[str], object]
 """Is called with a line for the user."""
 _SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())  # noqa: SIM905
 
+_MACHINERY = frozenset("__builtins__ __modules__ __import__ __build_class__ __loader__ __spec__".split())  # noqa: SIM905
+"""Names that Python or Muster defines in a function's namespace."""
+_HARMLESS = frozenset(
+    (  # noqa: SIM905
+        "__init__ __post_init__ __name__ __doc__ __version__ __call__ __len__ __contains__ __getitem__ __setitem__ __iter__ __next__ "
+        "__str__ __repr__"
+    ).split()
+)
+"""Special attributes that lead to nothing outside the file."""
+
 
 def check(path: Path, courses: Sequence[Course] = (OVAL,), note: Note | None = None) -> Problem | None:
     """The first fault of a reward function in a file, or None.
@@ -175,10 +185,9 @@ def _findings(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]
         yield from _import(node)
     starred = any(isinstance(node, ast.ImportFrom) and node.names[0].name == "*" for node in nodes)
     used = [*_unbound(code, NAMES | FILES if starred else NAMES, _bound(code))]
-    used += [(node.id, node.lineno) for node in nodes if isinstance(node, ast.Name) and node.id[:2] == "__"]
+    used += [(node.id, node.lineno) for node in nodes if isinstance(node, ast.Name) and node.id in _MACHINERY]
     for name, line in sorted(used, key=lambda item: item[1]):
-        if name != "__name__":
-            yield "FORBIDDEN", f"{name} can't be used in a reward function", line
+        yield "FORBIDDEN", f"{name} can't be used in a reward function", line
     for node in nodes:
         if isinstance(node, ast.Attribute):
             yield from _attribute(node, imported)
@@ -238,9 +247,9 @@ def _attribute(node: ast.Attribute, imported: dict[str, str]) -> Iterator[tuple[
     while isinstance(base, ast.Attribute):
         base = base.value
     of_module = isinstance(base, ast.Name) and base.id in imported
-    dunder = name.startswith("__") and name != "__init__"
-    hidden = name.startswith("_") and of_module  # that of an object of the file's own is no package's
-    if dunder or hidden or name in _SYSTEM or name == "tofile" or (of_module and name in FILES):
+    # a private one of a class of the file itself, such as self.__best, reaches nothing else
+    special = (name[:2] == "__" == name[-2:] or (of_module and name[:1] == "_")) and name not in _HARMLESS
+    if special or name == "tofile" or (of_module and name in FILES | _SYSTEM):
         yield "FORBIDDEN", f"the attribute {name} can't be used in a reward function", node.lineno
 
 

@@ -100,6 +100,7 @@ LARGE = "it returned -100000.5; a reward is from -100,000 to 100,000, as on AWS"
         (1, "start", TRUTH, "return params['is_crashed'] or 0.5 > 1"),
         (1, "finish", "it returned inf; return a finite number", "return params['progress'] == 100 and 1e999 or 1"),
         (1, "start", "it returned a str; return a number", "return '1'"),
+        (1, "start", "it returned a number beyond the range of a float", "return 10 ** 400"),
         (1, "start", "it returned a complex; return a number", "return 1j"),
         (2, "start", r"ValueError: a b\x1b[31m", r"raise ValueError('a\nb\x1b[31m')"),
         (1, "start", "it returned a generator; return a number", "yield 1"),
@@ -147,6 +148,12 @@ def test_of_two_definitions_the_last_counts_and_underscores_of_own_objects_are_t
     assert told(twice) == ""
     own = f"class Car:\n    def __init__(self):\n        self._last = 1.0\ncar = Car()\n{HEAD}return car._last"
     assert told(own) == ""
+    private = (
+        '__version__ = "1"\nclass Car:\n    __slots__ = ("__best", "io")\n    def __init__(self):\n        self.__best = 1.0\n'
+        "        self.io = self.__best\n    __call__ = lambda self: self.io\n    __repr__ = __call__\ncar = Car()\n"
+        f"{HEAD}__near = car.__call__()\n    return __near + len(type(car).__name__ + __version__)"
+    )
+    assert told(private) == ""
     hidden = f"import random\nbox = [random]\n{HEAD}r = box[0]\n    return r._inst.random()"
     assert told(hidden) == "r.py:5: FORBIDDEN: the sample 'start': random._inst can't be used in a reward function"
 
