@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from worker.racer.arithmetic import nearest
 from worker.racer.rewards.parameters import BY_NAME, MOST_OBJECTS, PARAMETERS, Point
 
 WIDTH = 1.07
@@ -83,6 +86,18 @@ class Line:
         share = (way - self.starts[segment]) / max(self.starts[segment + 1] - self.starts[segment], 1e-9)
         return segment, (x0 + share * (x1 - x0), y0 + share * (y1 - y0)), math.atan2(y1 - y0, x1 - x0)
 
+    def project(self, point: Point, is_reversed: bool) -> tuple[int, float, float]:
+        """The segment, the way along the line and the distance [m] of the nearest place, as :func:`worker.racer.geometry.project` has them."""
+        (row,), (share,) = nearest(np.array(self.points), np.array([point]), closed=False)
+        segment, last = int(row), len(self.points) - 2
+        if not is_reversed and share >= 1.0 and (self.closed or segment < last):
+            segment, share = (segment + 1) % (last + 1), 0.0
+        elif is_reversed and share <= 0.0 and (self.closed or segment > 0):
+            segment, share = (segment - 1) % (last + 1), 1.0
+        (x0, y0), (x1, y1) = self.points[segment : segment + 2]
+        way = self.starts[segment] + float(share) * (self.starts[segment + 1] - self.starts[segment])
+        return segment, way, math.dist(point, (x0 + share * (x1 - x0), y0 + share * (y1 - y0)))
+
 
 def oval(straight: float = 4.0, radius: float = 1.6, spacing: float = 0.15) -> list[Point]:
     """Two straights and two half circles, driven to the left; the first point is also the last one [m]."""
@@ -123,21 +138,26 @@ def sample(
     Raises:
         KeyError: There is no such key.
     """
-    segment, (x, y), direction = line.at(car.way)
+    _, (x, y), direction = line.at(car.way)
     points, width = line.points, line.width(car.way)
     if is_reversed:
-        segment, points, direction = len(points) - 2 - segment, points[::-1], direction + math.pi
-    far = abs(car.offset)
+        points, direction = points[::-1], direction + math.pi
+    x, y = x - car.offset * math.sin(direction), y + car.offset * math.cos(direction)
+    segment, along, far = line.project((x, y), is_reversed)  # beside a polygon the way to which the car belongs differs
+    if is_reversed:
+        segment = len(points) - 2 - segment
+    if car.offset == 0.0:
+        far = 0.0
     left = car.offset > 0.0
     poses = [line.at(each.way) for each in objects]
     way, *others = (
-        line.driven(each.way, is_reversed) for each in (car, *objects)
+        line.driven(each, is_reversed) for each in (along, *(each.way for each in objects))
     )  # all that follows is in driving direction
     ahead = sorted(range(len(objects)), key=lambda index: (others[index] - way) % line.period)
     params = {
         "all_wheels_on_track": far + _CAR <= width / 2,
-        "x": x - car.offset * math.sin(direction),
-        "y": y + car.offset * math.cos(direction),
+        "x": x,
+        "y": y,
         "heading": _degrees(direction + math.radians(car.turned)),
         "distance_from_center": far,
         "is_left_of_center": left,

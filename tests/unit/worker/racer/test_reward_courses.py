@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from worker.racer.rewards.__main__ import main
 from worker.racer.rewards.courses import courses_for, courses_of
 from worker.racer.rewards.guard import check_source
 from worker.racer.rewards.parameters import row_of
-from worker.racer.rewards.samples import FINE_OVAL, Line, oval
+from worker.racer.rewards.samples import FINE_OVAL, Line, oval, random_sample
+from worker.racer.track import Track
 from worker.tasks.configs.racer import ObstacleConfig, RewardFile
 
 NEXT = """def reward_function(params):
@@ -30,6 +32,8 @@ NEXT = """def reward_function(params):
     return 0.2 if 0.0 < gap < 0.8 else 1.0
 """
 FAR = "def reward_function(params):\n    return params['waypoints'][140][0]\n"
+TURNS = np.linspace(0.0, 2 * np.pi, 120, endpoint=False)
+RING = Track("ring", *(radius * np.stack((np.cos(TURNS), np.sin(TURNS)), 1) for radius in (3.0, 2.4, 3.6)))
 BOXES = (ObstacleConfig(2.0, "inner"), ObstacleConfig(8.0, "outer"), ObstacleConfig(9.5, "center"))
 
 
@@ -81,8 +85,8 @@ def test_of_tracks_that_are_drawn_one_is_tried_and_of_others_each() -> None:
 
 @pytest.mark.parametrize(
     "track",
-    [OVAL, make_preset("chicane", direction="clockwise", width=0.6), open_track(), open_track().turned_round()],
-    ids=["oval", "clockwise", "open", "open, back"],
+    [OVAL, make_preset("chicane", direction="clockwise", width=0.6), open_track(), open_track().turned_round(), RING],
+    ids=["oval", "clockwise", "open", "open, back", "ring"],
 )
 @pytest.mark.parametrize("boxes", [(), BOXES], ids=["without", "with"])
 def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[ObstacleConfig, ...]) -> None:
@@ -94,9 +98,10 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
         for name, params in samples.items():
             back = params["is_reversed"]
             found = project(track, [[params["x"], params["y"]]], back)
-            assert params["projection_distance"] == pytest.approx(found.along[0], abs=0.06), name
-            assert params["progress"] == pytest.approx(100.0 if name == "finish" else found.progress[0], abs=0.6)
-            assert params["distance_from_center"] == pytest.approx(found.distance[0], abs=0.04), name
+            assert params["projection_distance"] == pytest.approx(found.along[0], abs=1e-6), name
+            assert params["closest_waypoints"] == [found.before[0], found.after[0]], name
+            assert params["progress"] == pytest.approx(100.0 if name == "finish" else found.progress[0], abs=1e-6)
+            assert params["distance_from_center"] == pytest.approx(found.distance[0], abs=1e-6), name
             assert params["track_width"] == pytest.approx(found.width[0], abs=0.03)
             assert params["is_offtrack"] == (name == "off-track")
             assert on_road(track, [[params["x"], params["y"]]])[0] == (name != "off-track"), name
@@ -110,13 +115,24 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
                 np.array(params["objects_left_of_center"], bool)[there.distance > 0.01],
             )
             if len(places):
-                gaps = there.along - found.along[0]
+                gaps = np.array(params["objects_distance"]) - params["projection_distance"]
                 ahead = gaps % (track.length if track.closed else 2 * track.length)
                 if name not in ("objects", "crashed"):  # there the next box is level with the car, or nearly so
                     assert params["closest_objects"] == [ahead.argmax(), ahead.argmin()], name
             if boxes:
                 np.testing.assert_allclose(places, circuit.obstacle_poses[0, :, :2], atol=0.05)
             row_of(params)
+
+
+@pytest.mark.parametrize("track", [RING, OVAL, open_track()], ids=["ring", "oval", "open"])
+def test_a_car_of_a_random_sample_is_at_the_place_of_the_line_that_is_nearest_to_it(track: Track) -> None:
+    (course,) = courses_of(circuit_of([track], ()))
+    line, chance = Line(course.points, course.widths, course.closed), random.Random(3)
+    for params in (random_sample(line, chance) for _ in range(200)):
+        found = project(track, [[params["x"], params["y"]]], params["is_reversed"])
+        assert params["projection_distance"] == pytest.approx(found.along[0], abs=1e-6)
+        assert params["closest_waypoints"] == [found.before[0], found.after[0]]
+        assert params["distance_from_center"] == pytest.approx(found.distance[0], abs=1e-6)
 
 
 def test_distances_and_sides_of_a_reversed_sample_are_those_in_driving_direction() -> None:

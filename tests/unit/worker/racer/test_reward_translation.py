@@ -185,11 +185,64 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
         ("def f():\n        return lambda: x\n    return f()()", "line 11: a function that returns a function"),
         ("return 2 ** int(x)", "line 10: an int to the power of an int that is not known"),
         ("return 1\nfrom numpy import *", "line 11: from numpy import *"),
+        ("z = {(1, [2]): 3}\n    return 1", "line 10: a dictionary whose keys are no constants"),
+        ("return pow(3, 4, 5)", "line 10: pow() with 3 arguments"),
+        ("return int('101', 2)", "line 10: int() with 2 arguments"),
+        ("return abs() if x > 1e9 else 1", "line 10: abs() with 0 arguments"),
+        ("return np.hypot(x, y, 2) if x > 1e9 else 1\nimport numpy as np", "line 10: numpy.hypot() in this form"),
+        ("return len(v for v in (x, y))", "line 10: len() in this form"),
+        ("return min((v for v in (x, y)), 1)", "line 10: min() in this form"),
+        ("return sum((v for v in (x, y)), default=1)", "line 10: sum() in this form"),
+        ("return sum(NAMED.values(k=1))", "line 10: the method values of a constant dict"),
     ],
 )
 def test_code_outside_the_subset_is_refused_with_line_and_reason(body: str, reason: str) -> None:
     said = refusal(translate, f"{HEAD}    {body}\n", error=Outside)
     assert said == f"{reason}: such functions run in Python workers"
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        "z = f(x)\n    return 1.0 if z is None else z",
+        "f(x)\n    return 1",
+        "return f(x) or 3.0",
+        "return 0.0 + (f(x) != 5)",
+    ],
+)
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("if a > 0:\n            return 1.5", "line 10: a function that returns a float or None"),
+        ("if a > 0:\n            return\n        return 2", "line 12: a function that returns an int or None"),
+        (
+            "if a > 0:\n            return [a, 2]\n        return None",
+            "line 13: a function that returns a list of 2 or None",
+        ),
+        (
+            "for i in range(3):\n            if i > a:\n                return i",
+            "line 10: a function that returns an int or None",
+        ),
+        ("while a > 0:\n            return a", "line 10: a function that returns a float or None"),
+    ],
+)
+def test_a_function_that_only_sometimes_returns_a_value_runs_in_python_workers(
+    body: str, reason: str, use: str
+) -> None:
+    found = refusal(translate, f"{HEAD}    def f(a):\n        {body}\n    {use}\n", error=Outside)
+    assert found == f"{reason}: such functions run in Python workers"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "if a > 0:\n            return 1.5\n        else:\n            return 2",
+        "while True:\n            a += 1\n            if a > 3:\n                return a",
+        "if a > 0:\n            return\n        a = 3",
+    ],
+)
+def test_a_function_that_always_or_never_returns_a_value_compiles(body: str) -> None:
+    assert translate(f"{HEAD}    def f(a):\n        {body}\n    f(x)\n    return 1.0\n").snippet
 
 
 def test_a_function_that_would_be_enormous_is_outside() -> None:

@@ -69,9 +69,7 @@ class Body(Calls):
             else:
                 ended = self.block(self.node.body)
             if not ended:
-                if self.result is not None:
-                    self.emit(f"py_fail({16 * getattr(self.node, 'lineno', 0)} + {NO_RESULT});")
-                self.emit("return {};")
+                self._nothing(self.node)
             if before == (self.slots, self.flagged, self.result):
                 return [*self._declarations(), *self.lines]
         raise Outside(self.node, "a variable whose type keeps changing")
@@ -248,7 +246,10 @@ class Body(Calls):
         return True
 
     def _nothing(self, node: ast.AST) -> None:
+        """The result None: an error of reward_function, which some calls of other functions may well give."""
         if self.result is not None:
+            if len(self.program.running) > 1:  # not reward_function itself
+                raise Outside(node, f"a function that returns {described(self.result)} or None")
             self.emit(f"py_fail({self.at(node)} + {NO_RESULT});")
         self.emit("return {};")
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from shared_store.wording import counted
 from worker.racer.rewards.parameters import BY_NAME
 from worker.racer.rewards.translation.expressions import Expressions
 from worker.racer.rewards.translation.items import Iterated
@@ -32,7 +34,8 @@ from worker.racer.rewards.translation.values import (
     shape_of,
 )
 
-_FOLDS = ("sum", "min", "max", "any", "all", "len")
+_FOLDS = {"sum": "start", "min": "default", "max": "default", "any": None, "all": None, "len": None}
+"""The option that each of them has beside ``key``."""
 _Comprehension = ast.GeneratorExp | ast.ListComp
 
 
@@ -56,7 +59,7 @@ class Calls(Expressions):
             raise Outside(node, "a list that grows")
         if function.attr in ("format", "join"):
             raise Outside(node, "a text that is made when it runs")
-        if isinstance(base, Constant) and isinstance(base.value, dict) and not node.args:
+        if isinstance(base, Constant) and isinstance(base.value, dict) and not node.args + node.keywords:
             entries = base.value
             parts = {"keys": list(entries), "values": list(entries.values()), "items": list(entries.items())}
             if function.attr in parts:
@@ -98,6 +101,10 @@ class Calls(Expressions):
         method: Callable[..., Value] | None = getattr(self, f"_{function.name}", None)
         arguments = [self.expression(each) for each in node.args]
         if method is not None and "." not in function.name:
+            try:
+                inspect.signature(method).bind(node, *arguments)
+            except TypeError:
+                raise Outside(node, f"{function.name}() with {counted(len(arguments), 'argument')}") from None
             return method(node, *arguments)
         return self._mathematical(function.name, arguments, node)
 
@@ -114,7 +121,7 @@ class Calls(Expressions):
             raise Outside(node, f"{name}()")
         found = table[function]
         if len(arguments) not in found.counts:
-            raise Outside(node, f"{name}() with {len(arguments)} arguments")
+            raise Outside(node, f"{name}() with {counted(len(arguments), 'argument')}")
         numbers = [self.numeric(each, node) for each in arguments]
         held = [self.hold(each) for each in numbers]
         at = self.at(node) if found.may_fail else ""
@@ -129,7 +136,7 @@ class Calls(Expressions):
             parts = [self.binary(ast.Sub(), *pair, node) for pair in zip(one.items, other.items, strict=True)]
         elif name == "numpy.linalg.norm" and len(arguments) == 1 and isinstance(arguments[0], Group):
             parts = arguments[0].items
-        elif name not in ("math.hypot", "numpy.hypot"):
+        elif name != "math.hypot" and (name != "numpy.hypot" or len(arguments) != 2):
             raise Outside(node, f"{name}() in this form")
         held = [cast(self.numeric(self.hold(self.numeric(part, node)), node), "float") for part in parts]
         return Number("float", f"::sqrt({' + '.join(f'{part} * {part}' for part in held) or '0.0'})")
@@ -198,7 +205,7 @@ class Calls(Expressions):
 
     def _range(self, node: ast.Call, *bounds: Value) -> Value:
         if not 1 <= len(bounds) <= 3:
-            raise Outside(node, f"range() with {len(bounds)} arguments")
+            raise Outside(node, f"range() with {counted(len(bounds), 'argument')}")
         numbers = [self.numeric(each, node) for each in bounds]
         if any(each.kind == "float" for each in numbers):
             raise Outside(node, "range() of a float")
@@ -276,10 +283,14 @@ class Calls(Expressions):
     # what is worked out over many items
 
     def _folded(self, name: str, node: ast.Call, items: _Comprehension) -> Value:
-        if name in ("min", "max") and any(each.arg == "key" for each in node.keywords):
+        options = {each.arg: each.value for each in node.keywords}
+        if name in ("min", "max") and "key" in options:
             return self._best(name, node)
-        start = self.expression(node.args[1]) if len(node.args) == 2 else None
-        start = next((self.expression(each.value) for each in node.keywords if each.arg in ("start", "default")), start)
+        starts = [*node.args[1:], *options.values()]
+        is_refused = (name == "len" and isinstance(items, ast.GeneratorExp)) or (name != "sum" and len(node.args) > 1)
+        if is_refused or len(starts) > 1 or set(options) - {_FOLDS[name]}:
+            raise Outside(node, f"{name}() in this form")
+        start = self.expression(starts[0]) if starts else None
         return self._fold(name, node, lambda use: self.over(items, use), start)
 
     def over(self, node: _Comprehension, use: Callable[[Value], None], place: int = 0) -> None:

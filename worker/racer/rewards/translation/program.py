@@ -299,7 +299,7 @@ class Program:
 
     def _key(self, node: ast.expr | None) -> Any:
         key = self.constant(node) if node is not None else None
-        if not isinstance(key, str | bool | int | float | tuple):
+        if not all(isinstance(each, str | int | float) for each in (key if isinstance(key, tuple) else [key])):
             raise Outside(node or 0, "a dictionary whose keys are no constants")
         return key
 
