@@ -53,6 +53,18 @@ def short_id(job: str) -> str:
     return parent[:8] + colon + index
 
 
+def unknown_job(session: Session, reference: str, queues: Collection[str] | None = None) -> str:
+    """What to say where :func:`find_job`, with the same arguments, finds none."""
+    array, _, index = reference.rpartition(":")
+    parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
+    if parent is None:
+        return f"job {reference} does not exist; `muster list` shows the jobs"
+    named = f"job {parent.name} ({short_id(parent.id)})"
+    if parent.kind != "array":
+        return f"job {reference} does not exist: {named} is not an array"
+    return f"job {reference} does not exist: the children of {named} are 0 to {(parent.array_size or 1) - 1}"
+
+
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
     """The job with this id, else the newest one with this name, else the one whose id starts so.
 

@@ -237,6 +237,13 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
         assert f"{array}:2" in shared_server.muster("show", reference).stdout
     for missing in ("many:3", "many:x", "nosuch:0", f"{array[:8]}:1:1"):
         refused(["show", missing], shared_server.home, 2, f"job {missing} does not exist")
+    children = f"job many:3 does not exist: the children of job many ({array[:8]}) are 0 to 2"
+    refused(["show", "many:3"], shared_server.home, 2, children)
+    shared_server.wait(shared_server.gang("", name="lone"))
+    refused(["show", "lone:0"], shared_server.home, 2, "is not an array")
+    runs = f"its children have the runs many-{array[:8]}-0 to many-{array[:8]}-2; name one, such as many-{array[:8]}-0"
+    refused(["resume", f"many-{array[:8]}"], shared_server.home, 2, f"run many-{array[:8]} does not exist", runs)
+    refused(["resume", "many"], shared_server.home, 2, "many is a job, not a run", runs)
 
 
 def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(shared_server: Serving) -> None:
@@ -253,6 +260,8 @@ def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(share
     states = [(each["index"], each["status"]) for each in found["children"]]
     assert states == [*((i, "FAILED") for i in (1, 3, 5, 7)), *((i, "SUCCEEDED") for i in (0, 2, 4, 6, 8))]
     assert all(each["ranSeconds"] >= 0 for each in found["children"])
+    failed = f"name one, such as odd-{array[:8]}-1, which failed"
+    refused(["resume", f"odd-{array[:8]}"], shared_server.home, 2, failed)
     lines = shared_server.muster("show", array).stdout.splitlines()
     listed = [line.split(maxsplit=3) for line in lines if line.split()[1:2] in (["FAILED"], ["SUCCEEDED"])]
     assert [int(each[0]) for each in listed] == [1, 3, 5, 7, 0, 2, 4, 6, 8]
