@@ -351,6 +351,28 @@ def test_resume_is_the_controller_itself_where_none_is_running(tmp_path: Path) -
     refused(["resume", "nosuch"], home, 2, "run nosuch does not exist in")
 
 
+def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"env": {**os.environ, "MUSTER_HOME": str(tmp_path)}, "stderr": subprocess.PIPE}
+    listing = [MUSTER, "tracks", "list", "--json"]
+    for order in ([True, False, False], [False, True, False]):
+        started = [
+            subprocess.Popen(
+                [MUSTER, "serve", "--port", "0"] if serves else listing, text=True, stdout=subprocess.PIPE, **options
+            )
+            for serves in order
+        ]
+        server = started[order.index(True)]
+        try:
+            for command in started:
+                if command is not server:
+                    said, errors = command.communicate(timeout=60 * PATIENCE)
+                    assert command.returncode == 0 and json.loads(said), errors
+            assert server.stdout is not None and server.stdout.readline().startswith("Muster serves http")
+        finally:
+            server.terminate()
+        assert server.communicate(timeout=60 * PATIENCE)[1] == "" and server.returncode == 0
+
+
 @pytest.mark.parametrize(
     ("node", "said"),
     [
