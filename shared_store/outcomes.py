@@ -56,6 +56,8 @@ class Outcome:
     """Unix times [s] of the first rank's start and of the last rank's end."""
     asked: bool = False
     """Whether its ranks ended on request, so that the cause of the gang's end is elsewhere. Outcomes of older versions lack it."""
+    cannot_start: bool = False
+    """Whether its program could not be started. Outcomes of older versions lack it."""
 
 
 def first_cause(ends: Sequence[tuple[bool, float]]) -> int:
@@ -99,8 +101,8 @@ def parse_outcome(value: dict[str, Any]) -> Outcome:
         error = replace(error, fault=fault_from(error.fault))
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
-    if not isinstance(outcome.asked, bool):
-        raise TypeError("asked is of the wrong type")
+    if not isinstance(outcome.asked, bool) or not isinstance(outcome.cannot_start, bool):
+        raise TypeError("asked or cannot_start is of the wrong type")
     if not 0 <= outcome.exit_code <= 255:
         raise TypeError("exit_code is not one of a process")
     if error is not None:

@@ -18,6 +18,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
@@ -195,7 +196,7 @@ def _absent(reconciler: Reconciler, name: str) -> ClientError:
         if job is not None and is_visible(job):
             over = Status(job.status).is_terminal
             what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
-            return ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
+            return ClientError(f"run {name} does not exist: job {reasons.named(job.name, job.id)} {what}", 404)
         named = find_job(session, name, visible_queues())
         if named is not None and named.kind == "array":
             return ClientError(f"{name} is a job, not a run; {_runs_of_array(session, named)}", 404)
@@ -216,7 +217,7 @@ def _runs_of_array(session: Session, array: Job) -> str:
     else:
         such = f"name one, such as {first.run}" + (", which failed" if first.status == Status.FAILED else "")
     last = (array.array_size or 1) - 1
-    return f"job {array.name} ({array.id[:8]}) is an array; its children have the runs {array.run}-0 to {array.run}-{last}; {such}"
+    return f"job {reasons.named(array.name, array.id)} is an array; its children have the runs {array.run}-0 to {array.run}-{last}; {such}"
 
 
 def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from orchestrator.api.errors import ClientError
+from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import Job
 
 DAMAGED = "the job's row in the database is damaged"
@@ -15,7 +16,7 @@ class DamagedRow(ClientError):
     """A job's row can't be read (409); the message names the job."""
 
     def __init__(self, job: Job) -> None:
-        super().__init__(f"job {job.name} ({job.id[:8]}): {DAMAGED}; submit the job again", 409)
+        super().__init__(f"job {named(job.name, job.id)}: {DAMAGED}; submit the job again", 409)
 
 
 @contextmanager

@@ -31,6 +31,7 @@ from enum import StrEnum
 from typing import Any
 
 from orchestrator.api.errors import ClientError
+from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import (
     ComputeEnvironment,
     Job,
@@ -264,7 +265,7 @@ def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
 def _whose(thing: Object) -> str:
     match thing:
         case Job():
-            return f"job {thing.name} ({thing.id[:8]}) belongs to job queue {thing.queue}"
+            return f"job {named(thing.name, thing.id)} belongs to job queue {thing.queue}"
         case RunRecord():
             return f"run {thing.name} belongs to {f'job queue {thing.queue}' if thing.queue else 'no known job queue'}"
         case JobsOf():

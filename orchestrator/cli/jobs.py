@@ -15,6 +15,7 @@ from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client, named
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import ApiError, ServerError, SpecError, Unavailable, Unreachable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
@@ -204,7 +205,7 @@ def stop(
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         if detail["status"] in TERMINAL:
-            echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already{next_step(detail)}")
+            echo(f"{reasons.named(detail['name'], detail['id'])} is {detail['status']} already{next_step(detail)}")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
@@ -214,14 +215,14 @@ def stop(
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:
                 said = detail["statusReason"]
-                echo(f"{detail['name']} ({detail['id'][:8]}): {one_line(said)}", err=True)
+                echo(f"{reasons.named(detail['name'], detail['id'])}: {one_line(said)}", err=True)
             if slow and time.monotonic() > patience:
                 echo(slow, err=True)
                 slow = ""
     if not wait:
-        echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
+        echo(f"{reasons.named(detail['name'], detail['id'])} is asked to stop")
         return
-    echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
+    echo(f"{reasons.named(detail['name'], detail['id'])} ended: {one_line(detail['statusReason'])}")
     if lost := lost_iterations(detail):
         echo(lost)
     if _can_go_on(detail):

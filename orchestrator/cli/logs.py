@@ -13,7 +13,8 @@ import typer
 from orchestrator.cli.jobs import JobArgument, JsonOption
 from orchestrator.cli.progress import Waits
 from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
-from orchestrator.client import Client
+from orchestrator.client import Client, named
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import SpecError
 
 _COLOURS = (36, 33, 35, 32, 34, 31)
@@ -52,6 +53,9 @@ def logs(
         client.notify = lambda line: echo(line, err=True)
         waits = Waits(client, job)
         waits.tell()
+        hint = _of_children(client, job) if follow else ""
+        if hint:
+            echo(hint, err=True)
         for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
             if not lines:
                 waits.tell()
@@ -64,6 +68,10 @@ def logs(
             ]
             if shown and not _printed("\n".join(shown)):
                 return
+        if not came and (found := _of_children(client, job)):
+            if found != hint:
+                echo(found, err=True)
+            return
     if not came:
         asked = {"node": node, "rank": rank, "attempt": attempt}
         of = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
@@ -71,6 +79,16 @@ def logs(
             f"job {job} has no log lines{f' of {of}' if of else ''}; muster show {job} has its attempts and nodes",
             err=True,
         )
+
+
+def _of_children(client: Client, job: str) -> str:
+    """Where the log of an array is: with its first child that failed, else with child 0; empty for other jobs. Raises ApiError, Unreachable."""
+    found = client.get(f"/api/jobs/{named(job)}", store=False)
+    if found["children"] is None:
+        return ""
+    child = next((each["index"] for each in found["children"] if each["status"] == "FAILED"), 0)
+    who = reasons.named(found["name"], found["id"])
+    return f"{who} is an array, whose children have the logs, such as: muster logs {job}:{child}"
 
 
 def _printed(text: str) -> bool:

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client, named
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL, WAITING
 from shared_store.evaluations import in_one_line
@@ -79,7 +80,7 @@ def summary(client: Client, job_id: str, err: bool = False) -> int:
     succeeded = detail["status"] == "SUCCEEDED"
     colour = "green" if succeeded else "red"
     reason = "" if succeeded else f": {one_line(detail['statusReason'])}"
-    console.print(f"[{colour}]{detail['status']}[/]  {detail['name']} ({detail['id'][:8]})", end="")
+    console.print(f"[{colour}]{detail['status']}[/]  {reasons.named(detail['name'], detail['id'])}", end="")
     console.print(reason, markup=False)
     results = detail["results"] or {}
     attempt = detail["attempts"][-1] if detail["attempts"] else None
@@ -144,7 +145,7 @@ def _why_waiting(client: Client, job: str) -> str:
     found = client.get(f"/api/jobs/{named(job)}", store=False)
     if found["status"] in ("SUBMITTED", "RUNNING", *TERMINAL) or found["statusReason"] == WAITING:
         return ""
-    return f"{found['name']} ({found['id'][:8]}) {found['status']}: {one_line(found['statusReason'] or '')}"
+    return f"{reasons.named(found['name'], found['id'])} {found['status']}: {one_line(found['statusReason'] or '')}"
 
 
 def _format(line: dict[str, Any]) -> str:
@@ -223,7 +224,7 @@ class _Display:
     def __init__(self, detail: dict[str, Any]) -> None:
         self.total = int(detail["spec"]["train"]["iterations"])
         self.nodes, self.run = int(detail["nodes"]), str(detail["run"])
-        self.name = f"{detail['name']} ({detail['id'][:8]})"
+        self.name = reasons.named(detail["name"], detail["id"])
         self.iteration = 0
         """The last one that the present attempt has done."""
         self._first: tuple[float, int] | None = None

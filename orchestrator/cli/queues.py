@@ -12,6 +12,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import echo, echo_json, one_line, print_wrapped
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
+from orchestrator.domain.reasons import short_id, title
 
 
 def register(app: typer.Typer) -> None:
@@ -79,5 +80,7 @@ def _waiting(jobs: list[dict[str, Any]]) -> Table:
         table.add_column(column, no_wrap=True)
     table.add_column("WHY IT WAITS", overflow="fold")
     for number, job in enumerate(jobs, 1):
-        table.add_row(str(number), job["id"][:8], job["name"], escape(one_line(job["reason"] or "")))
+        table.add_row(
+            str(number), short_id(job["id"]), title(job["name"], job["id"]), escape(one_line(job["reason"] or ""))
+        )
     return table

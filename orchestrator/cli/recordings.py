@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +23,7 @@ from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, UsageError
 from orchestrator.spec.model import Record, Render, Spec
 from orchestrator.spec.sections import Resources, Retry
+from shared_store.tied import start_tied
 
 SourceArgument = Annotated[
     str | None,
@@ -78,7 +78,7 @@ def record(
         if live is not None:
             options = {"--worlds": str(worlds), "--episodes": str(episodes), "--output": str(output.absolute())}
             given = [text for pair in options.items() for text in pair]
-            raise typer.Exit(run_worker("worker.telemetry.live", run["path"], "--job", live, *given))
+            raise typer.Exit(run_worker("worker.telemetry.live", run["path"], "--job", live, *given, run=run["path"]))
         section = Record(
             run=run["run"],
             checkpoint=checkpoint_of(client, run, source),
@@ -220,10 +220,26 @@ def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> Non
     echo(f"written: {output}")
 
 
-def run_worker(module: str, *arguments: str) -> int:
-    """Run a part of the worker on this machine, since this package never imports it; returns its exit code. Raises ServerError."""
+def run_worker(module: str, *arguments: str, run: str = "") -> int:
+    """Run a part of the worker on this machine, since this package never imports it; returns its exit code.
+
+    Ctrl-C and SIGTERM let it complete its file. However this process dies, it dies too.
+
+    Args:
+        module: Of the worker.
+        arguments: Of its command line.
+        run: Directory of a run, whose store may have the tracks that its configuration names.
+
+    Raises:
+        ServerError: The worker is not installed here.
+    """
     if find_spec("newton") is None:
         raise ServerError("this needs the simulation on this machine: pip install 'muster[worker]'")
-    started = subprocess.Popen([sys.executable, "-P", "-m", module, *arguments])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for it: it completes its file
+    store = {"MUSTER_STORE": str(Path(run).parents[1])} if run else {}
+    ignored = [number for number in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_IGN]
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])  # until it can be passed on
+    started = start_tied([sys.executable, "-P", "-m", module, *arguments], ignored, env={**os.environ, **store})
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends Ctrl-C to both
+    signal.signal(signal.SIGTERM, lambda *_: started.send_signal(signal.SIGINT))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
     return started.wait()

@@ -95,11 +95,13 @@ def view(
                 raise UsageError(
                     f"--episodes: {source} is training; to see its newest policy: muster view {run['run']}"
                 )
-            raise typer.Exit(run_worker("worker.telemetry.view", "--training", run["path"], "--job", live, *given))
+            raise typer.Exit(
+                run_worker("worker.telemetry.view", "--training", run["path"], "--job", live, *given, run=run["path"])
+            )
         given += ["--checkpoint", str(checkpoint_of(client, run, source))]
         given += ["--episodes", str(episodes)] if episodes is not None else []
         given += ["--accept-changed-robot"] if accept_changed_robot else []
-        raise typer.Exit(run_worker("worker.telemetry.view", "--policy", run["path"], *given))
+        raise typer.Exit(run_worker("worker.telemetry.view", "--policy", run["path"], *given, run=run["path"]))
 
 
 def _has_display() -> bool:

@@ -29,7 +29,7 @@ from orchestrator.console.run_files import File, files_of
 from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
-from orchestrator.persistence.queries import short_id
+from orchestrator.domain.reasons import short_id
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
 from shared_store.learning import LEARNING

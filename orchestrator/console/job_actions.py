@@ -22,7 +22,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import SpecError
-from orchestrator.persistence.queries import short_id
+from orchestrator.domain.reasons import short_id
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.checkpoints import list_checkpoints

@@ -22,7 +22,7 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import TERMINAL, Status
-from orchestrator.persistence.queries import short_id
+from orchestrator.domain.reasons import short_id
 from shared_store.wording import counted
 
 router = page_router()

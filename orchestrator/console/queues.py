@@ -19,7 +19,7 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
-from orchestrator.persistence.queries import short_id
+from orchestrator.domain.reasons import short_id, title
 from shared_store.wording import counted
 
 router = page_router()
@@ -100,7 +100,7 @@ def _job(job: Mapping[str, Any]) -> dict[str, Any]:
         "key": job_id,
         "place": str(job.get("place", "")),
         "queue": job.get("queue", ""),
-        "name": job.get("name", ""),
+        "name": title(job.get("name", ""), job_id),
         "short": short_id(job_id),
         "link": f"/jobs/{job_id}" if job_id else "/",
         "owner": job.get("owner") or "",

@@ -18,7 +18,7 @@ from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.persistence.queries import short_id
+from orchestrator.domain.reasons import short_id
 from shared_store.evaluations import told_changes
 from shared_store.learning import LEARNING, in_words
 from shared_store.metrics import finite, warnings_of

@@ -18,7 +18,7 @@ from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.snapshot import holding_of, take_snapshot
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.job import Status
-from orchestrator.domain.reasons import Reason
+from orchestrator.domain.reasons import Reason, named
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Job
 from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
@@ -117,7 +117,7 @@ class Admission:
     def _preempt(self, preempt: Preempt, session: Session, job: Job) -> None:
         by = session.get_one(Job, preempt.by)
         if attempt := job.open_attempt:
-            self._attempts.preempt(session, job, attempt, f"preempted by job {by.name} ({by.id[:8]})")
+            self._attempts.preempt(session, job, attempt, f"preempted by job {named(by.name, by.id)}")
             self._work_queue.hurry(job.id)
 
     def _start(self, start: Start, session: Session, job: Job) -> None:

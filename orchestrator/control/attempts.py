@@ -27,7 +27,7 @@ from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefus
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
-from orchestrator.domain.attempt import FINISHING, NOT_STARTED, Phase, State, Terms, step
+from orchestrator.domain.attempt import FINISHING, Phase, State, Terms, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -196,7 +196,9 @@ class Attempts:
         verdict = None
         if attempt.ending is not None:
             ending, reason = Ending(attempt.ending), attempt.status_reason or ""
-            verdict = Verdict(ending, reason, attempt.exit_code, fault=attempt.fault)
+            main = attempt.node(gang.main)
+            error = main.reason if main is not None and attempt.handle is None else None
+            verdict = Verdict(ending, reason, attempt.exit_code, fault=attempt.fault, start_error=error)
         return State(
             terms,
             prepared=attempt.epoch != NO_EPOCH,
@@ -241,13 +243,13 @@ class Attempts:
             case Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
+                if verdict.start_error is not None:
+                    attempt.nodes[job.gang.main].reason = verdict.start_error
             case Save():
                 session.commit()
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
-                if attempt.ending in (Ending.FAILED, Ending.FATAL):  # as AWS shows why a container did not start
-                    attempt.nodes[job.gang.main].reason = (attempt.status_reason or "").removeprefix(NOT_STARTED)
                 return Gone(self.clock.now(), [], "")
             case Close():
                 self._close(session, job, attempt, instruction)

@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 from orchestrator.control.clock import Clock
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.job import WAITING, Status
-from orchestrator.domain.reasons import named
+from orchestrator.domain.reasons import array_of, named
 from orchestrator.persistence.models import Job
 
 _NAMED = 3
@@ -49,7 +49,7 @@ def _settle_array(session: Session, job: Job) -> None:
     counts: dict[str, int] = {status: count for status, count in session.execute(query)}
     left = sum(count for status, count in counts.items() if not Status(status).is_terminal)
     if job.status == Status.SUBMITTED:
-        job.move(Status.PENDING, f"an array of {job.array_size}")
+        job.move(Status.PENDING, array_of(job.array_size))
     if left:
         return
     failed = counts.get(Status.FAILED, 0)

@@ -33,6 +33,7 @@ def node_end(outcome: Outcome | None, node: NodeStatus, is_native: bool, moment:
         outcome.error.time if outcome.error else outcome.ended,
         outcome.error.message if outcome.error else None,
         asked=outcome.asked,
+        cannot_start=outcome.cannot_start,
         fault=str(error.fault) if error and error.fault else None,
     )
     return end, min(moment, int(outcome.ended * 1000))
@@ -54,4 +55,4 @@ def seen_end(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
         words = f"exit {code}, outcome not written{f' ({why})' if why else ''}"
         return NodeEnd(code, words, moment, asked=None)
     words = node.words or "the supervisor died without an outcome"
-    return NodeEnd(code, words, moment, lost=node.cause in _TAKEN)
+    return NodeEnd(code, words, moment, lost=node.cause in _TAKEN, cannot_start=node.cause is Cause.CANNOT_START)

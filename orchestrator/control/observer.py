@@ -12,7 +12,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.endings import node_end
 from orchestrator.control.run_store import Errands, Key, RunStore
 from orchestrator.domain.attempt_events import Observed, Silence
-from orchestrator.domain.job import AWS_EXITED, NodeEnd, lost_host
+from orchestrator.domain.job import NodeEnd, aws_ending
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Attempt, Job, Node, now
@@ -126,7 +126,7 @@ class Observer:
                 if record.stopped_at is None:
                     record.stopped_at = stopped
                     if attempt.ending is None:  # by itself: no one ended the gang
-                        record.status_reason = lost_host(record.host) if end.lost else AWS_EXITED
+                        record.status_reason = aws_ending(end, record.host)
                 self._bus.presence.ended(key)
             elif self._bus.presence.met(key):
                 record.met = True

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from orchestrator import machine
+from orchestrator.domain.reasons import short_id
 from shared_store.epoch import read_claim, read_epoch
 from shared_store.files import read_json, write_json
 from shared_store.layout import NAME, Run, Store
@@ -89,7 +90,7 @@ class Peers:
             self._note(claim.controller, found)  # it started after the last look
         if (peer := self._present(claim.controller)) is None:
             return None
-        return f"job {claim.job[:8]} (attempt {claim.attempt}) of {peer}"
+        return f"job {short_id(claim.job)} (attempt {claim.attempt}) of {peer}"
 
     def _present(self, controller: str) -> Peer | None:
         with self._lock:

@@ -45,7 +45,17 @@ from orchestrator.domain.attempt_instructions import (
     Withdraw,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict, container_reason, judge, judge_as_aws, lost_host
+from orchestrator.domain.job import (
+    AWS_NOT_STARTED,
+    Ending,
+    NodeEnd,
+    Status,
+    Verdict,
+    container_reason,
+    judge,
+    judge_as_aws,
+    lost_host,
+)
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.domain.retry import retries
 from shared_store.wording import counted
@@ -168,7 +178,7 @@ def step(state: State, event: Event) -> Instructions:
         case Phase.PREPARING, PrepareDelayed(reason):
             return (Withdraw(reason),)
         case Phase.PREPARING, PrepareRefused(reason):
-            return Decide(Verdict(Ending.FATAL, reason)), WindUp()
+            return Decide(Verdict(Ending.FATAL, reason, start_error=reason)), WindUp()
         case Phase.LAUNCHING, Due():
             return (Launch(again=state.verdict is None and state.stop_reason is None),)
         case Phase.LAUNCHING, Launched(handle):
@@ -181,10 +191,8 @@ def step(state: State, event: Event) -> Instructions:
             return (Explain(reason),)
         case Phase.LAUNCHING, LaunchRefused() if state.verdict is not None:
             return (WindUp(),)
-        case Phase.LAUNCHING, LaunchRefused(reason, True):
-            return Decide(Verdict(Ending.FATAL, f"{NOT_STARTED}{reason}")), WindUp()
-        case Phase.LAUNCHING, LaunchRefused(reason):
-            return Decide(Verdict(Ending.FAILED, reason)), WindUp()
+        case Phase.LAUNCHING, LaunchRefused():
+            return Decide(_refused(state.terms, event)), WindUp()
         case _, Preempted(reason) if state.verdict is None:
             return (Decide(Verdict(Ending.PREEMPTED, reason)),)
         case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Due():
@@ -196,6 +204,12 @@ def step(state: State, event: Event) -> Instructions:
         case _, Gone() if state.verdict is not None:
             return (_close(state, state.verdict, event),)
     return ()
+
+
+def _refused(terms: Terms, event: LaunchRefused) -> Verdict:
+    ending = Ending.FATAL if event.is_final else Ending.FAILED
+    reason = f"{NOT_STARTED}{event.reason}" if event.is_final else event.reason
+    return Verdict(ending, reason if terms.options.is_native else AWS_NOT_STARTED, start_error=event.reason)
 
 
 def _observed(state: State, seen: Observed) -> Instructions:
@@ -345,7 +359,7 @@ def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
 
 def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
     """The reason of a gang that was never launched is its container's, as of AWS's CannotStartContainerError."""
-    reason = head.reason if head else verdict.reason
+    reason = head.reason if head else verdict.start_error or verdict.reason
     if not terms.options.is_native:
         reason = container_reason(reason, verdict.reason) or ""
     return retries(terms.conditions, verdict.exit_code, reason, verdict.reason)

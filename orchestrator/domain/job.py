@@ -110,6 +110,8 @@ class NodeEnd:
     """The end was not observed: the node vanished, presumably with its host."""
     asked: bool | None = False
     """The node was told to end: the cause lies elsewhere. None: that is not known."""
+    cannot_start: bool = False
+    """Its program or its container could not be started."""
     fault: str | None = None
     """Type, file, line and cause of the Python exception that ended it, if another attempt would meet that, too."""
 
@@ -130,19 +132,21 @@ class Verdict:
     """False while every node that has ended was told to end: the cause may be observed later."""
     fault: str | None = None
     """As :attr:`NodeEnd.fault`, of the node that was the cause; native jobs only."""
+    start_error: str | None = None
+    """Why the gang was never started, if so: the reason of the main node."""
 
 
 _LOST_HOST = "Host EC2"
 AWS_EXITED = "Essential container in task exited"
 """AWS Batch's reason for an attempt whose main container ended, successfully or not; clients match it."""
+AWS_NOT_STARTED = "Task failed to start"
+"""The same for one whose main container could not be started."""
+AWS_CHILD_FAILED = "Array Child Job failed"
+"""AWS Batch's reason for an array of which children failed."""
 
 
 _OF_AWS = re.compile(r"[A-Z][A-Za-z]*Error: ")
 """Beginning of a reason for which AWS ended a container, or could not start it: OutOfMemoryError, CannotPullContainerError, …"""
-
-
-_NO_PROGRAM = "can't start '"
-"""Beginning of a supervisor's reason for a program that does not exist or can't be executed."""
 
 
 def container_reason(reason: str | None, status_reason: str | None) -> str | None:
@@ -154,9 +158,14 @@ def container_reason(reason: str | None, status_reason: str | None) -> str | Non
     """
     if status_reason and status_reason.startswith(_LOST_HOST):
         return status_reason
-    if reason and reason.startswith(_NO_PROGRAM):
-        return f"CannotStartContainerError: {reason}"
-    return reason if reason and _OF_AWS.match(reason) else None
+    if reason and _OF_AWS.match(reason):
+        return reason
+    return f"CannotStartContainerError: {reason}" if reason and status_reason == AWS_NOT_STARTED else None
+
+
+def has_exited(status_reason: str | None) -> bool:
+    """Whether AWS knows the exit code of a node with this status reason: not where it was lost, or never started."""
+    return status_reason != AWS_NOT_STARTED and not (status_reason or "").startswith(_LOST_HOST)
 
 
 def lost_host(host: str) -> str:
@@ -164,8 +173,16 @@ def lost_host(host: str) -> str:
     return f"{_LOST_HOST} (instance {host}) terminated."
 
 
-AWS_ENDINGS = re.compile(rf"{AWS_EXITED}|{re.escape(lost_host('HOST')).replace('HOST', '[^)]*')}")
-"""Both of these reasons, which AWS Batch gives whatever the main node's own reason is."""
+def aws_ending(end: NodeEnd, host: str) -> str:
+    """AWS Batch's status reason for a node that ended by itself."""
+    if end.lost:
+        return lost_host(host)
+    return AWS_NOT_STARTED if end.cannot_start else AWS_EXITED
+
+
+_LOST = re.escape(lost_host("HOST")).replace("HOST", "[^)]*")
+AWS_ENDINGS = re.compile(rf"(?<![^(])(?:{AWS_EXITED}|{AWS_NOT_STARTED}|{_LOST})")
+"""These three reasons, which AWS Batch gives whatever the main node's own reason is; at the start of a text, or of its parentheses."""
 
 
 def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdict | None:
@@ -179,9 +196,10 @@ def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdic
     head = ends[main]
     if head is None:
         return None
-    if head.lost:
-        return Verdict(Ending.FAILED, lost_host(host), None)
-    return Verdict(Ending.SUCCEEDED if head.exit_code == 0 else Ending.FAILED, AWS_EXITED, head.exit_code)
+    reason = aws_ending(head, host)
+    if not has_exited(reason):
+        return Verdict(Ending.FAILED, reason, None)
+    return Verdict(Ending.SUCCEEDED if head.exit_code == 0 else Ending.FAILED, reason, head.exit_code)
 
 
 def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | None:

@@ -30,7 +30,23 @@ class Reason:
         return "" if self.aws == self.words else self.aws.removesuffix(f" - {self.words}")
 
 
+def short_id(job: str) -> str:
+    """The start of a job's id, as commands show it; of an array's child with its index."""
+    parent, colon, index = job.partition(":")
+    return parent[:8] + colon + index
+
+
+def title(name: str, job: str) -> str:
+    """The name by which commands find a job: of an array's child ``ant:3``."""
+    _, colon, index = job.partition(":")
+    return name + colon + index
+
+
 def named(name: str, job: str) -> str:
     """A job in words, such as ``ant (1f2e3d4c)``, and ``ant:3 (1f2e3d4c:3)`` for an array's child."""
-    head, sign, index = job.partition(":")
-    return f"{name}{sign}{index} ({head[:8]}{sign}{index})"
+    return f"{title(name, job)} ({short_id(job)})"
+
+
+def array_of(size: int | None) -> str:
+    """What the AWS Batch API states of an array whose children are not all over."""
+    return f"an array of {size}"

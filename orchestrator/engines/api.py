@@ -21,7 +21,7 @@ class EngineError(Exception):
 
 
 class CannotStart(EngineError):
-    """The engine tried to start a node and failed, so the attempt has failed; another one may start. AWS: CannotStartContainerError."""
+    """The engine tried to start a node and failed, so the attempt has failed; another one may start. AWS: CannotStartContainerError and the like."""
 
 
 class NotYet(EngineError):
@@ -235,6 +235,8 @@ class Cause(StrEnum):
     """The engine took its place away for other work."""
     STOPPED = "stopped"
     """It was stopped, in the engine or through it."""
+    CANNOT_START = "cannot start"
+    """It never ran: its container could not be started."""
 
 
 @dataclass(frozen=True)

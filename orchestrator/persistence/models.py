@@ -11,10 +11,11 @@ from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
 from orchestrator import machine
+from orchestrator.domain.attempt import NOT_STARTED
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
-from orchestrator.domain.job import AWS_ENDINGS, RunTime, Status, check_transition
+from orchestrator.domain.job import AWS_CHILD_FAILED, AWS_ENDINGS, RunTime, Status, check_transition
 from orchestrator.domain.reasons import Reason
 from orchestrator.persistence.columns import Names, storable
 from orchestrator.persistence.gangs import gangs
@@ -219,6 +220,8 @@ class Job(Base):
         text = self.status_reason or ""
         if AWS_ENDINGS.search(text) and self.attempts:
             return Reason(self.attempts[-1].in_own_words(text), text)
+        if self.kind == "array" and self.status == Status.FAILED and self.stop_reason is None:
+            return Reason(text, AWS_CHILD_FAILED)
         return Reason.plain(text)
 
     @property
@@ -367,7 +370,7 @@ class Attempt(Base):
             return reason
         if main is None or not main.reason:
             return reason
-        own = main.reason if main.exit_code == 0 else f"main node: {main.reason}"
+        own = main.reason if main.exit_code == 0 else f"{'main node: ' if self.handle else NOT_STARTED}{main.reason}"
         return AWS_ENDINGS.sub(lambda _: own, reason)
 
     def node(self, index: int) -> Node | None:

@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, TERMINAL
+from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import Job
 
 _NAMED = 5
@@ -47,22 +48,16 @@ def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, can
         session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
 
 
-def short_id(job: str) -> str:
-    """The start of a job's id, as commands show it; of an array's child with its index."""
-    parent, colon, index = job.partition(":")
-    return parent[:8] + colon + index
-
-
 def unknown_job(session: Session, reference: str, queues: Collection[str] | None = None) -> str:
     """What to say where :func:`find_job`, with the same arguments, finds none."""
     array, _, index = reference.rpartition(":")
     parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
     if parent is None:
         return f"job {reference} does not exist; `muster list` shows the jobs"
-    named = f"job {parent.name} ({short_id(parent.id)})"
+    job = f"job {named(parent.name, parent.id)}"
     if parent.kind != "array":
-        return f"job {reference} does not exist: {named} is not an array"
-    return f"job {reference} does not exist: the children of {named} are 0 to {(parent.array_size or 1) - 1}"
+        return f"job {reference} does not exist: {job} is not an array"
+    return f"job {reference} does not exist: the children of {job} are 0 to {(parent.array_size or 1) - 1}"
 
 
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:

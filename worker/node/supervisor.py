@@ -102,11 +102,8 @@ class Supervisor:
             except OSError as error:
                 reason = f"can't start {self.command[0]!r}: {error.strerror}; is it installed, and is the path right?"
                 self.write(None, "e", reason)
-                return self._commit(
-                    Outcome(
-                        self.contract.node_index, self.contract.epoch, 127, None, reason, None, started, time.time()
-                    )
-                )
+                node, epoch, ended = self.contract.node_index, self.contract.epoch, time.time()
+                return self._commit(Outcome(node, epoch, 127, None, reason, None, started, ended, cannot_start=True))
             if self.stopping:  # asked while the ranks were being started: they have not heard it
                 self._ask_ranks()
             while any(rank.running for rank in self.ranks):

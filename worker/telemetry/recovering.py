@@ -35,8 +35,12 @@ def recover(partial: Path) -> Recovered | None:
     Raises:
         UserError: There is no such file, or no control step in it can be read.
     """
-    if not partial.is_file():
+    if not partial.exists():
         raise UserError(f"{partial}: there is no such file; a recording that was cut short ends on .mcap{PARTIAL}")
+    if not partial.is_file():
+        raise UserError(f"{partial}: it is no file; a recording that was cut short ends on .mcap{PARTIAL}")
+    if not os.access(partial, os.R_OK):
+        raise UserError(f"{partial}: it can't be read (Permission denied)")
     name = partial.name.removesuffix(PARTIAL)
     target = partial.with_name(name if name != partial.name else f"{partial.stem}-recovered{partial.suffix}")
     if target.exists():

@@ -82,6 +82,7 @@ class Replay:
         links: list[str] = []
         cameras: list[str] = []
         terms: tuple[str, ...] | None = None
+        steps = False
         with self._ours():
             for kind, topic, _, data in self._messages():
                 if topic == "/tf" and terms is not None:
@@ -96,8 +97,9 @@ class Replay:
                         shapes[frame] = bytes(entity.models[0].data)
                 elif topic == "/tf":
                     links = [each.child_frame_id for each in _decoded(kind, data).transforms]
-                elif topic == "/world_0/rl/step" and shapes and places:
-                    terms = tuple(_decoded(kind, data).reward_names)
+                elif topic == "/world_0/rl/step":
+                    steps = True
+                    terms = tuple(_decoded(kind, data).reward_names) if shapes and places else None
                 elif found := _IMAGES.fullmatch(topic):
                     cameras += [found[2]] if found[1] == "0" else []
         if terms is not None:
@@ -105,6 +107,11 @@ class Replay:
             self.look = Look(own, shapes, np.array(places), terms, tuple(cameras))
             self.cut = False
             return
+        if steps:
+            raise UserError(
+                f"{path}: what its worlds look like (/world_0/scene, /tf_static) is lost, so that it can't be drawn; "
+                f"`rerun {path.name}` and ROS 2's tools show the rest"
+            )
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 

@@ -80,6 +80,8 @@ class SoundRecords:
         self._lost_metadata = 0
         self._uncounted = self._pending = self._behind = False
         """Whether a chunk is lost that no index counts, one whose indexes may follow, and anything since the last sound chunk."""
+        self._chunks: set[bytes] = set()
+        """Times, size and checksum of the sound chunks."""
         self._known: set[int] = set()
         self._schemas: set[int] = set()
         self._listed: defaultdict[int, list[int]] = defaultdict(list)
@@ -228,6 +230,10 @@ class SoundRecords:
         content = decompressor.decompress(frame)
         _require(decompressor.eof and not decompressor.unused_data and len(content) == size)
         _require(zlib.crc32(content) == crc)
+        if body[:28] in self._chunks:  # the same messages once more
+            self.damaged, self.unreadable = self.damaged + 1, self.unreadable + len(body)
+            return []
+        self._chunks.add(body[:28])
         kept, self._listed = [], defaultdict(list)
         for record in breakup_chunk(Chunk("", content, end, start, crc, size)):
             if isinstance(record, Schema):

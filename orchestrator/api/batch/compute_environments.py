@@ -37,8 +37,7 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
         raise ClientError(f"there are {_MOST_COMPUTE_ENVIRONMENTS} compute environments; delete one first")
     if request["type"] not in ("MANAGED", "UNMANAGED"):
         raise ClientError(f"type is {request['type'][:50]!r}; it is MANAGED or UNMANAGED")
-    if request.get("eksConfiguration"):
-        raise ClientError("eksConfiguration is not supported: no engine is a Kubernetes cluster; leave it out")
+    _check_members(request)
     resources = request.get("computeResources")
     if request["type"] == "MANAGED" and not resources:
         raise ClientError("a MANAGED compute environment needs computeResources")
@@ -64,6 +63,7 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
     """UpdateComputeEnvironment: state and resources; running jobs are left alone."""
     compute_environment = _compute_environment(context, request["computeEnvironment"])
     permissions.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, compute_environment)
+    _check_members(request)
     if (state := request.get("state")) is not None:
         compute_environment.state = _state(state)
     if changes := request.get("computeResources"):
@@ -73,8 +73,15 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
             )
         resources = {**(compute_environment.document.get("computeResources") or {}), **changes}
         _check_resources(resources)
-        compute_environment.document = {**compute_environment.document, "computeResources": resources}
-    for key in ("serviceRole", "unmanagedvCpus", "context"):
+        document = {**compute_environment.document, "computeResources": resources}
+        is_moved = fargate.of_environment(document) != fargate.of_environment(compute_environment.document)
+        if is_moved and (queue := _queue_of(context, compute_environment)):
+            raise ClientError(
+                f"computeResources type {resources['type']}: compute environment {compute_environment.name} is used by job queue "
+                f"{queue} and can't change between EC2 and Fargate; give that queue another compute environment first"
+            )
+        compute_environment.document = document
+    for key in ("serviceRole", "unmanagedvCpus", "updatePolicy", "context", "ecsSettings"):
         if key in request:
             compute_environment.document = {**compute_environment.document, key: request[key]}
     return {
@@ -93,14 +100,9 @@ def delete_compute_environment(context: Context, request: dict[str, Any]) -> dic
         return {}
     if compute_environment.state != "DISABLED":
         raise ClientError(f"Compute environment {compute_environment.name} is ENABLED; disable it first")
-    users = [
-        queue.name
-        for queue in context.session.scalars(select(JobQueue))
-        if compute_environment.name in queue.compute_environments
-    ]
-    if users:
+    if queue := _queue_of(context, compute_environment):
         raise ClientError(
-            f"Compute environment {compute_environment.name} is used by job queue {users[0]}; delete that first"
+            f"Compute environment {compute_environment.name} is used by job queue {queue}; delete that first"
         )
     context.session.delete(compute_environment)
     return {}
@@ -173,6 +175,12 @@ def _compute_environment(context: Context, reference: str) -> ComputeEnvironment
     return compute_environment
 
 
+def _queue_of(context: Context, compute_environment: ComputeEnvironment) -> str | None:
+    """The name of a queue with this compute environment; None where there is none."""
+    queues = context.session.scalars(select(JobQueue))
+    return next((each.name for each in queues if compute_environment.name in each.compute_environments), None)
+
+
 def _policy(context: Context, arn: str) -> SchedulingPolicy:
     policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
     if policy is None:
@@ -184,6 +192,28 @@ def _state(state: str) -> str:
     if state not in ("ENABLED", "DISABLED"):
         raise ClientError(f"state is {state[:50]!r}; it is ENABLED or DISABLED")
     return state
+
+
+def _check_members(request: Mapping[str, Any]) -> None:
+    """CreateComputeEnvironment and UpdateComputeEnvironment: refuse members of EKS by name. Raises ClientError."""
+    resources = request.get("computeResources") or {}
+    images, template = resources.get("ec2Configuration") or [], resources.get("launchTemplate") or {}
+    templates = [template, *(template.get("overrides") or [])]
+    of_eks = [
+        *(["eksConfiguration"] if request.get("eksConfiguration") else []),
+        *(
+            f"ec2Configuration imageType {kind[:50]}"
+            for each in images
+            if (kind := each["imageType"]).startswith("EKS")
+        ),
+        *("ec2Configuration imageKubernetesVersion" for each in images if each.get("imageKubernetesVersion")),
+        *(f"launchTemplate userdataType {kind[:50]}" for each in templates if (kind := each.get("userdataType"))),
+    ]
+    if of_eks:
+        raise ClientError(f"{of_eks[0]} {rules.NO_KUBERNETES} leave it out")
+    insights = (request.get("ecsSettings") or {}).get("containerInsights") or "DISABLED"
+    if insights not in ("ENABLED", "ENHANCED", "DISABLED"):
+        raise ClientError(f"containerInsights is {insights[:50]!r}; it is ENABLED, ENHANCED or DISABLED")
 
 
 def _check_resources(resources: Mapping[str, Any]) -> None:
@@ -239,7 +269,8 @@ def _describe(context: Context, compute_environment: ComputeEnvironment) -> dict
     }
     if document["type"] == "MANAGED":
         document.setdefault("serviceRole", iam_arn(f"role{_SERVICE_ROLE}"))
-        document.setdefault("updatePolicy", {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30})
+        policy = {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30}
+        document["updatePolicy"] = {**policy, **document.get("updatePolicy", {})}
     if is_built_in(compute_environment):
         document["computeResources"] = {
             **_own_resources(context, compute_environment),

@@ -37,7 +37,7 @@ def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any],
     if wanted is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
     if request.get("eksProperties"):
-        raise ClientError(f"job definition {name}: eksProperties {rules.NO_KUBERNETES} {' or '.join(wanted)}")
+        raise ClientError(f"job definition {name}: eksProperties {rules.NO_KUBERNETES} use {' or '.join(wanted)}")
     given = [key for key in _PROPERTIES if request.get(key)]
     if len(given) != 1 or given[0] not in wanted:
         raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")

@@ -10,7 +10,7 @@ from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.api.batch.ecs import to_ecs
 from orchestrator.api.batch.fargate import is_fargate
 from orchestrator.api.damaged import DAMAGED
-from orchestrator.domain.job import Status, container_reason
+from orchestrator.domain.job import Ending, Status, container_reason, has_exited
 from orchestrator.persistence.models import Attempt, Job, JobDefinition
 
 _LISTS = ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes")
@@ -157,10 +157,7 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
         if job.array_index is not None:
             summary["arrayProperties"]["index"] = job.array_index
     index = gang.main if node is None else node
-    record = job.attempts[-1].node(index) if job.attempts else None
-    if record is not None and record.exit_code is not None:
-        reason = container_reason(record.reason, record.status_reason)
-        summary["container"] = {"exitCode": record.exit_code, **({"reason": reason[:255]} if reason else {})}
+    summary["container"] = (_exit(job, job.attempts[-1], index) if job.attempts else {}) or None
     if job.share:
         summary["shareIdentifier"] = job.share
     if job.stop_reason is not None:  # AWS shows only the one that is true
@@ -229,12 +226,21 @@ def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
     return {key: value for key, value in detail.items() if value is not None}
 
 
+def _exit(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
+    """``exitCode`` and ``reason`` of a container, those that ``evaluateOnExit`` sees; empty while it runs."""
+    record = attempt.node(node)
+    if record is None:
+        return {}
+    decided = attempt.status_reason if node == job.gang.main and attempt.ending != Ending.STOPPED else None
+    status = record.status_reason or decided
+    code, reason = record.exit_code if has_exited(status) else None, container_reason(record.reason, status)
+    return {**({} if code is None else {"exitCode": code}), **({"reason": reason[:255]} if reason else {})}
+
+
 def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
     record = attempt.node(node)
-    reason = container_reason(record.reason, record.status_reason) if record else None
     detail = {
-        "exitCode": record.exit_code if record else None,
-        "reason": reason[:255] if reason else None,
+        **_exit(job, attempt, node),
         "logStreamName": stream_name(job, attempt.number, node, record.log_prefix if record else None)
         if attempt.started_at
         else None,

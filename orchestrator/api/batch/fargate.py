@@ -32,6 +32,11 @@ _MEMORY: Mapping[float, Sequence[int]] = {
 }
 """MiB that go with a number of vCPUs (the same, ResourceRequirement)."""
 _TYPES = ("EC2", "SPOT", "FARGATE", "FARGATE_SPOT")
+_VALUES = (
+    ("networkConfiguration", "assignPublicIp", ("ENABLED", "DISABLED")),
+    ("runtimePlatform", "cpuArchitecture", ("X86_64", "ARM64")),
+)
+"""Members of a container's members, and the values that they can have (the same, NetworkConfiguration and RuntimePlatform)."""
 
 
 def is_fargate(document: Mapping[str, Any]) -> bool:
@@ -65,6 +70,9 @@ def _check_values(container: Mapping[str, Any], where: str) -> None:
     system = (container.get("runtimePlatform") or {}).get("operatingSystemFamily", "LINUX")
     if system != "LINUX":
         raise ClientError(f"{where}: operatingSystemFamily {system[:50]!r} is not supported: nodes run LINUX")
+    for member, key, known in _VALUES:
+        if (value := (container.get(member) or {}).get(key)) and value not in known:
+            raise ClientError(f"{where}: {member} {key} is {value[:50]!r}; it is {' or '.join(known)}")
     if (size := (container.get("ephemeralStorage") or {}).get("sizeInGiB")) is not None and not 21 <= size <= 200:
         raise ClientError(f"{where}: ephemeralStorage sizeInGiB is {size}; it must be 21 to 200")
 
@@ -109,6 +117,11 @@ def of_environment(document: Mapping[str, Any]) -> bool:
     return str((document.get("computeResources") or {}).get("type", "EC2")).upper().startswith(FARGATE)
 
 
+def of_queue(documents: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the compute environments of a queue, by their documents, are of Fargate alone."""
+    return bool(documents) and all(map(of_environment, documents))
+
+
 def check_queue(name: str, documents: Sequence[Mapping[str, Any]], definition: Mapping[str, Any]) -> None:
     """A queue of Fargate alone takes no job of EC2, such as one with several nodes or GPUs, as on AWS. Raises ClientError.
 
@@ -117,7 +130,7 @@ def check_queue(name: str, documents: Sequence[Mapping[str, Any]], definition: M
         documents: Of its compute environments.
         definition: The job's.
     """
-    if documents and all(map(of_environment, documents)) and not is_fargate(definition):
+    if of_queue(documents) and not is_fargate(definition):
         # the first sentence is AWS's own: clients match it
         raise ClientError(
             "Job Queue is attached to Compute Environment that can not run Jobs with capability EC2. "

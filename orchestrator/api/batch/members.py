@@ -6,7 +6,7 @@ Members that are ignored are listed in docs/aws-differences.md; a test checks ev
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from orchestrator.api.errors import ClientError
@@ -21,6 +21,12 @@ _LOG_OPTIONS = (
     *("awslogs-multiline-pattern", "awslogs-endpoint", "mode", "max-buffer-size"),
 )
 """Options of the driver ``awslogs``; all but the first two change nothing here."""
+_LOG_VALUES: Mapping[str, Sequence[str]] = {
+    "mode": ("blocking", "non-blocking"),
+    # all that Docker's driver reads as true or false
+    "awslogs-create-group": ("true", "false", "1", "0", "t", "f", "T", "F", "True", "False", "TRUE", "FALSE"),
+}
+"""Values of the options that have a few; the first two are named where another one is refused."""
 _STREAM_PREFIX = re.compile(r"[^:*]{1,256}")
 _USER = re.compile(r"[a-z0-9_][a-z0-9_-]{0,30}(:[a-z0-9_][a-z0-9_-]{0,30})?")
 _VOLUME_KINDS = ("host", "efsVolumeConfiguration", "s3filesVolumeConfiguration")
@@ -72,6 +78,8 @@ def _check_log(log: Mapping[str, Any], where: str) -> None:
     for name, value in (log.get("options") or {}).items():
         if name not in _LOG_OPTIONS:
             raise ClientError(f"{where}: logConfiguration option {name[:100]!r} is not supported; leave it out")
+        if value and value not in (known := _LOG_VALUES.get(name, (value,))):
+            raise ClientError(f"{where}: logConfiguration {name} is {value[:50]!r}; it is {' or '.join(known[:2])}")
         if name == "awslogs-group":
             check_log_group(f"{where}: logConfiguration awslogs-group", value)
         if name == "awslogs-stream-prefix" and not _STREAM_PREFIX.fullmatch(value):

@@ -15,6 +15,7 @@ from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, Shared
+from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
@@ -42,6 +43,10 @@ def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
         raise ClientError("computeEnvironmentOrder is missing: name 1 to 3 compute environments")
     queue = JobQueue(name=name, compute_environments=[], limits=[], tags=request.get("tags") or {})
     _apply(context, queue, request)
+    if (kind := request.get("jobQueueType")) not in (None, own := _type(context, queue)):
+        raise ClientError(
+            f"jobQueueType is {kind}, and the compute environments make it {own}: use that, or leave it out"
+        )
     check_engine_tags(context, queue, queue.tags)
     if policy := request.get("schedulingPolicyArn"):
         queue.policy = _policy(context, policy)
@@ -55,7 +60,7 @@ def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, 
     if named := request.get("jobQueues"):
         query = query.where(JobQueue.name.in_([plain_name(each, "job-queue") for each in named]))
     rows, token = page(context.session, query, request, page_size(request, 100), (JobQueue.name,), (False,))
-    return {"jobQueues": [_describe(queue) for queue in rows], **token}
+    return {"jobQueues": [_describe(context, queue) for queue in rows], **token}
 
 
 def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -136,9 +141,18 @@ def _apply(context: Context, queue: JobQueue, request: Mapping[str, Any]) -> Non
 
 
 def _check_kind(request: Mapping[str, Any]) -> None:
-    for key in ("serviceEnvironmentOrder", "jobQueueType"):
-        if request.get(key) not in (None, [], "EC2", "ECS"):
-            raise ClientError(f"{key} is not supported; use computeEnvironmentOrder")
+    if request.get("serviceEnvironmentOrder"):
+        raise ClientError("serviceEnvironmentOrder is not supported; use computeEnvironmentOrder")
+    if (kind := request.get("jobQueueType")) == "EKS":
+        raise ClientError(f"jobQueueType EKS {rules.NO_KUBERNETES} use ECS or ECS_FARGATE")
+    if kind not in (None, "ECS", "ECS_FARGATE"):
+        raise ClientError(f"jobQueueType {kind[:50]!r} is not supported; use ECS or ECS_FARGATE")
+
+
+def _type(context: Context, queue: JobQueue) -> str:
+    """``jobQueueType``, which follows from the compute environments."""
+    documents = [each.document for each in environments_of(context.session, queue)]
+    return "ECS_FARGATE" if fargate.of_queue(documents) else "ECS"
 
 
 def _checked_order(context: Context, order: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -147,6 +161,9 @@ def _checked_order(context: Context, order: Sequence[Mapping[str, Any]]) -> list
         raise ClientError(
             f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_COMPUTE_ENVIRONMENTS}"
         )
+    for each in order:
+        if not 0 <= each["order"] < 2**31:
+            raise ClientError(f"computeEnvironmentOrder order is {each['order']}; it must be 0 to {2**31 - 1}")
     names = [plain_name(each["computeEnvironment"], "compute-environment") for each in order]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
         raise ClientError("computeEnvironmentOrder: every compute environment and every order once")
@@ -182,7 +199,7 @@ def _policy(context: Context, arn: str) -> str:
     return policy.name
 
 
-def _describe(queue: JobQueue) -> dict[str, Any]:
+def _describe(context: Context, queue: JobQueue) -> dict[str, Any]:
     sent = queue.sent_order or [
         {"order": number, "computeEnvironment": name} for number, name in enumerate(queue.compute_environments, 1)
     ]
@@ -196,7 +213,7 @@ def _describe(queue: JobQueue) -> dict[str, Any]:
         "priority": queue.priority,
         "computeEnvironmentOrder": order,
         "jobStateTimeLimitActions": queue.limits,
-        "jobQueueType": "ECS",
+        "jobQueueType": _type(context, queue),
         "tags": queue.tags,
         **({"schedulingPolicyArn": policy_arn(queue.policy)} if queue.policy else {}),
     }

@@ -23,7 +23,7 @@ _MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
 _SHORTEST_TIMEOUT = 60
 _DEEPEST_SPEC = 100
 """Levels of MUSTER_SPEC; what is nested much deeper can be stored, but no answer could show it."""
-NO_KUBERNETES = "is not supported: no engine is a Kubernetes cluster; use"
+NO_KUBERNETES = "is not supported: no engine is a Kubernetes cluster;"
 _MALFORMED = (
     "MUSTER_SPEC, MUSTER_STALL_TIMEOUT, MUSTER_LOG_LIMIT (bytes, at least 1048576) or MUSTER_RANKS_PER_NODE (at least 1) is malformed; "
     "they are written by `muster submit`"
@@ -219,7 +219,7 @@ def _where(entry: Mapping[str, Any], kind: str) -> str:
 def _in_container(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
     given = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
     if "eksProperties" in given:
-        raise ClientError(f"{where}: eksProperties {NO_KUBERNETES} container or ecsProperties")
+        raise ClientError(f"{where}: eksProperties {NO_KUBERNETES} use container or ecsProperties")
     if given not in (["container"], ["ecsProperties"]):
         raise ClientError(f"{where}: give container or ecsProperties, and only one of them")
     check_consumables(entry, where)
@@ -313,7 +313,7 @@ def override_range(entry: dict[str, Any], changes: Mapping[str, Any], kind: str)
     if "ecs" not in entry:
         right, wrong = wrong, right
     if changes.get("eksPropertiesOverride"):
-        raise ClientError(f"{where}: eksPropertiesOverride {NO_KUBERNETES} {right}")
+        raise ClientError(f"{where}: eksPropertiesOverride {NO_KUBERNETES} use {right}")
     if changes.get(wrong):
         raise ClientError(f"{where}: {wrong} does not fit the job definition; use {right}")
     override = changes.get(right) or {}

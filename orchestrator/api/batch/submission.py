@@ -21,6 +21,7 @@ from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import check_sources, hold_teacher
 from orchestrator.control.compute_environments import environments_of, queue_engines
+from orchestrator.domain import reasons
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
@@ -134,7 +135,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
     gang = rules.check_nodes(properties, document["type"])
-    _check_commands(context, queue, gang, definition.name)
+    _check_commands(context, queue, definition, properties, gang)
     fargate.check_platform(document, properties, f"job definition {definition.name}")
     fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     _check_secrets(context, queue, gang)
@@ -170,14 +171,22 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     return job, gang
 
 
-def _check_commands(context: Context, queue: JobQueue, gang: GangSpec, definition: str) -> None:
+def _check_commands(
+    context: Context, queue: JobQueue, definition: JobDefinition, properties: Mapping[str, Any], gang: GangSpec
+) -> None:
     """A node without a command runs that of its image, where its engine runs images. Raises ClientError."""
-    if all(node.command for node in gang.nodes):
+    open_node = next((node for node in gang.nodes if not node.command), None)
+    if open_node is None:
         return
     engine = context.reconciler.engine
     if without := engine.without_images(queue_engines(context.session, queue.name, engine.names[0])):
+        where = f"job definition {definition.name}"
+        if definition.document["type"] == "multinode":
+            ranges = properties["nodeRangeProperties"]
+            target = next(each["targetNodes"] for each in ranges if each["container"] is open_node.container)
+            where = f"node range {target[:20]} of {where}"
         raise ClientError(
-            f"job definition {definition} has no command, and engine {without[0]} of job queue {queue.name} runs no image, whose ENTRYPOINT "
+            f"{where} has no command, and engine {without[0]} of job queue {queue.name} runs no image, whose ENTRYPOINT "
             "and CMD could stand for one: give a command in the definition or in the overrides, or use a queue of an engine with images "
             "(docker, aws-batch)"
         )
@@ -227,7 +236,7 @@ def _check_run(context: Context, run: str, named: bool) -> None:
         raise ClientError(f"run {run} is being written by another job; choose another name")
     if holder:
         raise ClientError(
-            f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
+            f"run {run} is being written by job {reasons.named(holder.name, holder.id)}; stop it first: muster stop {reasons.short_id(holder.id)}"
         )
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
         there = context.run(run)

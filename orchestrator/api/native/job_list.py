@@ -21,7 +21,8 @@ from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
-from orchestrator.domain.job import RunTime, Status
+from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
+from orchestrator.domain.reasons import Reason, array_of
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
@@ -103,7 +104,7 @@ def page_of_jobs(
         query = select(Job).where(*conditions, *wanted.in_states).order_by(Job.created_at.desc(), Job.id.desc())
         query = query.options(selectinload(Job.attempts)).offset(offset).limit(most)
         jobs = session.scalars(query).all()
-        rows = [_row(reconciler, job) for job in jobs]
+        rows = [_row(reconciler, session, job) for job in jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
     progress = _progress(reconciler, trainings)
     found = [{**row, "progress": progress.get(row["id"])} for row, _ in rows]
@@ -144,6 +145,20 @@ def children_of(reconciler: Reconciler, session: Session, array: Job) -> list[di
     ]
 
 
+def reason_of(reconciler: Reconciler, session: Session, job: Job) -> Reason:
+    """Why a job is in its state; of an array of which children wait: how many, and why the first of them does."""
+    own = reconciler.admission.reason(job)
+    if job.kind != "array" or own.words != array_of(job.array_size):
+        return own
+    waiting = select(func.count(), func.min(Job.array_index)).where(Job.parent == job.id, Job.status.in_(EARLY))
+    count, first = session.execute(waiting).one()
+    child = session.get(Job, f"{job.id}:{first}") if count else None
+    words = reconciler.admission.reason(child).words if child else ""
+    if words in ("", WAITING):
+        return Reason(words or own.words, own.aws)
+    return Reason(f"{count} of {job.array_size} wait; child {first}: {words}", own.aws)
+
+
 @dataclass(frozen=True)
 class _Training:
     """A job that has begun to train."""
@@ -153,12 +168,12 @@ class _Training:
     iterations: int
 
 
-def _row(reconciler: Reconciler, job: Job) -> tuple[dict[str, Any], _Training | None]:
+def _row(reconciler: Reconciler, session: Session, job: Job) -> tuple[dict[str, Any], _Training | None]:
     row = {
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "statusReason": reconciler.admission.reason(job).words or None,
+        "statusReason": reason_of(reconciler, session, job).words or None,
         "queue": job.queue,
         "owner": job.owner,
         "run": job.run,

@@ -25,6 +25,7 @@ from orchestrator.api.permissions import LeagueOf, Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import Status
+from orchestrator.domain.reasons import named
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.spec.league_races import race_job
@@ -392,10 +393,10 @@ def _race_of(reconciler: Reconciler, league: League, reference: str) -> str:
         permissions.check(Operation.ENTER_LEAGUE, job)
         if job.status != Status.SUCCEEDED:
             raise ClientError(
-                f"job {job.name} ({job.id[:8]}) is {job.status}: only a race that has SUCCEEDED is entered", CONFLICT
+                f"job {named(job.name, job.id)} is {job.status}: only a race that has SUCCEEDED is entered", CONFLICT
             )
         if closed := league.closed(job.created_at / 1000):
-            raise ClientError(f"{closed}, and job {job.name} ({job.id[:8]}) was not submitted in between", CONFLICT)
+            raise ClientError(f"{closed}, and job {named(job.name, job.id)} was not submitted in between", CONFLICT)
         return job.id
 
 

@@ -45,10 +45,11 @@ from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import Status
+from orchestrator.domain.reasons import named, short_id
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
-from orchestrator.persistence.queries import find_job, short_id, unknown_job
+from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
@@ -93,9 +94,9 @@ def _jobs_of_run(session: Session, reference: str) -> str:
     made = [job for job in session.scalars(query) if permissions.is_visible(job)]
     if not made:
         return ""
-    named = ", ".join(f"{job.name} ({short_id(job.id)})" for job in made[-5:])
+    names = ", ".join(named(job.name, job.id) for job in made[-5:])
     which = "job" if len(made) == 1 else "jobs"
-    return f"{reference} is a run, which {which} {named} made; see: muster show {short_id(made[-1].id)}"
+    return f"{reference} is a run, which {which} {names} made; see: muster show {short_id(made[-1].id)}"
 
 
 @router.get("/capacity")
@@ -163,7 +164,7 @@ def job_detail(
         definition = named_definition(session, job.definition)
         with reading(job):
             attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
-            gang, reason = job.gang, reconciler.admission.reason(job)
+            gang, reason = job.gang, job_list.reason_of(reconciler, session, job)
             detail = {
                 "id": job.id,
                 "name": job.name,
@@ -232,7 +233,7 @@ def job_logs(
             count = len(job.gang.nodes)
         if node is not None and not 0 <= node < count:
             raise ClientError(
-                f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
+                f"job {named(job.name, job.id)} has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
         follower = LogFollower(
             reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions), PIECE
@@ -276,7 +277,7 @@ def _running(reconciler: Reconciler, reference: str, operation: Operation) -> tu
         job = permitted_job(session, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
-            raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", CONFLICT)
+            raise ClientError(f"job {named(job.name, job.id)} is {job.status}, not RUNNING", CONFLICT)
         with reading(job):
             main = job.gang.main
             nodes = sorted((node.index for node in attempt.nodes), key=lambda index: index != main)

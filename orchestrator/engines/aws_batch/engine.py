@@ -24,7 +24,7 @@ from botocore.parsers import ResponseParserError
 
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.domain.hosts import Limit, Queued
-from orchestrator.domain.job import TERMINAL
+from orchestrator.domain.job import AWS_NOT_STARTED, TERMINAL
 from orchestrator.domain.resources import Resources
 from orchestrator.engines.api import (
     Cause,
@@ -332,7 +332,7 @@ class AwsBatchEngine:
         outcome = seen(handle, index, code or 0, str(reason), stopped, asked)
         if code is not None and not self._settled(handle, watched, log, outcome):
             return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
-        return _ended(address, code, str(reason))
+        return _ended(address, code, str(reason), code is None and detail.get("statusReason") == AWS_NOT_STARTED)
 
     def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, outcome: Outcome) -> bool:
         """Whether the store has the node's outcome; it is written here if it was missing."""
@@ -408,12 +408,14 @@ def _waits(status: str, address: str, why: str) -> NodeStatus:
     return NodeStatus(NodePhase.STARTING if status == "STARTING" else NodePhase.QUEUED, address, why)
 
 
-def _ended(address: str, code: int | None, reason: str) -> NodeStatus:
+def _ended(address: str, code: int | None, reason: str, not_started: bool = False) -> NodeStatus:
     """A node that has ended, by its exit code and AWS's reason: of memory and lost hosts AWS tells in words alone."""
+    if not_started:
+        return NodeStatus(NodePhase.ENDED, address, reason, Cause.CANNOT_START)
     if reason.startswith("OutOfMemoryError"):
         return NodeStatus(NodePhase.ENDED, address, reason, Cause.OUT_OF_MEMORY, code)
     if code is None and reason and not reason.startswith("Host EC2"):
-        return NodeStatus(NodePhase.ENDED, address, reason)  # it never started, or AWS does not say
+        return NodeStatus(NodePhase.ENDED, address, reason)  # AWS does not say
     return ended(address, code, reason)
 
 

@@ -202,7 +202,7 @@ class DockerEngine:
         return handle
 
     def _image(self, name: str) -> Image:
-        """The image; where it is not here it is pulled meanwhile. Raises NotYet, and EngineError in AWS's words."""
+        """The image; where it is not here it is pulled meanwhile. Raises NotYet, and CannotStart in AWS's words."""
         try:
             return self._client.images.get(name)
         except ImageNotFound:
@@ -210,7 +210,7 @@ class DockerEngine:
         except DockerException as error:
             if isinstance(error, APIError) and error.is_server_error():
                 raise
-            raise EngineError(f"CannotInspectContainerError: image {name!r}: {error}") from error
+            raise CannotStart(f"CannotInspectContainerError: image {name!r}: {error}") from error
         pull = self._pulls.pop(name, None) or self._puller.submit(self._client.images.pull, name)
         if not pull.done():
             self._pulls[name] = pull
@@ -220,7 +220,7 @@ class DockerEngine:
         except DockerException as error:
             why = error.explanation if isinstance(error, APIError) and error.explanation else str(error)
             why = f"CannotPullContainerError: Error response from daemon: {why} (image {name})"
-            raise EngineError(why) from error
+            raise CannotStart(why) from error
 
     def _network(self, gang: str) -> tuple[Network, str]:
         """The gang's network and its subnet, ``a.b.c.0/24``."""

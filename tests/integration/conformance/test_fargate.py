@@ -87,6 +87,8 @@ def test_the_members_of_a_fargate_task_run_and_are_shown(batch: Batch) -> None:
         (needs("1", "2049"), "no MEMORY 2049 with VCPU 1; it is 2048 to 8192 in steps of 1024"),
         ({"ephemeralStorage": {"sizeInGiB": 20}}, "sizeInGiB is 20; it must be 21 to 200"),
         ({"runtimePlatform": {"operatingSystemFamily": "WINDOWS_SERVER_2022_CORE"}}, "nodes run LINUX"),
+        ({"runtimePlatform": {"cpuArchitecture": "SPARC"}}, "cpuArchitecture is 'SPARC'; it is X86_64 or ARM64"),
+        ({"networkConfiguration": {"assignPublicIp": "MAYBE"}}, "is 'MAYBE'; it is ENABLED or DISABLED"),
     ],
 )
 def test_what_fargate_does_not_have_is_refused_by_name(batch: Batch, change: dict[str, Any], message: str) -> None:
@@ -143,6 +145,81 @@ def test_a_fargate_compute_environment_runs_fargate_jobs_alone(batch: Batch, kin
     batch.remove([name], [name])
 
 
+@pytest.mark.parametrize(("kind", "own", "other"), [("FARGATE", "ECS_FARGATE", "ECS"), ("EC2", "ECS", "ECS_FARGATE")])
+def test_the_type_of_a_queue_is_that_of_its_compute_environments(batch: Batch, kind: str, own: str, other: str) -> None:
+    name = f"typed-{kind.lower()}"
+    resources = {"type": kind, "maxvCpus": 8, "subnets": ["subnet-none"]}
+    batch.api.create_compute_environment(computeEnvironmentName=name, type="MANAGED", computeResources=resources)
+    for bad, message in [
+        (other, f"jobQueueType is {other}, and the compute environments make it {own}"),
+        ("EKS", "jobQueueType EKS is not supported: no engine is a Kubernetes cluster; use ECS or ECS_FARGATE"),
+        ("EC2", "jobQueueType 'EC2' is not supported; use ECS or ECS_FARGATE"),
+        ("SAGEMAKER_TRAINING", "jobQueueType 'SAGEMAKER_TRAINING' is not supported"),
+    ]:
+        with refused(message):
+            batch.queue(name, name, jobQueueType=bad)
+    batch.queue(name, name, jobQueueType=own)
+    batch.queue(f"{name}-2", name)
+    queues = batch.api.describe_job_queues(jobQueues=[name, f"{name}-2"])["jobQueues"]
+    assert [queue["jobQueueType"] for queue in queues] == [own, own]
+    batch.remove([name, f"{name}-2"], [name])
+
+
+def test_a_compute_environment_of_a_queue_can_t_change_between_ec2_and_fargate(batch: Batch) -> None:
+    resources = {"maxvCpus": 8, "subnets": ["subnet-none"]}
+    names = {"EC2": "moves-ec2", "FARGATE": "moves-fargate"}
+    for kind, name in names.items():
+        create = {"computeEnvironmentName": name, "type": "MANAGED"}
+        batch.api.create_compute_environment(**create, computeResources={"type": kind, **resources})
+        batch.queue(name, name)
+
+    def become(name: str, kind: str) -> None:
+        batch.api.update_compute_environment(computeEnvironment=name, state="DISABLED", computeResources={"type": kind})
+
+    for name, kind, queue in [("moves-ec2", "FARGATE_SPOT", "moves-ec2"), ("moves-fargate", "EC2", "moves-fargate")]:
+        with refused(f"type {kind}: compute environment {name} is used by job queue {queue} and can't change between"):
+            become(name, kind)
+    with refused("type FARGATE: compute environment local is used by job queue default"):
+        become("local", "FARGATE")
+    listed = batch.api.describe_compute_environments(computeEnvironments=[*names.values(), "local"])
+    shown = {each["computeEnvironmentName"]: each for each in listed["computeEnvironments"]}
+    assert {name: each["computeResources"]["type"] for name, each in shown.items()} == {
+        "local": "EC2",
+        **{name: kind for kind, name in names.items()},
+    }
+    assert {each["state"] for each in shown.values()} == {"ENABLED"}, "a refused update changes nothing"
+    become("moves-ec2", "SPOT")
+    become("moves-fargate", "FARGATE_SPOT")
+    batch.remove(list(names.values()), [])
+    become("moves-ec2", "FARGATE")
+    batch.remove([], list(names.values()))
+
+
+KUBERNETES: list[tuple[dict[str, Any], str]] = [
+    ({"ec2Configuration": [{"imageType": "EKS_AL2023"}]}, "ec2Configuration imageType EKS_AL2023"),
+    ({"ec2Configuration": [{"imageType": "ECS_AL2", "imageKubernetesVersion": "1.30"}]}, "imageKubernetesVersion"),
+    ({"launchTemplate": {"launchTemplateId": "x", "userdataType": "EKS_NODEADM"}}, "userdataType EKS_NODEADM"),
+    (
+        {"launchTemplate": {"launchTemplateId": "x", "overrides": [{"userdataType": "EKS_BOOTSTRAP_SH"}]}},
+        "launchTemplate userdataType EKS_BOOTSTRAP_SH",
+    ),
+]
+
+
+@pytest.mark.parametrize(("members", "name"), KUBERNETES)
+def test_members_of_eks_are_refused_by_name_in_compute_resources(
+    batch: Batch, members: dict[str, Any], name: str
+) -> None:
+    with refused(f"{name} is not supported: no engine is a Kubernetes cluster; leave it out"):
+        batch.api.create_compute_environment(
+            computeEnvironmentName="eks",
+            type="MANAGED",
+            computeResources={"type": "EC2", "maxvCpus": 1, "subnets": ["subnet-none"], **members},
+        )
+    with refused(f"{name} is not supported: no engine is a Kubernetes cluster; leave it out"):
+        batch.api.update_compute_environment(computeEnvironment="local", computeResources=members)
+
+
 def test_eks_is_refused_by_its_name_wherever_it_is_asked_for(batch: Batch) -> None:
     request = json.loads(
         '{"jobDefinitionName": "eks", "type": "container", "eksProperties": {"podProperties": {"containers": '
@@ -164,4 +241,8 @@ def test_eks_is_refused_by_its_name_wherever_it_is_asked_for(batch: Batch) -> No
             type="MANAGED",
             eksConfiguration={"eksClusterArn": f"{PREFIX}cluster/x", "kubernetesNamespace": "x"},
             computeResources={"type": "EC2", "maxvCpus": 1, "subnets": ["subnet-none"]},
+        )
+    with refused("eksConfiguration is not supported: no engine is a Kubernetes cluster; leave it out"):
+        batch.api.update_compute_environment(
+            computeEnvironment="local", eksConfiguration={"accessEntry": {"desiredState": "ENABLED"}}
         )

@@ -159,6 +159,21 @@ def test_a_prefix_that_no_stream_can_have_is_refused(batch: Batch) -> None:
         batch.single("misnamed", "true", container={"logConfiguration": logging_to(None, "a:b")})
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "values"),
+    [("mode", "weird", "blocking or non-blocking"), ("awslogs-create-group", "maybe", "true or false")],
+)
+def test_a_value_that_an_option_can_t_have_is_refused(batch: Batch, option: str, value: str, values: str) -> None:
+    with refused(f"logConfiguration {option} is '{value}'; it is {values}"):
+        batch.single("misset", "true", container={"logConfiguration": logging_to(None, **{option: value})})
+
+
+@pytest.mark.parametrize("value", ["true", "True", "0", ""])
+def test_a_truth_value_is_taken_as_docker_s_driver_takes_it(batch: Batch, value: str) -> None:
+    options = {"awslogs-create-group": value, "mode": ""}
+    batch.single("options", "true", container={"logConfiguration": logging_to(None, **options)})
+
+
 def test_every_option_of_the_driver_is_taken(batch: Batch, own: str) -> None:
     options = {"awslogs-region": "us-west-2", "awslogs-create-group": "false", "mode": "blocking"}
     options |= {"awslogs-datetime-format": "%Y", "awslogs-multiline-pattern": "^a", "max-buffer-size": "4m"}

@@ -67,6 +67,30 @@ def test_a_compute_environment_from_its_creation_to_its_end(batch: Batch) -> Non
         batch.api.update_compute_environment(computeEnvironment="q-bad", state="DISABLED")
 
 
+def test_an_update_drops_no_member_of_a_compute_environment(batch: Batch) -> None:
+    batch.compute_environment("q-updated")
+    changes: dict[str, Any] = {
+        "state": "DISABLED",
+        "unmanagedvCpus": 4,
+        "serviceRole": "arn:aws:iam::000000000000:role/mine",
+        "context": "reserved",
+        "computeResources": {"maxvCpus": 5},
+        "updatePolicy": {"terminateJobsOnUpdate": True},
+        "ecsSettings": {"containerInsights": "ENHANCED"},
+    }
+    known = batch.api.meta.service_model.operation_model("UpdateComputeEnvironment").input_shape.members
+    assert {"computeEnvironment", "eksConfiguration", *changes} == set(known)
+    batch.api.update_compute_environment(computeEnvironment="q-updated", **changes)
+    [shown] = batch.api.describe_compute_environments(computeEnvironments=["q-updated"])["computeEnvironments"]
+    assert shown["computeResources"].pop("maxvCpus") == 5
+    whole = {"terminateJobsOnUpdate": True, "jobExecutionTimeoutMinutes": 30}
+    changes |= {"computeResources": shown["computeResources"], "updatePolicy": whole}
+    assert {key: shown[key] for key in changes} == changes
+    with refused("containerInsights is 'SOME'; it is ENABLED, ENHANCED or DISABLED"):
+        batch.api.update_compute_environment(computeEnvironment="q-updated", ecsSettings={"containerInsights": "SOME"})
+    batch.remove([], ["q-updated"])
+
+
 def test_a_queue_from_its_creation_to_its_end(batch: Batch, parked: str) -> None:
     limit = {"reason": NO_ROOM, "state": "RUNNABLE", "maxTimeSeconds": 600, "action": "CANCEL"}
     arn = batch.api.create_job_queue(
@@ -113,7 +137,7 @@ def test_the_order_of_compute_environments_is_described_as_it_was_sent_and_tried
         [queue] = batch.api.describe_job_queues(jobQueues=["q-order"])["jobQueues"]
         return list(queue["computeEnvironmentOrder"])
 
-    for orders in ([1], [0], [5], [0, 1], [10, 20], [2, 1, 3], [3, 1, 2]):
+    for orders in ([1], [0], [2**31 - 1], [0, 1], [10, 20], [2, 1, 3], [3, 1, 2]):
         shown = [{"order": order, "computeEnvironment": arn} for order, arn in zip(orders, arns, strict=False)]
         assert described(*orders) == shown
     batch.api.update_job_queue(jobQueue="q-order", priority=2)
@@ -135,6 +159,11 @@ def test_the_order_of_compute_environments_is_described_as_it_was_sent_and_tried
         ({"computeEnvironmentOrder": [{"order": 1, "computeEnvironment": "q-none"}]}, "q-none does not exist"),
         ({"computeEnvironmentOrder": [{"order": i, "computeEnvironment": f"q-{i}"} for i in range(4)]}, "at most 3"),
         ({"computeEnvironmentOrder": [{"order": i, "computeEnvironment": "queues-parked"} for i in range(2)]}, "once"),
+        (
+            {"computeEnvironmentOrder": [{"order": -1, "computeEnvironment": "queues-parked"}]},
+            "order is -1; it must be",
+        ),
+        ({"computeEnvironmentOrder": [{"order": 2**31, "computeEnvironment": "queues-parked"}]}, "0 to 2147483647"),
         ({"schedulingPolicyArn": f"{PREFIX}scheduling-policy/q-none"}, "q-none does not exist"),
         ({"jobQueueName": "queues-parked"}, "queues-parked exists already"),
         ({"limit": {"maxTimeSeconds": 599}}, "maxTimeSeconds is 599; it must be 600 to 86400"),

@@ -113,7 +113,9 @@ def test_an_arrays_children_know_their_index_and_decide_its_end(batch: Batch, tm
     assert set(parent["arrayProperties"]["statusSummary"]) == set(states)
     gate(tmp_path, "go")
     parent = batch.wait(job)
-    assert parent["status"] == "FAILED" and "1 of 3" in parent["statusReason"]
+    assert (parent["status"], parent["statusReason"]) == ("FAILED", "Array Child Job failed")
+    own = batch.server.client.get(f"/api/jobs/{job}")["statusReason"]
+    assert own.startswith("1 of 3 array jobs failed: "), "Muster's own words"
     assert summary(batch, job) == {"SUCCEEDED": 2, "FAILED": 1}
     assert batch.api.list_jobs(arrayJobId=job)["jobSummaryList"] == [], "without a status: those that run"
     over = [batch.api.list_jobs(arrayJobId=job, jobStatus=each)["jobSummaryList"] for each in ("SUCCEEDED", "FAILED")]
@@ -287,22 +289,54 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         assert detail["retryStrategy"] == {"attempts": 3, "evaluateOnExit": shown}, "in the model's case"
 
 
-def test_a_program_that_does_not_exist_has_aws_s_reason_and_rules_match_it(batch: Batch) -> None:
-    rules = [{"onReason": "CannotStartContainerError*", **END}]
+@pytest.mark.parametrize(
+    ("rules", "attempts"),
+    [
+        ([{"onReason": "CannotStartContainerError*", **END}], 1),
+        ([{"onStatusReason": "Task failed to start", **AGAIN}, {"onReason": "*", **END}], 3),
+        ([{"onStatusReason": EXITED, **END}, {"onExitCode": "127", **END}], 3),
+    ],
+)
+def test_a_program_that_does_not_exist_has_aws_s_reasons_and_rules_match_them(
+    batch: Batch, rules: list[dict[str, str]], attempts: int
+) -> None:
     job = batch.submit(
         batch.single("one-missing", "true"),
         containerOverrides={"command": ["no-such-program"]},
         retryStrategy={"attempts": 3, "evaluateOnExit": rules},
     )
     detail = batch.wait(job)
-    assert detail["container"]["reason"].startswith("CannotStartContainerError: can't start 'no-such-program': ")
-    assert len(detail["attempts"]) == 1
+    assert len(detail["attempts"]) == attempts
+    listed = batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
+    [summary] = [each for each in listed if each["jobId"] == job]
+    for each in (detail, *detail["attempts"], summary):
+        own = "CannotStartContainerError: can't start 'no-such-program': "
+        assert each["statusReason"] == "Task failed to start" and each["container"]["reason"].startswith(own)
+        assert "exitCode" not in each["container"], "no container ran"
+    shown = batch.server.muster("show", job, MUSTER_URL=batch.server.url).stdout
+    assert "why:" in shown and "main node: can't start 'no-such-program': " in " ".join(shown.split())
+
+
+def test_a_gang_that_the_engine_refuses_has_aws_s_reasons(batch: Batch) -> None:
+    job = batch.submit(batch.single("one-nowhere", "true", env={"MUSTER_DIRECTORY": "/nowhere"}))
+    detail, own = batch.wait(job), "working directory /nowhere is not on this machine"
+    listed = batch.api.list_jobs(jobQueue="default", jobStatus="FAILED")["jobSummaryList"]
+    [summary] = [each for each in listed if each["jobId"] == job]
+    for each in (detail, *detail["attempts"], summary):
+        assert each["statusReason"] == "Task failed to start"
+        assert each["container"]["reason"] == f"CannotStartContainerError: {own}"
+        assert "exitCode" not in each["container"]
+    assert batch.server.client.get(f"/api/jobs/{job}")["statusReason"] == f"can't start the gang: {own}"
 
 
 def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tmp_path: Path) -> None:
     """The pattern that many clients use: again where the host went away, not where the program failed."""
     script = f"[ {ATTEMPT} = 1 ] || exit 3; echo $PPID > $GATE/pid.new; mv $GATE/pid.new $GATE/pid; exec sleep 600"
-    conditions = [{"onStatusReason": "Host EC2*", **AGAIN}, {"onReason": "*", **END}]
+    conditions = [
+        {"onExitCode": "137", **END},
+        {"onStatusReason": "Host EC2*", **AGAIN},
+        {"onReason": "*", **END},
+    ]
     definition = batch.single("one-lost", script, env={"GATE": str(tmp_path)})
     job = batch.submit(definition, retryStrategy={"attempts": 3, "evaluateOnExit": conditions})
     wait_for((tmp_path / "pid").exists, what="the supervisor's pid")
@@ -312,6 +346,7 @@ def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tm
     lost, failed = detail["attempts"]
     assert lost["statusReason"].startswith("Host EC2 (instance ") and lost["statusReason"].endswith(") terminated.")
     assert lost["container"]["reason"] == lost["statusReason"]
+    assert "exitCode" not in lost["container"], "nobody has seen it, and no rule matches it"
     assert (failed["container"]["exitCode"], failed["statusReason"]) == (3, EXITED)
     assert "reason" not in failed["container"]
     assert detail["status"] == "FAILED"
@@ -376,7 +411,7 @@ def test_the_command_may_come_with_the_submission(batch: Batch) -> None:
         {"targetNodes": "0:0", "container": container("true", {})},
         {"targetNodes": "1:", "container": properties},
     ]
-    with refused("job definition one-part has no command, and engine local"):
+    with refused("node range 1: of job definition one-part has no command, and engine local"):
         batch.submit(batch.multinode("one-part", "", ranges=ranges))
 
 

@@ -317,7 +317,11 @@ def test_the_page_of_an_array_leads_to_its_jobs(console: Console, store: Store) 
     page = console.visitor().page(f"/jobs/{job}")
     found = [each["href"] for each in page.all("a") if f"{job}:" in str(each["href"])]
     assert found == [f"/jobs/{job}:{i}" for i in range(3)]
-    wait_for(lambda: console.visitor().page(f"/jobs/{job}").text.count("4 CPUs") == 3, 20, "the children's reasons")
+    wait_for(
+        lambda: console.visitor().page(f"/jobs/{job}").text.count("4 CPUs") == 4,
+        20,
+        "the reasons of the array and of its children",
+    )
     wait_for(lambda: "RUNNABLE" in console.visitor().page(f"/jobs/{job}:1").text, 20, "the child's reason")
     with pytest.raises(ApiError):
         console.client.get(f"/api/jobs/{job}:7")

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.engines.api import EngineError, Gang, NotYet
+from orchestrator.engines.api import CannotStart, EngineError, Gang, NotYet
 from orchestrator.engines.docker import engine as docker_engine
 from orchestrator.engines.docker.engine import DockerEngine
 from shared_store import __version__
@@ -292,7 +292,7 @@ def test_a_missing_image_fails_in_docker_s_words_and_leaves_nothing(bench: Docke
         except NotYet as wait:
             assert str(wait) == "pulling image muster-test-missing:1"
             return None
-        except EngineError as error:
+        except CannotStart as error:
             return str(error)
         raise AssertionError("it was launched")
 

@@ -82,11 +82,10 @@ def test_a_program_that_is_missing_is_the_reason_everywhere_but_in_the_batch_api
     assert found["statusReason"] == found["attempts"][0]["statusReason"] == f"main node: {own}"
     assert found["attempts"][0]["nodes"][0]["exitCode"] == 127
     shown = " ".join(shared_server.muster("show", job).stdout.split())
-    assert f"why: main node: {own} in AWS's API: Essential container in task exited" in shown
+    assert f"why: main node: {own} in AWS's API: Task failed to start" in shown
     assert f"main node: {own}" in shared_server.muster("list").stdout
     [described] = client.batch("DescribeJobs", jobs=[job])["jobs"]
-    assert described["statusReason"] == "Essential container in task exited"
-    assert described["attempts"][0]["statusReason"] == "Essential container in task exited"
+    assert described["statusReason"] == described["attempts"][0]["statusReason"] == "Task failed to start"
     run = Store(shared_server.home / "store").run(found["run"])
     assert [each.text for each in first_error(Chosen(run, job), {}).lines] == [own]
 

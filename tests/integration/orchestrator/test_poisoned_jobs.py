@@ -28,7 +28,18 @@ from orchestrator.domain.attempt_events import Event
 from orchestrator.domain.attempt_instructions import Instructions
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
-from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, NodePhase, NodeStatus, NotYet, Plan
+from orchestrator.domain.reasons import Reason
+from orchestrator.engines.api import (
+    CannotStart,
+    EngineError,
+    Gang,
+    GangStatus,
+    Handle,
+    NodePhase,
+    NodeStatus,
+    NotYet,
+    Plan,
+)
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
@@ -204,9 +215,25 @@ HALF = "a name with half a character: \udcff"
 def test_a_reason_that_no_column_can_hold_is_written_out(bench: Bench) -> None:
     bench.engine.raises["launch"] = EngineError(HALF)
     bench.submit("bad")
-    said = bench.wait("bad", Status.FAILED).status_reason
-    assert said == "can't start the gang: a name with half a character: \\udcff"
+    bench.wait("bad", Status.FAILED)
+    with bench.database.session() as session:
+        said = session.get_one(Job, "bad").reason
+    assert said.words == "can't start the gang: a name with half a character: \\udcff"
+    assert said.aws == "Task failed to start"
     bench.runs_and_ends("good")
+
+
+def test_a_container_that_the_engine_can_t_start_fails_each_attempt_and_rules_see_aws_s_reasons(bench: Bench) -> None:
+    pull = "CannotPullContainerError: no space left on device"
+    bench.engine.raises["launch"] = CannotStart(pull)
+    again = {"onStatusReason": "Task failed to start", "onReason": "CannotPullContainerError*", "action": "RETRY"}
+    bench.submit("bad", attempts_allowed=3, own_evaluate_on_exit=[again, {"onReason": "*", "action": "EXIT"}])
+    bench.wait("bad", Status.FAILED)
+    with bench.database.session() as session:
+        found = session.get_one(Job, "bad")
+        reasons = [(each.status_reason, each.nodes[0].reason) for each in found.attempts]
+        assert reasons == [("Task failed to start", pull)] * 3
+        assert found.reason == Reason(f"can't start the gang: {pull}", "Task failed to start")
 
 
 @pytest.mark.parametrize(

@@ -201,7 +201,7 @@ def test_a_command_that_can_not_be_started_is_reported_with_a_remedy(node: Nodes
     n = node(ranks_per_node=2)
     assert n.call(command, "argument") == 127
     reason = f"can't start {command!r}: {problem}; is it installed, and is the path right?"
-    assert (n.ended().exit_code, n.ended().reason) == (127, reason)
+    assert (n.ended().exit_code, n.ended().reason, n.ended().cannot_start) == (127, reason, True)
     assert n.lines() == [(None, "e", reason)]
 
 

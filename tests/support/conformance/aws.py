@@ -112,7 +112,8 @@ class Batch:
             self.api.delete_job_queue(jobQueue=queue)
         for compute_environment in compute_environments:
             self.api.update_compute_environment(computeEnvironment=compute_environment, state="DISABLED")
-        wait_for(lambda: not self.api.describe_job_queues(jobQueues=queues)["jobQueues"], 60, f"the end of {queues}")
+        gone = lambda: not queues or not self.api.describe_job_queues(jobQueues=queues)["jobQueues"]  # noqa: E731
+        wait_for(gone, 60, f"the end of {queues}")
         for compute_environment in compute_environments:
             self.api.delete_compute_environment(computeEnvironment=compute_environment)
 

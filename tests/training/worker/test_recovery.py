@@ -191,7 +191,7 @@ def test_what_can_not_be_counted_is_an_unknown_number(whole: Path, tmp_path: Pat
     losses, _ = kept_of(data[:start] + bytes(end - start) + data[end:], tmp_path)
     assert "an unknown number of messages lost" in losses
     (tmp_path / "zeros.mcap.partial").write_bytes(bytes(5000))
-    with pytest.raises(UserError, match="an unknown number of messages lost; there is no control step"):
+    with pytest.raises(UserError, match="it has no readable record of an MCAP file"):
         recover(tmp_path / "zeros.mcap.partial")
     _, end = next(records_of(data, 9))
     losses, (_, _, attachments) = kept_of(data[: end - 1] + b"\0" + data[end:], tmp_path)
@@ -217,6 +217,26 @@ def test_a_damaged_first_chunk_costs_its_messages_alone(whole: Path, tmp_path: P
         zeroed = data[: first + 9] + bytes(end - first - 9) + data[end:]
         code, kept, _ = recovered(zeroed, tmp_path, original)
         assert code == 1 and kept > 0.7 * sum(map(len, original.values()))
+
+
+def test_a_chunk_that_stands_there_twice_is_kept_once(whole: Path, tmp_path: Path) -> None:
+    data, original = whole.read_bytes(), messages_of(whole)
+    place, length = chunks_of(whole)[2]
+    twice = data[: place + length] + data[place : place + length] + data[place + length :]
+    code, kept, lines = recovered(twice, tmp_path, original, whole)
+    assert (code, kept) == (1, sum(map(len, original.values()))) and "damaged at 1 place" in lines
+
+
+def test_a_recording_without_its_meshes_is_recovered_and_the_view_says_that_it_can_t_draw_it(
+    whole: Path, tmp_path: Path
+) -> None:
+    data = bytearray(whole.read_bytes())
+    place, length = chunks_of(whole)[0]
+    data[place + length // 2] ^= 1
+    code, kept, _ = recovered(bytes(data), tmp_path, messages_of(whole))
+    assert code == 1 and kept
+    with pytest.raises(UserError, match="what its worlds look like"):
+        Replay(tmp_path / "f.mcap")
 
 
 def test_a_cut_anywhere_keeps_all_whole_chunks_and_is_no_damage(whole: Path, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_an_outcome_comes_back_with_its_fault(tmp_path: Path, fault: Fault | Non
 
 WRONG: list[dict[str, Any]] = [
     *({"exit_code": each} for each in (10**30, -1, 256, "1", True)),
-    *({"ended": -1e300}, {"ended": 1e300}, {"started": None}, {"reason": ["x"]}),
+    *({"ended": -1e300}, {"ended": 1e300}, {"started": None}, {"reason": ["x"]}, {"cannot_start": 1}),
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": "x"}},
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": {"type": "x"}}},

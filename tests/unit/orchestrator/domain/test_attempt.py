@@ -97,7 +97,8 @@ FROZEN = Verdict(Ending.LOST, "node 1 has been silent for 121 s: it hangs, or it
 UNHEARD_SO = Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC (none is heard)")
 QUIET_SO = Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC")
 LATE = Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
-REFUSED = Verdict(Ending.FATAL, "can't start the gang: no such image")
+REFUSED = Verdict(Ending.FATAL, "can't start the gang: no such image", start_error="no such image")
+DRIVER = "CannotStartContainerError: a driver"
 AWS_FAILED = Verdict(Ending.FAILED, AWS_EXITED, 1)
 GONE = Verdict(Ending.FAILED, "Host EC2 (instance h/0) terminated.")
 ROOMLESS = "attempt 2 runs on 2 of 4 nodes: there is no room for more"
@@ -125,7 +126,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "a run that can't be used is final": (
         PREPARING,
         PrepareRefused("it is damaged"),
-        [Decide(Verdict(Ending.FATAL, "it is damaged")), WindUp()],
+        [Decide(Verdict(Ending.FATAL, "it is damaged", start_error="it is damaged")), WindUp()],
     ),
     "while its run can't be read, others may have its room": (PREPARING, PrepareDelayed("away"), [Withdraw("away")]),
     "but not while a call on the store is under way": (PREPARING, Delayed("silent"), [Explain("silent")]),
@@ -154,8 +155,18 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "a refusal is final": (LAUNCHING, LaunchRefused("no such image"), [Decide(REFUSED), WindUp()]),
     "a start that failed is an attempt that failed": (
         LAUNCHING,
-        LaunchRefused("CannotStartContainerError: a driver", is_final=False),
-        [Decide(Verdict(Ending.FAILED, "CannotStartContainerError: a driver")), WindUp()],
+        LaunchRefused(DRIVER, is_final=False),
+        [Decide(Verdict(Ending.FAILED, DRIVER, start_error=DRIVER)), WindUp()],
+    ),
+    "on AWS it has AWS's reason": (
+        on_aws(LAUNCHING),
+        LaunchRefused(DRIVER, is_final=False),
+        [Decide(Verdict(Ending.FAILED, "Task failed to start", start_error=DRIVER)), WindUp()],
+    ),
+    "so has a refusal on AWS": (
+        on_aws(LAUNCHING),
+        LaunchRefused("no such image"),
+        [Decide(Verdict(Ending.FATAL, "Task failed to start", start_error="no such image")), WindUp()],
     ),
     "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),
     # -- what is told
@@ -307,6 +318,7 @@ def final(code: int, condition: dict[str, str]) -> State:
 REASON_3 = {"action": "EXIT", "onReason": "exit 3"}
 PERHAPS_ASKED = (replace(end(0), asked=None), None)
 NEVER_STARTED = ending(Ending.FAILED, of=LAUNCHING)
+REFUSED_ON_AWS = replace(LAUNCHING, verdict=Verdict(Ending.FAILED, "Task failed to start", start_error="why"))
 WHY = {"action": "EXIT", "onReason": "wh*"}
 BOTH_LEFT, MAIN_FAILED = (end(75), end(75)), (end(1), None)
 FAILED_LAST = with_terms(ending(Ending.FAILED), spent=2)
@@ -388,6 +400,22 @@ CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
         SPENT,
         S.FAILED,
         LAST_SO,
+    ),
+    "not started, on AWS": (
+        on_aws(with_terms(REFUSED_ON_AWS, conditions=[{"action": "EXIT", "onReason": "wh*"}])),
+        (),
+        SPENT,
+        S.RUNNABLE,
+        f"attempt 2 failed (Task failed to start){SAVED}; trying again",
+    ),
+    "not started, on AWS, for a reason that no retry mends": (
+        on_aws(
+            with_terms(REFUSED_ON_AWS, conditions=[{"action": "EXIT", "onReason": "CannotStartContainerError: why"}])
+        ),
+        (),
+        SPENT,
+        S.FAILED,
+        "Task failed to start",
     ),
     "fatal": (ending(Ending.FATAL), (), SPENT, S.FAILED, "why"),
     "over time": (ending(Ending.TIMEOUT), (), SPENT, S.FAILED, "why"),

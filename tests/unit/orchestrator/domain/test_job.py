@@ -14,9 +14,12 @@ from orchestrator.domain.job import (
     NodeEnd,
     RunTime,
     Status,
+    aws_ending,
     check_transition,
     container_reason,
+    has_exited,
     judge,
+    judge_as_aws,
 )
 
 S = Status
@@ -75,9 +78,34 @@ def test_a_job_has_run_as_long_as_its_attempts_together(
 
 
 def test_aws_s_words_for_an_end_are_found_within_other_words_and_others_are_not() -> None:
-    for words in ("Essential container in task exited", "Host EC2 (instance local/a-1) terminated."):
+    for words in (
+        "Essential container in task exited",
+        "Task failed to start",
+        "Host EC2 (instance local/a-1) terminated.",
+    ):
         assert AWS_ENDINGS.sub("X", f"attempt 1 failed ({words}); trying again") == "attempt 1 failed (X); trying again"
+        assert AWS_ENDINGS.search(f"main node: rank 0 exited with code 1: RuntimeError: {words}") is None
     assert AWS_ENDINGS.search("Job attempt duration exceeded timeout") is None
+
+
+NOT_STARTED = "Task failed to start"
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        ({}, (Ending.FAILED, "Essential container in task exited", 137)),
+        ({"lost": True}, (Ending.FAILED, "Host EC2 (instance a) terminated.", None)),
+        ({"cannot_start": True}, (Ending.FAILED, NOT_STARTED, None)),
+    ],
+)
+def test_on_aws_only_a_container_that_ran_to_its_end_has_an_exit_code(
+    facts: dict[str, bool], expected: tuple[Ending, str, int | None]
+) -> None:
+    end = NodeEnd(137, "its own words", 1.0, **facts)
+    verdict = judge_as_aws(0, (end, None), "a")
+    assert verdict and (verdict.ending, verdict.reason, verdict.exit_code) == expected
+    assert aws_ending(end, "a") == verdict.reason and has_exited(verdict.reason) is (verdict.exit_code is not None)
 
 
 RUNS, DONE, FAILED, LEFT = None, 0, 1, 75
@@ -167,7 +195,9 @@ def test_on_aws_only_the_main_node_matters_and_a_gang_never_goes_on_without_it()
         ("container exited with code 2", None, None),
         ("exit 0, outcome not written (OSError: x)", None, None),
         *((f"{name}Error: x", None, f"{name}Error: x") for name in ("OutOfMemory", "CannotPullContainer")),
-        ("can't start 'x': not there", None, "CannotStartContainerError: can't start 'x': not there"),
+        ("can't start 'x': not there", NOT_STARTED, "CannotStartContainerError: can't start 'x': not there"),
+        ("CannotPullContainerError: x", NOT_STARTED, "CannotPullContainerError: x"),
+        ("can't start 'x': a program's own words", "Essential container in task exited", None),
         ("the supervisor died", "Host EC2 (instance a) terminated.", "Host EC2 (instance a) terminated."),
     ],
 )

@@ -146,6 +146,7 @@ def test_aws_s_exit_code_and_reason_give_the_cause_of_a_node_s_end(
     from orchestrator.engines.aws_batch.engine import _ended
 
     check_end(_ended("10.0.0.1", code, reason), cause, code, reason)
+    check_end(_ended("10.0.0.1", None, reason, not_started=True), Cause.CANNOT_START, None, reason)
 
 
 @pytest.mark.parametrize(("status", "phase"), [("RUNNABLE", QUEUED), ("SUBMITTED", QUEUED), ("STARTING", STARTING)])
@@ -161,7 +162,7 @@ def test_a_node_that_aws_has_not_started_is_queued_until_it_has_an_instance(stat
     [
         *((Cause.EXIT, 3, False), (Cause.OUT_OF_MEMORY, 137, False), (Cause.STOPPED, 137, False)),
         *((None, None, False), (Cause.SIGNAL, 137, True), (Cause.HOST_LOST, None, True)),
-        (Cause.PREEMPTED, 75, True),
+        *((Cause.PREEMPTED, 75, True), (Cause.CANNOT_START, None, False)),
     ],
 )
 def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
@@ -170,6 +171,7 @@ def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
     for words in ("", "what the engine says"):
         end = seen_end(NodeStatus(ENDED, "", words, cause, code), True, 5.0)
         assert (end.lost, end.exit_code, end.ended) == (lost, code or 137, 5.0)
+        assert end.cannot_start is (cause is Cause.CANNOT_START)
         told = f"exit {code}, outcome not written{words and f' ({words})'}" if cause is Cause.EXIT else words
         assert end.reason == (told or "the supervisor died without an outcome")
     preempted = seen_end(NodeStatus(ENDED, "", "preempted by Slurm", Cause.PREEMPTED, 75), False, 5.0)
