@@ -473,7 +473,7 @@ def test_all_requirements_are_installed(tmp_path: Path) -> None:
 def test_a_controller_is_found(shared_server: Serving) -> None:
     found = json.loads(shared_server.muster("doctor", "--json").stdout)
     [controller] = [each for each in found if each["what"] == "controller"]
-    assert (controller["state"], controller["said"]) == ("ok", f"{shared_server.url}, engines local")
+    assert (controller["state"], controller["text"]) == ("ok", f"{shared_server.url}, engines local")
 
 
 def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
