@@ -62,7 +62,8 @@ class Client:
         if not _is_url(url):
             raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {EXAMPLE_URL}")
         self.url = url
-        self._found = False
+        self.found = False
+        """Whether it is the running controller of the home directory, which no URL named."""
         self.successor: Callable[[], Client] | None = None
         """Finds or starts another controller when this one is gone; None: the client waits for this one."""
         self.notify: Callable[[str], object] = lambda line: None
@@ -89,7 +90,7 @@ class Client:
                 f"such as {EXAMPLE_URL}"
             )
         client = cls(url, os.environ.get("MUSTER_TOKEN"))
-        client._found = found
+        client.found = found
         try:
             client.get("/healthz")
         except NotServing:
@@ -246,7 +247,7 @@ class Client:
         deadline, shown = time.monotonic() + seconds, ""
         while True:
             try:
-                url = None if self._found else self.url
+                url = None if self.found else self.url
                 successor = self.successor() if self.successor else Client.connect(url, serving=serving)
                 break
             except NotServing as error:

@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import secrets
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +26,9 @@ _DIRECTORIES = ("store", "supervisors", "kernels", "ray")
 _MADE_LATER = ("supervisors", "kernels")
 """Of these, those that are made by jobs or for them, who would make them open."""
 
+_PATIENCE = 10.0
+"""Seconds to wait for a controller that starts or ends, and for a command's temporary one."""
+
 log = logging.getLogger("muster.home")
 
 
@@ -35,24 +39,24 @@ def muster_home() -> Path:
 
 def local_url() -> str | None:
     """URL at which the controller of this home directory listens; None where it does not run."""
-    found = _published()
+    found = _published(muster_home())
     return str(found["url"]) if found else None
 
 
 def local_region() -> str:
     """The AWS region in the ARNs of this home directory's controller; the default one where it does not run."""
-    return str((_published() or {}).get("region") or "us-east-1")
+    return str((_published(muster_home()) or {}).get("region") or "us-east-1")
 
 
 def is_temporary() -> bool:
     """Whether the controller of this home directory goes away with the command that started it."""
-    return bool((_published() or {}).get("temporary"))
+    return bool((_published(muster_home()) or {}).get("temporary"))
 
 
-def _published() -> dict[str, Any] | None:
-    """What the controller of this home directory tells of itself; None where it does not run."""
+def _published(home: Path) -> dict[str, Any] | None:
+    """What the controller of a home directory tells of itself; None where it does not run, or not yet."""
     try:
-        found = json.loads((muster_home() / "controller.json").read_text())
+        found = json.loads((home / "controller.json").read_text())
         os.kill(int(found["pid"]), 0)
         return {"url": found["url"], "temporary": found.get("temporary"), "region": found.get("region")}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -114,20 +118,38 @@ class ControllerRuns(ServerError):
 
 
 class HomeLock:
-    """One controller a home directory: a lock that the kernel drops when the process dies, however it dies."""
+    """One controller a home directory: a lock that the kernel drops when the process dies, however it dies.
 
-    def __init__(self, home: Path) -> None:
+    Args:
+        home: The home directory.
+        temporary: For a command that could use another controller as well: it waits for its holder only until that listens, or is gone.
+            A server also waits for the temporary controller of such a command.
+
+    Raises:
+        ControllerRuns: Another one has it.
+        OSError: The directory can't be used.
+    """
+
+    def __init__(self, home: Path, temporary: bool = False) -> None:
         make_private(home)
         self.path = home / "controller.json"
         self._file: IO[str] = open(home / "controller.lock", "a")  # noqa: SIM115 - held until release()
+        until = time.monotonic() + _PATIENCE
+        while not self._taken():
+            holder = _published(home)
+            if (holder and (temporary or not holder["temporary"])) or time.monotonic() > until:
+                self._file.close()
+                raise ControllerRuns(
+                    f"{home}: already served by {describe_holder(home)}; use that one, stop it, or set MUSTER_HOME to another directory"
+                )
+            time.sleep(0.05)
+
+    def _taken(self) -> bool:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            self._file.close()
-            holder = describe_holder(home)
-            raise ControllerRuns(
-                f"{home}: already served by {holder}; use that one, stop it, or set MUSTER_HOME to another directory"
-            ) from None
+            return False
+        return True
 
     def publish(self, url: str, temporary: bool, region: str) -> None:
         """Tell commands on this machine where the controller listens, whether it goes away with the command that started it, and its AWS
@@ -139,8 +161,12 @@ class HomeLock:
         except OSError as error:
             log.warning("%s can't be written (%s); commands need MUSTER_URL=%s", self.path, error.strerror, url)
 
-    def release(self) -> None:
+    def withdraw(self) -> None:
+        """Commands find this controller no more, and wait for the lock."""
         self.path.unlink(missing_ok=True)
+
+    def release(self) -> None:
+        self.withdraw()
         self._file.close()
 
 

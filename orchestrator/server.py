@@ -111,7 +111,7 @@ class Server:
         self.access = Access(KeyStore(home), token, exposed=exposed, reachable=exposed, user=os.geteuid())
         _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
-            self._lock = _take_lock(home)
+            self._lock = _take_lock(home, temporary)
             stack.callback(self._lock.release)
             self.access.console_secret = console_secret(home)
             self._socket = _listen(host, port)
@@ -197,6 +197,7 @@ class Server:
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
+        self._lock.withdraw()
         self.app.state.closing.set()
         self._uvicorn.should_exit = True
         if self._thread.is_alive():
@@ -231,9 +232,9 @@ def _read_webhooks(source: str | None) -> Sequence[Webhook]:
         raise ServerError(str(error)) from None
 
 
-def _take_lock(home: Path) -> HomeLock:
+def _take_lock(home: Path, temporary: bool) -> HomeLock:
     try:
-        return HomeLock(home)
+        return HomeLock(home, temporary)
     except OSError as error:
         raise ServerError(
             f"{home}: can't be used ({error.strerror}); set MUSTER_HOME to a directory that can be written"

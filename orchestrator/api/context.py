@@ -191,17 +191,33 @@ def _absent(reconciler: Reconciler, name: str) -> ClientError:
     with reconciler.database.session() as session:
         query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
         job = session.scalars(query.limit(1)).first()
+        if job is not None and is_visible(job) and job.kind == "array":
+            return ClientError(f"run {name} does not exist: {_runs_of_array(session, job)}", 404)
         if job is not None and is_visible(job):
             over = Status(job.status).is_terminal
             what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
             return ClientError(f"run {name} does not exist: job {reasons.named(job.name, job.id)} {what}", 404)
         named = find_job(session, name, visible_queues())
+        if named is not None and named.kind == "array":
+            return ClientError(f"{name} is a job, not a run; {_runs_of_array(session, named)}", 404)
         if named is not None:
             return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
     runs = [each.name for each in visible_runs(reconciler, most=_COMPARED)]
     others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
     hint = nearest(name, runs, others, cutoff=0.3)
     return ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
+
+
+def _runs_of_array(session: Session, array: Job) -> str:
+    """The runs of an array's children, with the one to name first: of those that started, one that failed if there is one."""
+    failed_first = (Job.status != Status.FAILED, Job.array_index)
+    query = select(Job).where(Job.parent == array.id, Job.first_epoch.is_not(None)).order_by(*failed_first).limit(1)
+    if (first := session.scalars(query).first()) is None:
+        such = "none of them has started"
+    else:
+        such = f"name one, such as {first.run}" + (", which failed" if first.status == Status.FAILED else "")
+    last = (array.array_size or 1) - 1
+    return f"job {reasons.named(array.name, array.id)} is an array; its children have the runs {array.run}-0 to {array.run}-{last}; {such}"
 
 
 def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:

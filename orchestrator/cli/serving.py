@@ -254,7 +254,8 @@ def found_or_own(store: str | None, cpus: float | None, engines: Sequence[str] =
             f"--store {store}: there is no store here (no store.json), so no run; name the store of the run"
         )
     with controller(store, cpus, engines) as connect:
-        yield connect(), is_own
+        client = connect()
+        yield client, is_own and not client.found  # else another one was starting
 
 
 @contextlib.contextmanager
@@ -281,6 +282,10 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
     try:
         server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",), temporary=True)
     except ControllerRuns as error:
+        if local_url() not in (None, url):  # it was starting
+            with _controller(store, cpus, engines) as client:
+                yield client
+            return
         if url is None:
             raise
         raise Unreachable(

@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, TERMINAL
+from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import Job
 
 _NAMED = 5
@@ -45,6 +46,18 @@ def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, can
         note_changed(session, session.scalars(select(Job.id).where(asked)))
         changes = {"stop_reason": reason, "cancelled": cancel}
         session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
+
+
+def unknown_job(session: Session, reference: str, queues: Collection[str] | None = None) -> str:
+    """What to say where :func:`find_job`, with the same arguments, finds none."""
+    array, _, index = reference.rpartition(":")
+    parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
+    if parent is None:
+        return f"job {reference} does not exist; `muster list` shows the jobs"
+    job = f"job {named(parent.name, parent.id)}"
+    if parent.kind != "array":
+        return f"job {reference} does not exist: {job} is not an array"
+    return f"job {reference} does not exist: the children of {job} are 0 to {(parent.array_size or 1) - 1}"
 
 
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:

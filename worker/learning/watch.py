@@ -82,7 +82,7 @@ class Watch:
         if mean is None:
             return ""
         return (
-            f"it unlearns: mean return {mean:.2f}, below {FALLEN:.0%} of its gain for {PATIENCE} iterations; the best was "
+            f"it unlearns: its mean return over {WINDOW} iterations is {mean:.2f}, below {FALLEN:.0%} of its gain for {PATIENCE} iterations; the best was "
             f"{self._best:.2f} at iteration {self._best_at} ({THIS_RUN}best)"
         )
 
@@ -91,7 +91,7 @@ class Watch:
         if mean is None:
             return ""
         return (
-            f"it ended below its best: its mean return is {mean:.2f}; it was {self._best:.2f} at iteration {self._best_at}; "
+            f"it ended below its best: its mean return over {WINDOW} iterations is {mean:.2f}; it was {self._best:.2f} at iteration {self._best_at}; "
             f"try its best checkpoint: muster evaluate {THIS_RUN}best"
         )
 

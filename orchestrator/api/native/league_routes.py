@@ -27,7 +27,7 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.queries import find_job
+from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.spec.league_races import race_job
 from orchestrator.spec.settings import task_config
 from shared_store import bundles, leagues
@@ -386,9 +386,10 @@ def _checked(reconciler: Reconciler, league: League, model: Model) -> Checkpoint
 def _race_of(reconciler: Reconciler, league: League, reference: str) -> str:
     """Id of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
     with reconciler.database.session() as session:
-        job = find_job(session, reference, permissions.visible_queues())
+        queues = permissions.visible_queues()
+        job = find_job(session, reference, queues)
         if job is None:
-            raise ClientError(f"job {reference} does not exist; `muster list` shows the jobs", 404)
+            raise ClientError(unknown_job(session, reference, queues), 404)
         permissions.check(Operation.ENTER_LEAGUE, job)
         if job.status != Status.SUCCEEDED:
             raise ClientError(

@@ -49,7 +49,7 @@ from orchestrator.domain.reasons import named, short_id
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
-from orchestrator.persistence.queries import find_job
+from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
@@ -80,10 +80,10 @@ _HEARTBEAT = 5.0
 
 def permitted_job(session: Session, reference: str, operation: Operation) -> Job:
     """The job, where the caller may do this to it. Raises ClientError."""
-    job = find_job(session, reference, permissions.visible_queues())
+    queues = permissions.visible_queues()
+    job = find_job(session, reference, queues)
     if job is None:
-        hint = _jobs_of_run(session, reference) or f"job {reference} does not exist; `muster list` shows the jobs"
-        raise ClientError(hint, 404)
+        raise ClientError(_jobs_of_run(session, reference) or unknown_job(session, reference, queues), 404)
     permissions.check(operation, job)
     return job
 

@@ -238,6 +238,13 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
         assert f"{array}:2" in shared_server.muster("show", reference).stdout
     for missing in ("many:3", "many:x", "nosuch:0", f"{array[:8]}:1:1"):
         refused(["show", missing], shared_server.home, 2, f"job {missing} does not exist")
+    children = f"job many:3 does not exist: the children of job many ({array[:8]}) are 0 to 2"
+    refused(["show", "many:3"], shared_server.home, 2, children)
+    shared_server.wait(shared_server.gang("", name="lone"))
+    refused(["show", "lone:0"], shared_server.home, 2, "is not an array")
+    runs = f"its children have the runs many-{array[:8]}-0 to many-{array[:8]}-2; name one, such as many-{array[:8]}-0"
+    refused(["resume", f"many-{array[:8]}"], shared_server.home, 2, f"run many-{array[:8]} does not exist", runs)
+    refused(["resume", "many"], shared_server.home, 2, "many is a job, not a run", runs)
 
 
 def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(shared_server: Serving) -> None:
@@ -254,6 +261,8 @@ def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(share
     states = [(each["index"], each["status"]) for each in found["children"]]
     assert states == [*((i, "FAILED") for i in (1, 3, 5, 7)), *((i, "SUCCEEDED") for i in (0, 2, 4, 6, 8))]
     assert all(each["ranSeconds"] >= 0 for each in found["children"])
+    failed = f"name one, such as odd-{array[:8]}-1, which failed"
+    refused(["resume", f"odd-{array[:8]}"], shared_server.home, 2, failed)
     lines = shared_server.muster("show", array).stdout.splitlines()
     listed = [line.split(maxsplit=3) for line in lines if line.split()[1:2] in (["FAILED"], ["SUCCEEDED"])]
     assert [int(each[0]) for each in listed] == [1, 3, 5, 7, 0, 2, 4, 6, 8]
@@ -396,6 +405,28 @@ def test_resume_is_the_controller_itself_where_none_is_running(tmp_path: Path) -
     refused(["resume", "nosuch"], home, 2, "run nosuch does not exist in")
 
 
+def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"env": {**os.environ, "MUSTER_HOME": str(tmp_path)}, "stderr": subprocess.PIPE}
+    listing = [MUSTER, "tracks", "list", "--json"]
+    for order in ([True, False, False], [False, True, False]):
+        started = [
+            subprocess.Popen(
+                [MUSTER, "serve", "--port", "0"] if serves else listing, text=True, stdout=subprocess.PIPE, **options
+            )
+            for serves in order
+        ]
+        server = started[order.index(True)]
+        try:
+            for command in started:
+                if command is not server:
+                    said, errors = command.communicate(timeout=60 * PATIENCE)
+                    assert command.returncode == 0 and json.loads(said), errors
+            assert server.stdout is not None and server.stdout.readline().startswith("Muster serves http")
+        finally:
+            server.terminate()
+        assert server.communicate(timeout=60 * PATIENCE)[1] == "" and server.returncode == 0
+
+
 @pytest.mark.parametrize(
     ("node", "said"),
     [
@@ -442,7 +473,7 @@ def test_all_requirements_are_installed(tmp_path: Path) -> None:
 def test_a_controller_is_found(shared_server: Serving) -> None:
     found = json.loads(shared_server.muster("doctor", "--json").stdout)
     [controller] = [each for each in found if each["what"] == "controller"]
-    assert (controller["state"], controller["said"]) == ("ok", f"{shared_server.url}, engines local")
+    assert (controller["state"], controller["text"]) == ("ok", f"{shared_server.url}, engines local")
 
 
 def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_a_fall_below_the_share_of_the_gain_is_reported_after_fifty_iterations(f
     assert (first is not None) == reported and (not reported or 40 + 50 < first <= 60 + 50)
     if reported:
         assert found[-1] == [
-            "it unlearns: mean return 14.00, below 70% of its gain for 50 iterations; the best was 21.00 at iteration 40 (RUN@best)"
+            "it unlearns: its mean return over 20 iterations is 14.00, below 70% of its gain for 50 iterations; the best was 21.00 at iteration 40 (RUN@best)"
         ]
 
 
@@ -62,7 +62,7 @@ def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
     found = begun(watch(60), [*RISE, *([18.5] * 20)])
     assert not any(found[:-1])
     assert found[-1] == [
-        "it ended below its best: its mean return is 18.50; it was 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
+        "it ended below its best: its mean return over 20 iterations is 18.50; it was 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
     ]
     assert not any(begun(watch(60), [*RISE, *([20.0] * 20)]))
     shifted = [900.0 + value for value in (*RISE, *([15.0] * 20))]
@@ -109,7 +109,7 @@ def test_a_resumed_training_remembers_its_best_and_warns_once(
     printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
     assert len(printed) == 1 and "the best was 21.00 at iteration 40 (cart@best)" in printed[0]
     (kept,) = warnings_of(read_metrics(run)[-1], run.name)
-    assert kept.startswith("it unlearns: mean return 2.00, ") and kept.endswith("(cart@best)")
+    assert kept.startswith("it unlearns: its mean return over 20 iterations is 2.00, ") and kept.endswith("(cart@best)")
     assert "cart" not in str(read_metrics(run)), "records are the same whatever the run is called"
 
 

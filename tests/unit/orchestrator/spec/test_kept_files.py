@@ -251,6 +251,25 @@ def test_a_run_s_function_is_tried_anew_on_another_track() -> None:
     assert with_files(boxes, "evaluation of r", task="Racer", base=racer["train"]["config"]) == boxes
 
 
+def test_the_submitter_reads_why_a_function_is_not_compiled_whatever_the_command(directory: Path) -> None:
+    remembers = (
+        "class Memory:\n    last = 0.0\n\nmemory = Memory()\ndef reward_function(params):\n    return memory.last\n"
+    )
+    (directory / "mine.py").write_text(remembers)
+    trained = {"train": {"task": "Racer", "config": {"reward_function": {"file": "mine.py", "text": remembers}}}}
+    base: dict[str, Any] = trained["train"]["config"]  # type: ignore[assignment]
+    set_, resumed, evaluated = "train.config.reward_function=mine.py", list[str](), list[str]()
+    changes_with_files(lambda: {"train": {"task": "Racer"}}, [set_], no_text, note=resumed.append)
+    document = {"evaluate": {"config": {"track": "oval"}}}
+    with_files(document, "evaluation of r", task="Racer", base=base, note=evaluated.append)
+    submitted, in_console = specfile.load("job.yaml").notes, specfile.from_text(in_yaml(remembers), "job").notes
+    for notes in (submitted, in_console, resumed, evaluated):
+        (note,) = [each for each in notes if "no sandbox" not in each]
+        assert (
+            note.startswith("mine.py: line 6: an object of the class Memory: ") and "Python workers, hundreds" in note
+        )
+
+
 def test_a_long_function_of_a_run_is_fetched_and_tried_anew_on_another_track() -> None:
     kept = {"file": "mine.py", "sha256": digest_of(FAR)}
     racer = {"train": {"task": "Racer", "config": {"track": "chicane", "reward_function": kept}}}
