@@ -8,9 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from worker.racer.arithmetic import nearest
 from worker.racer.rewards.parameters import BY_NAME, MOST_OBJECTS, PARAMETERS, Point
 
 WIDTH = 1.07
@@ -88,6 +85,10 @@ class Line:
 
     def project(self, point: Point, is_reversed: bool) -> tuple[int, float, float]:
         """The segment, the way along the line and the distance [m] of the nearest place, as :func:`worker.racer.geometry.project` has them."""
+        import numpy as np  # not at the top: whoever reads a task's settings imports this
+
+        from worker.racer.arithmetic import nearest
+
         (row,), (share,) = nearest(np.array(self.points), np.array([point]), closed=False)
         segment, last = int(row), len(self.points) - 2
         if not is_reversed and share >= 1.0 and (self.closed or segment < last):
