@@ -236,7 +236,7 @@ def run_worker(module: str, *arguments: str, run: str = "") -> int:
     if find_spec("newton") is None:
         raise ServerError("this needs the simulation on this machine: pip install 'muster[worker]'")
     store = {"MUSTER_STORE": str(Path(run).parents[1])} if run else {}
-    ignored = [number for number in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_IGN]
+    ignored = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else []  # nohup
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])  # until it can be passed on
     started = start_tied([sys.executable, "-P", "-m", module, *arguments], ignored, env={**os.environ, **store})
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends Ctrl-C to both

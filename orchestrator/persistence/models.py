@@ -199,8 +199,7 @@ class Job(Base):
 
     @property
     def gang(self) -> GangSpec:
-        """Its commands and resources, from its definition; read once for all children of an array. Raises ValueError if the definition is
-        damaged."""
+        """Commands and resources, from its definition; read once for an array. Raises ValueError if the definition is damaged."""
         return gangs.of((self.array or self).id, self.node_properties)
 
     @property
@@ -220,9 +219,8 @@ class Job(Base):
         text = self.status_reason or ""
         if AWS_ENDINGS.search(text) and self.attempts:
             return Reason(self.attempts[-1].in_own_words(text), text)
-        if self.kind == "array" and self.status == Status.FAILED and self.stop_reason is None:
-            return Reason(text, AWS_CHILD_FAILED)
-        return Reason.plain(text)
+        of_children = self.kind == "array" and self.status == Status.FAILED and self.stop_reason is None
+        return Reason(text, AWS_CHILD_FAILED if of_children else text)
 
     @property
     def is_terminal(self) -> bool:
