@@ -130,7 +130,8 @@ def test_a_training_survives_two_workers_and_the_controller(cluster: Cluster, do
     def iteration() -> int:
         return ((cluster.ask(f"/api/jobs/{job}") or {}).get("progress") or {}).get("iteration", 0)
 
-    wait_for(lambda: iteration() >= 5, 180, "some iterations")
+    run = wait_for(lambda: cluster.ask(f"/api/jobs/{job}"), 60, "the job")["run"]
+    wait_for(lambda: iteration() >= 5 and cluster.ask(f"/api/runs/{run}/checkpoints"), 180, "a checkpoint")
     mine = {"label": [f"com.docker.compose.project={cluster.project}", "com.docker.compose.service=worker"]}
     first, second = random.sample(docker_client.containers.list(filters=mine), 2)
     os.kill(first.attrs["State"]["Pid"], signal.SIGKILL)  # a crash: the container comes back by itself
