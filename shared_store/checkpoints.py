@@ -285,7 +285,7 @@ class CheckpointWriter:
                 retain(self.run, keep)
             # every rank's writer takes its saves in order: no rank still works on an earlier, failed one
             sweep(self.run, up_to=(self.epoch, self.iteration))
-            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode())
+            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode(), parents=False)
         return Checkpoint(target, self.iteration, self.epoch)
 
     def _write_manifest(self, facts: Mapping[str, Any], digests: Mapping[str, Any] | None) -> None:
@@ -304,7 +304,7 @@ class CheckpointWriter:
             "created": time.time(),
             "files": files,
         }
-        write_json(self.path / "manifest.json", {**facts, **manifest})
+        write_json(self.path / "manifest.json", {**facts, **manifest}, parents=False)
 
 
 def retain(run: Run, keep: int) -> list[str]:

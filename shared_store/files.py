@@ -51,12 +51,18 @@ def sync_directory(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_atomic(path: Path, data: bytes, mode: int = 0o666) -> None:
+def write_atomic(path: Path, data: bytes, mode: int = 0o666, *, parents: bool = True) -> None:
     """Replace ``path`` with ``data`` atomically. Raises OSError; a failed write leaves no file behind.
 
-    ``mode``: permissions, less the umask, from the first instant; 0o600 for secrets.
+    Args:
+        path: The file.
+        data: Its content.
+        mode: Permissions, less the umask, from the first instant; 0o600 for secrets.
+        parents: Make the directories that are missing. False for files of a run that exists: where its volume is gone, they would be
+            made in its mount point, and vanish when it is back.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if parents:
+        path.parent.mkdir(parents=True, exist_ok=True)
     hidden = path.parent / f".{path.name}.{uuid.uuid4().hex[:8]}.tmp"
     try:
         with open(hidden, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
@@ -70,9 +76,9 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o666) -> None:
     sync_directory(path.parent)
 
 
-def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666) -> None:
+def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666, *, parents: bool = True) -> None:
     """:func:`write_atomic` for a JSON document."""
-    write_atomic(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode(), mode)
+    write_atomic(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode(), mode, parents=parents)
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:

@@ -164,6 +164,16 @@ def test_an_uncommitted_checkpoint_is_not_listed_and_one_that_is_gone_can_not_be
 # -- order and choice -------------------------------------------------------------------------------------------------
 
 
+def test_nothing_is_committed_into_the_mount_point_of_a_volume_that_is_gone(run: Run) -> None:
+    writer = CheckpointWriter(run, 50, 1)
+    away = run.path.rename(run.path.with_name("away"))
+    with pytest.raises(FileNotFoundError):
+        writer.commit({}, None, {"rank-0.pt": {"size": 0, "sha256": ""}})
+    assert not run.path.exists()
+    away.rename(run.path)
+    assert commit(run, 50).name == "00000050-e1"
+
+
 def test_latest_is_only_a_hint_and_a_later_epoch_is_newer_whatever_its_iteration(run: Run) -> None:
     commit(run, 25)
     commit(run, 50)
