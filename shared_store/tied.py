@@ -1,7 +1,7 @@
 """Runs a command that dies with the process that started it: ``python -I -S tied.py PARENT IGNORED GROUP COMMAND ...``.
 
-It is no shell, which would drop variables of the environment that have names that it can't have itself, such as ``my.var``. It is a
-program of its own, not a ``preexec_fn``: Python must not run between fork and exec in a process with threads, since a thread
+It is not a shell: a shell drops environment variables with names that it does not allow, such as ``my.var``. It is a separate program,
+not a ``preexec_fn``: Python must not run between fork and exec in a process with threads, since a thread
 that the child lacks may hold one of Python's locks (seen with CPython 3.11: child and parent wait forever). Linux only.
 """
 

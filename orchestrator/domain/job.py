@@ -142,7 +142,7 @@ AWS_EXITED = "Essential container in task exited"
 AWS_NOT_STARTED = "Task failed to start"
 """The same for one whose main container could not be started."""
 AWS_CHILD_FAILED = "Array Child Job failed"
-"""AWS Batch's reason for an array of which children failed."""
+"""AWS Batch's reason for an array with failed children."""
 
 
 _OF_AWS = re.compile(r"[A-Z][A-Za-z]*Error: ")

@@ -38,7 +38,7 @@ def recover(partial: Path) -> Recovered | None:
     if not partial.exists():
         raise UserError(f"{partial}: there is no such file; a recording that was cut short ends on .mcap{PARTIAL}")
     if not partial.is_file():
-        raise UserError(f"{partial}: it is no file; a recording that was cut short ends on .mcap{PARTIAL}")
+        raise UserError(f"{partial}: it is not a file; a recording that was cut short ends on .mcap{PARTIAL}")
     if not os.access(partial, os.R_OK):
         raise UserError(f"{partial}: it can't be read (Permission denied)")
     name = partial.name.removesuffix(PARTIAL)

@@ -146,7 +146,7 @@ def children_of(reconciler: Reconciler, session: Session, array: Job) -> list[di
 
 
 def reason_of(reconciler: Reconciler, session: Session, job: Job) -> Reason:
-    """Why a job is in its state; of an array of which children wait: how many, and why the first of them does."""
+    """Why a job is in its state. For an array with waiting children: how many wait, and why the first one does."""
     own = reconciler.admission.reason(job)
     if job.kind != "array" or own.words != array_of(job.array_size):
         return own

@@ -346,7 +346,7 @@ def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tm
     lost, failed = detail["attempts"]
     assert lost["statusReason"].startswith("Host EC2 (instance ") and lost["statusReason"].endswith(") terminated.")
     assert lost["container"]["reason"] == lost["statusReason"]
-    assert "exitCode" not in lost["container"], "nobody has seen it, and no rule matches it"
+    assert "exitCode" not in lost["container"], "a lost host reports no exit code, and no rule matches one"
     assert (failed["container"]["exitCode"], failed["statusReason"]) == (3, EXITED)
     assert "reason" not in failed["container"]
     assert detail["status"] == "FAILED"

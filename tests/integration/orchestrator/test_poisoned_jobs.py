@@ -217,9 +217,9 @@ def test_a_reason_that_no_column_can_hold_is_written_out(bench: Bench) -> None:
     bench.submit("bad")
     bench.wait("bad", Status.FAILED)
     with bench.database.session() as session:
-        said = session.get_one(Job, "bad").reason
-    assert said.words == "can't start the gang: a name with half a character: \\udcff"
-    assert said.aws == "Task failed to start"
+        reason = session.get_one(Job, "bad").reason
+    assert reason.words == "can't start the gang: a name with half a character: \\udcff"
+    assert reason.aws == "Task failed to start"
     bench.runs_and_ends("good")
 
 

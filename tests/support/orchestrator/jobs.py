@@ -10,7 +10,7 @@ from typing import Any
 
 from orchestrator.client import Client
 from orchestrator.server import Server
-from tests.conftest import Serving
+from tests.conftest import REPOSITORY, Serving, call_muster
 from tests.support.waiting import wait_for
 
 FOREVER = "import time; time.sleep(600)"
@@ -60,3 +60,13 @@ def refusal(server: Serving, *arguments: str, code: int = 2) -> str:
     assert done.returncode == code and len(done.stderr.splitlines()) == 1, (done.returncode, done.stdout, done.stderr)
     wait_for(lambda: there() == before, 10, "nothing that is left")  # a copy is deleted after the answer
     return done.stderr
+
+
+def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str) -> None:
+    """The command exits with ``code`` and one line on stderr that holds all ``parts``."""
+    done = call_muster(*arguments, home=home, cwd=REPOSITORY, **env)
+    assert done.returncode == code, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1 and "Traceback" not in done.stderr, done.stderr
+    for part in parts:
+        assert part in lines[0], f"{part!r} is not in: {lines[0]}"

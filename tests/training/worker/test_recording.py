@@ -266,6 +266,6 @@ def test_a_file_other_than_a_recording_is_not_recovered(tmp_path: Path) -> None:
         recover(tmp_path / "text.mcap.partial")
     with pytest.raises(UserError, match="there is no such file"):
         recover(tmp_path / "nothing.mcap.partial")
-    with pytest.raises(UserError, match="it is no file"):
+    with pytest.raises(UserError, match="it is not a file"):
         recover(tmp_path)
     assert [each.name for each in tmp_path.iterdir()] == ["text.mcap.partial"]

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.domain.attempt import CAUSE_PATIENCE, FINISHING, SHORTEST_REQUEUE, UNHEARD, Phase, State, Terms, step
+from orchestrator.domain.attempt import CAUSE_PATIENCE, FINISHING, SHORTEST_REQUEUE, UNHEARD, State, Terms, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -43,7 +43,7 @@ from orchestrator.domain.attempt_instructions import (
     Withdraw,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON
-from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions
 
 T = 1_000_000
@@ -428,42 +428,9 @@ def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
     assert step(state, Gone(T, ends, SAVED)) == (Close(T, spent, status, reason),)
 
 
-EVENTS = (
-    *(
-        Due(),
-        Prepared(7),
-        PrepareDelayed("why"),
-        PrepareRefused("why"),
-        Launched("handle"),
-        LaunchDelayed("why", False),
-        LaunchRefused("why"),
-        Preempted("why"),
-        seen(),
-    ),
-    *(Delayed("why"), Gone(T, MAIN_LAST, "")),
-)
-
-
 def test_a_long_reason_leaves_room_for_the_fault_that_came_again() -> None:
     state = faulty(FAULT)
     long = replace(state, verdict=replace(FAILED, reason="y" * 5000, fault=FAULT))
     (close,) = step(long, Gone(T, MAIN_FAILED, SAVED))
     assert isinstance(close, Close) and close.reason.endswith(REPEATED_SO.removeprefix("why"))
     assert len(close.reason) == LONGEST_REASON and close.reason.startswith("yyyy")
-
-
-@pytest.mark.parametrize("policy", ["restart", "ignore", "fail"])
-def test_the_fault_of_the_node_that_was_the_cause_is_the_attempts(policy: str) -> None:
-    main, child = end(1, fault=FAULT), replace(end(1, fault=OTHER), ended=2.0)
-    verdict = judge(policy, 0, (main, child))
-    assert verdict is not None and verdict.fault == FAULT
-    late = judge(policy, 0, (replace(main, ended=3.0), child))
-    assert late is not None and late.fault == (FAULT if policy == "ignore" else OTHER)
-    aws = judge_as_aws(0, (main, child), "host")
-    assert aws is not None and aws.fault is None
-
-
-@pytest.mark.parametrize("event", EVENTS, ids=lambda event: type(event).__name__)
-def test_nothing_follows_from_an_event_of_a_closed_attempt(event: Event) -> None:
-    closed = replace(ending(Ending.FAILED), closed=True)
-    assert closed.phase is Phase.CLOSED and step(closed, event) == ()

@@ -7,7 +7,20 @@ from dataclasses import replace
 import pytest
 
 from orchestrator.domain.attempt import SHORTEST_REQUEUE, Phase, State, Terms, after, step
-from orchestrator.domain.attempt_events import Gone, Observed
+from orchestrator.domain.attempt_events import (
+    Delayed,
+    Due,
+    Event,
+    Gone,
+    LaunchDelayed,
+    Launched,
+    LaunchRefused,
+    Observed,
+    Preempted,
+    Prepared,
+    PrepareDelayed,
+    PrepareRefused,
+)
 from orchestrator.domain.attempt_instructions import (
     AwaitCause,
     AwaitChildren,
@@ -64,3 +77,25 @@ def test_what_is_known_after_each_instruction() -> None:
     assert after(RUNNING, Decide(verdict)) == replace(RUNNING, verdict=verdict)
     assert after(RUNNING, Close(9, True, Status.FAILED, "why")) == replace(RUNNING, closed=True)
     assert after(RUNNING, Explain("why")) == RUNNING
+
+
+EVENTS = (
+    *(
+        Due(),
+        Prepared(7),
+        PrepareDelayed("why"),
+        PrepareRefused("why"),
+        Launched("handle"),
+        LaunchDelayed("why", False),
+        LaunchRefused("why"),
+        Preempted("why"),
+        Observed(2000, (None, None), (None, None)),
+    ),
+    *(Delayed("why"), Gone(2000, (NodeEnd(0, "exit 0", 1.0), NodeEnd(0, "exit 0", 1.0)), "")),
+)
+
+
+@pytest.mark.parametrize("event", EVENTS, ids=lambda event: type(event).__name__)
+def test_nothing_follows_from_an_event_of_a_closed_attempt(event: Event) -> None:
+    closed = replace(RUNNING, verdict=Verdict(Ending.FAILED, "why"), closed=True)
+    assert closed.phase is Phase.CLOSED and step(closed, event) == ()

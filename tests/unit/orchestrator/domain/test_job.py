@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
@@ -205,3 +206,15 @@ def test_the_reason_of_a_container_is_the_one_that_aws_gives(
     reason: str | None, status_reason: str | None, shown: str | None
 ) -> None:
     assert container_reason(reason, status_reason) == shown
+
+
+@pytest.mark.parametrize("policy", ["restart", "ignore", "fail"])
+def test_the_fault_of_the_node_that_was_the_cause_is_the_attempts(policy: str) -> None:
+    here, there = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
+    main, child = NodeEnd(1, "exit 1", 1.0, fault=here), NodeEnd(1, "exit 1", 2.0, fault=there)
+    verdict = judge(policy, 0, (main, child))
+    assert verdict is not None and verdict.fault == here
+    late = judge(policy, 0, (replace(main, ended=3.0), child))
+    assert late is not None and late.fault == (here if policy == "ignore" else there)
+    aws = judge_as_aws(0, (main, child), "host")
+    assert aws is not None and aws.fault is None
