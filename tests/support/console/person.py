@@ -70,10 +70,11 @@ class Person:
         self.page.wait_for_url(lambda url: url != before)
 
     def confirm(self) -> None:
-        """Say yes to the question that the page asks."""
+        """Say yes to the question that the page asks, and wait for the server's answer: to leave earlier could keep the yes from being sent."""
         dialog = self.page.get_by_role("dialog")
         expect(dialog).to_be_visible()
-        dialog.locator("button.danger").click()
+        with self.page.expect_response(lambda answer: answer.request.method == "POST"):
+            dialog.locator("button.danger").click()
         expect(dialog).to_be_hidden()
 
     def picture(self, name: str) -> Path:
