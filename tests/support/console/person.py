@@ -70,7 +70,7 @@ class Person:
         self.page.wait_for_url(lambda url: url != before)
 
     def confirm(self) -> None:
-        """Say yes to the question that the page asks, and wait for the server's answer: to leave earlier could keep the yes from being sent."""
+        """Say yes to the question that the page asks. The yes is sent after the click: leaving the page before its answer could lose it."""
         dialog = self.page.get_by_role("dialog")
         expect(dialog).to_be_visible()
         with self.page.expect_response(lambda answer: answer.request.method == "POST"):
