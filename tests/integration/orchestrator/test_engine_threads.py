@@ -141,8 +141,8 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
         handle = launched(several, gang(tmp_path))
         wait_for(lambda: observed(several, handle), 10, "the first picture")
         for error, said in (
-            (OSError(errno.EMFILE, "Too many"), "can't look at the gang now ([Errno 24] Too many)"),
-            (RuntimeError("no\nwords"), "failed to look at the gang (RuntimeError: no words)"),
+            (OSError(errno.EMFILE, "Too many"), "can't look at its gangs now ([Errno 24] Too many)"),
+            (RuntimeError("no\nwords"), "failed to look at its gangs (RuntimeError: no words)"),
         ):
             fake.error = error
             [node] = wait_for(
@@ -156,7 +156,7 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
         fake.error = None
         wait_for(lambda: (s := observed(several, handle)) and not s[0].words, 20, "that it is seen again")
         assert [node.running for node in several.stop(handle, 0)] == [False]
-    looks = [record for record in caplog.records if "look at the gang" in record.getMessage()]
+    looks = [record for record in caplog.records if "look at its gangs" in record.getMessage()]
     assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
 
 
