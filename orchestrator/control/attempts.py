@@ -7,8 +7,8 @@ its ending before the gang is stopped. A controller that starts on the database 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
 from functools import partial
 from math import inf
 from typing import Any
@@ -81,6 +81,11 @@ _LEAST, _LATER = 0.02, 60.0
 """Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
 
 
+Steps = Generator[Callable[[], None], None, None]
+"""What is done to an attempt, up to each commit: at a ``yield`` what has changed is to be committed, and then the value to be called. So
+many attempts share a commit, and everything is recorded before it is done."""
+
+
 @dataclass
 class _Memory:
     """Facts about an attempt that its row does not hold, until it is closed."""
@@ -92,6 +97,14 @@ class _Memory:
     """As in :class:`orchestrator.domain.attempt.State`."""
     progress: Progress | None = None
     """What the run holds once the gang is stopped."""
+    uncommitted: list[Callable[[], None]] = field(default_factory=list)
+    """What the metrics are to note after the next commit."""
+
+    def committed(self) -> None:
+        """Follows each commit."""
+        for note in self.uncommitted:
+            note()
+        self.uncommitted = []
 
 
 class Attempts:
@@ -124,7 +137,7 @@ class Attempts:
         self._errands.close()
         self._stops.close()
 
-    def begin(self, session: Session, job: Job, start: Start) -> None:
+    def begin(self, session: Session, job: Job, start: Start) -> Steps:
         """Record a new attempt, and go on with it: after a crash in between, the next controller goes on from there."""
         number, nodes = len(job.attempts) + 1, new_nodes(start.placements)
         attempt = Attempt(
@@ -139,16 +152,17 @@ class Attempts:
         record_logs(session, job, nodes)
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {self._state(job, attempt).terms.size}")
-        session.commit()
-        self._happened(session, job, attempt, Due())
+        yield self._memory(attempt).committed
+        yield from self._happened(session, job, attempt, Due())
 
-    def advance(self, session: Session, job: Job, attempt: Attempt) -> float:
-        """One look at an open attempt; returns the seconds until the next one, if nothing changes."""
-        self._happened(session, job, attempt, Due())
-        return self._pause(job, attempt) if attempt in job.attempts else _LATER
+    def advance(self, session: Session, job: Job, attempt: Attempt) -> Steps:
+        """One look at an open attempt."""
+        yield from self._happened(session, job, attempt, Due())
 
-    def _pause(self, job: Job, attempt: Attempt) -> float:
+    def pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
+        if attempt not in job.attempts:
+            return _LATER
         key, state = (job.id, attempt.number), self._state(job, attempt)
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
@@ -166,15 +180,23 @@ class Attempts:
             pause = _LATER
         return min(max(min(pause, self._errands.pause(key) or inf), 0.0) + _LEAST, _LATER)
 
-    def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
+    def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> Steps:
         """Have an open attempt end in favour of another job."""
-        self._happened(session, job, attempt, Preempted(reason))
+        yield from self._happened(session, job, attempt, Preempted(reason))
 
-    def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> None:
+    def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> Steps:
         """Carry out the instructions that follow from an event, and from the events that these cause."""
         for instruction in step(self._state(job, attempt), event):
-            if (then := self._carry_out(session, job, attempt, instruction)) is not None:
-                self._happened(session, job, attempt, then)
+            match instruction:
+                case Save():
+                    yield self._memory(attempt).committed
+                case Withdraw(reason):
+                    yield self._withdraw(job, attempt, reason)
+                case Close():
+                    yield self._close(session, job, attempt, instruction)
+                case _:
+                    if (then := self._carry_out(session, job, attempt, instruction)) is not None:
+                        yield from self._happened(session, job, attempt, then)
 
     def _state(self, job: Job, attempt: Attempt) -> State:
         memory, gang = self._memory(attempt), job.gang
@@ -222,10 +244,8 @@ class Attempts:
             case TakeEpoch(epoch):
                 attempt.epoch = epoch
                 waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
-                self.monitoring.begun(session, job, attempt, waited / 1000)
+                self._memory(attempt).uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
                 job.first_epoch = job.first_epoch or epoch
-            case Withdraw(reason):
-                self._withdraw(session, job, attempt, reason)
             case Launch(again):
                 return self._launch(session, job, attempt, again)
             case Keep(handle):
@@ -233,7 +253,8 @@ class Attempts:
             case Observe():
                 return self._observer.observe(job, attempt)
             case Explain(reason):
-                job.status_reason = reason
+                if job.status_reason != reason:
+                    job.status_reason = reason
             case MarkRunning(reason, moment):
                 self._mark_running(session, job, attempt, reason, moment)
             case AwaitCause(since):
@@ -245,14 +266,10 @@ class Attempts:
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
                 if verdict.start_error is not None:
                     attempt.nodes[job.gang.main].reason = verdict.start_error
-            case Save():
-                session.commit()
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
                 return Gone(self.clock.now(), [], "")
-            case Close():
-                self._close(session, job, attempt, instruction)
         return None
 
     def _prepare(
@@ -362,12 +379,16 @@ class Attempts:
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
         return Gone(self.clock.now(), self._observer.ends(job, attempt, status), progress)
 
-    def _withdraw(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
+    def _withdraw(self, job: Job, attempt: Attempt, reason: str) -> Callable[[], None]:
+        """Give the room back; returns what follows the commit."""
+
+        def withdrawn() -> None:
+            self._forget(job, attempt)
+            self.withdrawn(job.id, reason)
+
         job.attempts.remove(attempt)
         job.move(Status.RUNNABLE, reason)
-        session.commit()
-        self._forget(job, attempt)
-        self.withdrawn(job.id, reason)
+        return withdrawn
 
     def _forget(self, job: Job, attempt: Attempt) -> None:
         key, release = (job.id, attempt.number), partial(self.runs.release, job.run)
@@ -376,22 +397,27 @@ class Attempts:
         self._errands.forget(key, job.run, release, attempt.epoch if attempt.epoch != NO_EPOCH else None)
         self._observer.forget(key)
 
-    def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> None:
+    def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> Callable[[], None]:
+        """Record the end; returns what follows the commit."""
+
+        def closed() -> None:
+            memory.committed()
+            self._forget(job, attempt)
+            self.bus.forget(job.id, attempt.number)
+            self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
+
         memory = self._memory(attempt)
         ran = close.moment - (attempt.running_since or close.moment)
         attempt.started_at = attempt.started_at or now()
         attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
         attempt.spent = close.spent
         charge(attempt, memory.progress.saved if memory.progress else None, close.moment)
-        self.monitoring.ended(session, job, attempt)
+        memory.uncommitted.append(self.monitoring.ended(job, attempt))
         self._charge_share(session, job, attempt, close.moment)
         job.move(close.status, close.reason)
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
-        session.commit()
-        self._forget(job, attempt)
-        self.bus.forget(job.id, attempt.number)
-        self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
+        return closed
 
     @staticmethod
     def _charge_share(session: Session, job: Job, attempt: Attempt, moment: int) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from sqlalchemy import update
 from sqlalchemy.orm import Session
 
+from orchestrator.control.attempts import Steps
 from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
@@ -16,6 +17,9 @@ from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.columns import storable
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
+
+AT_ONCE = 200
+"""Jobs that share their commits, at most: one that fails has all of them done again, each by itself."""
 
 log = logging.getLogger("muster.controller")
 
@@ -44,17 +48,17 @@ class Isolation:
         except Exception as error:
             self.backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
-    def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
-        """Do something to these jobs in one commit; where that fails, to each by itself. Returns the jobs for which it failed.
+    def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
+        """Do something to these jobs, with commits that they share; where that fails, to each by itself. Returns those for which it failed.
 
-        Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
+        They are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
         """
         self._heartbeat.beat()
         try:
             with self._loaded.session() as session:
-                for job in self._loaded.jobs(session, ids).values():
-                    body(session, job)
+                begun = [body(session, job) for job in self._loaded.jobs(session, ids).values()]
+                _finish(session, [steps for steps in begun if steps is not None])
         except DatabaseError:
             raise
         except Exception as error:
@@ -77,6 +81,16 @@ class Isolation:
                 )
                 session.execute(explained)
             self._loaded.changed([job_id])
+
+
+def _finish(session: Session, steps: Sequence[Steps]) -> None:
+    """Carry all of them out, up to the next commit of each in turn."""
+    while steps:
+        reached = [(each, then) for each in steps if (then := next(each, None)) is not None]
+        session.commit()
+        for _, then in reached:
+            then()
+        steps = [each for each, _ in reached]
 
 
 def _words(error: Exception) -> str:

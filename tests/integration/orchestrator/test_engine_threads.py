@@ -38,6 +38,7 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.engines.toolkit.looks import status_of
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.transience import is_final
 from orchestrator.spec.compile import compile_definition
@@ -174,7 +175,7 @@ def test_without_descriptors_no_gang_counts_as_dead_and_no_half_gang_is_started(
                 while True:
                     taken.append(os.open("/dev/null", os.O_RDONLY))
             with pytest.raises(OSError, match="Too many open files"):
-                engine.observe(read_handle(handle))
+                status_of(engine, read_handle(handle))
             for spare in range(12):  # wherever it runs out of them
                 for descriptor in taken[-spare:] if spare else []:
                     os.close(descriptor)
