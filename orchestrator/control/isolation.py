@@ -35,6 +35,8 @@ class Isolation:
         """Whether its volume is full; jobs are ended all the same."""
         self.backoff = Backoff(log)
         """Failures, by the part of the pass, or by the action on a job and the job's id."""
+        self.before: Callable[[Session, Sequence[Job]], None] = lambda session, jobs: None
+        """Called with the jobs that are worked on next."""
 
     def part(self, what: str, body: Callable[[], None]) -> None:
         """Carry out one part of a pass."""
@@ -57,7 +59,9 @@ class Isolation:
         self._heartbeat.beat()
         try:
             with self._loaded.session() as session:
-                begun = [body(session, job) for job in self._loaded.jobs(session, ids).values()]
+                jobs = self._loaded.jobs(session, ids)
+                self.before(session, list(jobs.values()))
+                begun = [body(session, job) for job in jobs.values()]
                 _finish(session, [steps for steps in begun if steps is not None])
         except DatabaseError:
             raise
@@ -86,7 +90,8 @@ class Isolation:
 def _finish(session: Session, steps: Sequence[Steps]) -> None:
     """Carry all of them out, up to the next commit of each in turn."""
     while steps:
-        reached = [(each, then) for each in steps if (then := next(each, None)) is not None]
+        with session.no_autoflush:  # none reads what another one has changed
+            reached = [(each, then) for each in steps if (then := next(each, None)) is not None]
         session.commit()
         for _, then in reached:
             then()

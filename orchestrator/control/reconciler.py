@@ -112,11 +112,15 @@ class Reconciler:
         database.committed = self._committed
         database.changed = self._look_again
         self._swept = self._kept = 0.0
+        self._kept_version = -1
+        self._is_draining = True
+        """Whether a deleted queue may still be there."""
         self._wake, self._ending = threading.Event(), threading.Event()
         self._ticking: int | None = None
         """The thread that makes a pass now."""
         self._isolation = Isolation(database, self._loaded, self.heartbeat)
         self._backoff = self._isolation.backoff
+        self._isolation.before, self._loaded.reread = self.attempts.share, self.attempts.forget_states
         self.admission = Admission(
             engine,
             self.disk,
@@ -204,10 +208,11 @@ class Reconciler:
     def _pass(self) -> None:
         self.database.reserve_connections()
         self._keep_database()
-        with self.database.session() as session:
-            if self.clock.stepped:
-                self.clock.note_step(session)
-            self.work_queue.take_dependents(session)
+        if self.clock.stepped or self.work_queue.has_ended:
+            with self.database.session() as session:
+                if self.clock.stepped:
+                    self.clock.note_step(session)
+                self.work_queue.take_dependents(session)
         taken = self.work_queue.take_due(_SETTLED_A_TICK)
         due = [job_id for job_id in taken if not self._backoff.waits(("settle", job_id))]
         self.work_queue.look_again(job_id for job_id in taken if self._backoff.waits(("settle", job_id)))
@@ -215,7 +220,9 @@ class Reconciler:
             self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), AT_ONCE):
             self.work_queue.look_again(self._isolation.jobs("settle", due[start : start + AT_ONCE], self._settle))
-        self._loaded.keep(self.work_queue.active())
+        if self._kept_version != self.work_queue.version:
+            self._kept_version = self.work_queue.version
+            self._loaded.keep(self.work_queue.active())
         self.engine.look()
         self._look_at_gangs()
         self._note_silence()
@@ -307,7 +314,8 @@ class Reconciler:
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
 
     def drain(self, session: Session, queue: JobQueue) -> None:
-        """Ask all jobs of a queue to end."""
+        """Ask all jobs of a queue to end; it goes with the last of them."""
+        self._is_draining = True
         ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
     def _sweep(self) -> None:
@@ -325,11 +333,26 @@ class Reconciler:
 
     def _clear_away(self) -> None:
         self._backoff.tidy()
-        with self.database.session() as session:
-            for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
-                busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
-                if session.scalars(busy).first() is None:
-                    session.delete(queue)
-            if self.retention is not None:
+        if self._is_draining:
+            left = True
+            try:
+                with self.database.session() as session:
+                    left = _delete_drained(session)
+            finally:
+                self._is_draining = left
+        if self.retention is not None:
+            with self.database.session() as session:
                 # by the clock that is behind: nothing is forgotten too early
                 forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
+
+
+def _delete_drained(session: Session) -> bool:
+    """Delete the queues that are to go and have no open job; returns whether others are left."""
+    left = False
+    for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
+        busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
+        if session.scalars(busy).first() is None:
+            session.delete(queue)
+        else:
+            left = True
+    return left

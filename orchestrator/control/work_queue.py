@@ -109,6 +109,11 @@ class WorkQueue:
             if self._active.get(job) == inf:
                 self._active[job] = moment
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether jobs have ended since the last :meth:`take_dependents`."""
+        return bool(self._ended)
+
     def take_dependents(self, session: Session) -> None:
         """Make the jobs due that depend on jobs that ended since the last call."""
         with self._lock:

@@ -200,7 +200,11 @@ class Job(Base):
     @property
     def gang(self) -> GangSpec:
         """Commands and resources, from its definition; read once for an array. Raises ValueError if the definition is damaged."""
-        return gangs.of((self.array or self).id, self.node_properties)
+        properties, known = self.node_properties, self.__dict__.get("_gang")
+        if known is None or known[0] is not properties:
+            known = self.__dict__["_gang"] = properties, gangs.of((self.array or self).id, properties)
+        gang: GangSpec = known[1]
+        return gang
 
     @property
     def open_attempt(self) -> Attempt | None:

@@ -1,0 +1,56 @@
+"""Changed columns of many rows in one statement a kind of change: the unit of work would send one statement a row."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+from sqlalchemy import Update, bindparam, update
+from sqlalchemy.orm import InstanceState, Session, attributes
+
+from orchestrator.persistence.models import Attempt, Job, Node
+
+_BATCHED: tuple[type[Any], ...] = (Job, Attempt, Node)
+"""Tables whose rows change together. Their keys never change."""
+
+
+def write_changes(session: Session) -> Sequence[Any]:
+    """Write the changed columns of the rows that are in the database; returns their objects. What else has changed is left to the flush."""
+    groups: dict[tuple[type[Any], tuple[str, ...]], list[InstanceState[Any]]] = defaultdict(list)
+    for each in session.dirty:
+        if isinstance(each, _BATCHED):
+            state: InstanceState[Any] = attributes.instance_state(each)
+            columns = state.mapper.column_attrs.keys()
+            changed = tuple(key for key in columns if key in state.committed_state and _differs(state, key))
+            if changed:
+                groups[type(each), changed].append(state)
+    for (kind, changed), states in groups.items():
+        statement, keys = _statement(kind, changed)
+        rows = [
+            {**{f"key_{name}": state.dict[name] for name in keys}, **{name: state.dict[name] for name in changed}}
+            for state in states
+        ]
+        session.connection().execute(statement, rows)
+        for state in states:
+            for name in changed:
+                attributes.set_committed_value(state.obj(), name, state.dict[name])
+    return [state.obj() for states in groups.values() for state in states]
+
+
+def _differs(state: InstanceState[Any], key: str) -> bool:
+    """Whether a column that was set has another value than before."""
+    before = state.committed_state[key]
+    return key in state.dict and (before is attributes.NO_VALUE or before != state.dict[key])
+
+
+@cache
+def _statement(kind: type[Any], changed: tuple[str, ...]) -> tuple[Update, Sequence[str]]:
+    """An update of these attributes by the primary key, whose parts are named ``key_…``; and these parts."""
+    mapper = attributes.manager_of_class(kind).mapper
+    keys = [mapper.get_property_by_column(column).key for column in mapper.primary_key]
+    table = mapper.local_table
+    where = [column == bindparam(f"key_{key}") for key, column in zip(keys, mapper.primary_key, strict=True)]
+    values = {mapper.columns[name].name: bindparam(name) for name in changed}
+    return update(table).where(*where).values(values), keys
