@@ -183,8 +183,8 @@ class Attempts:
 
     def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> Steps:
         """Carry out the instructions that follow from an event, and from the events that these cause."""
-        for instruction in step(self._state(job, attempt), event):
-            state = self._state(job, attempt)
+        state = self._state(job, attempt)
+        for instruction in step(state, event):
             match instruction:
                 case Save():
                     yield self._memory(attempt).committed
@@ -197,6 +197,7 @@ class Attempts:
                     self._states[job.id] = after(state, instruction)
                     if then is not None:
                         yield from self._happened(session, job, attempt, then)
+                    state = self._state(job, attempt)
 
     def share(self, session: Session, jobs: Sequence[Job]) -> None:
         """These jobs are worked on next: what their attempts share is read once."""

@@ -22,11 +22,12 @@ def write_changes(session: Session) -> Sequence[Any]:
     for each in session.dirty:
         if isinstance(each, _BATCHED):
             state: InstanceState[Any] = attributes.instance_state(each)
-            columns = state.mapper.column_attrs.keys()
-            changed = tuple(key for key in columns if key in state.committed_state and _differs(state, key))
+            columns = _columns(type(each))
+            changed = tuple(sorted(key for key in state.committed_state if key in columns and _differs(state, key)))
             if changed:
                 groups[type(each), changed].append(state)
     for (kind, changed), states in groups.items():
+        columns = _columns(kind)
         statement, keys = _statement(kind, changed)
         rows = [
             {**{f"key_{name}": state.dict[name] for name in keys}, **{name: state.dict[name] for name in changed}}
@@ -34,8 +35,10 @@ def write_changes(session: Session) -> Sequence[Any]:
         ]
         session.connection().execute(statement, rows)
         for state in states:
-            for name in changed:
-                attributes.set_committed_value(state.obj(), name, state.dict[name])
+            if all(key in columns for key in state.committed_state):
+                state._commit_all(state.dict, session.identity_map)  # nothing is left for the flush; there is no public way
+            else:
+                state._commit(state.dict, changed)
     return [state.obj() for states in groups.values() for state in states]
 
 
@@ -43,6 +46,12 @@ def _differs(state: InstanceState[Any], key: str) -> bool:
     """Whether a column that was set has another value than before."""
     before = state.committed_state[key]
     return key in state.dict and (before is attributes.NO_VALUE or before != state.dict[key])
+
+
+@cache
+def _columns(kind: type[Any]) -> frozenset[str]:
+    """Names of the attributes that are columns."""
+    return frozenset(attributes.manager_of_class(kind).mapper.column_attrs.keys())
 
 
 @cache
