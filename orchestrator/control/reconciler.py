@@ -262,6 +262,7 @@ class Reconciler:
     def _take_up(self, session: Session) -> None:
         """Read the jobs, and expect the nodes of all open attempts, and of no other."""
         self.work_queue.load(session)
+        self.database.counts.load(session)
         found = {(job.id, attempt.number): attempt for job, attempt in open_attempts(session, self.work_queue.active())}
         expected = self.bus.presence.expected()
         for closed in expected - found.keys():

@@ -27,6 +27,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import Unavailable
+from orchestrator.persistence.job_counts import JobCounts, note_counts
 from orchestrator.persistence.models import Attempt, Job
 from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
 from orchestrator.persistence.updates import write_changes
@@ -67,6 +68,8 @@ class Database:
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
         self.ended: Callable[[Session, Job], None] | None = None
         """Called with each job that a transaction ends, before it is written: what it adds to the session is committed with that."""
+        self.counts = JobCounts()
+        """Of its jobs, once they are loaded."""
         self._lock: Connection | None = None
         self._file_lock: IO[bytes] | None = None
         self._damage: str | None = None
@@ -369,6 +372,7 @@ class _Session(Session):
 def _tell(session: Session) -> None:
     jobs, ids = session.info.pop("jobs", None), session.info.pop("ids", None)
     database = session.info["database"]
+    database.counts.add(session.info.pop("counts", {}))
     if jobs and database.committed:
         database.committed(list(jobs.values()))
     if ids and database.changed:
@@ -379,6 +383,7 @@ def _tell(session: Session) -> None:
 def _forget(session: Session) -> None:
     session.info.pop("jobs", None)
     session.info.pop("ids", None)
+    session.info.pop("counts", None)
 
 
 @event.listens_for(_Session, "before_flush")
@@ -387,6 +392,7 @@ def _write_changes(session: Session, _context: object, _instances: object) -> No
         for each in list(session.dirty):
             if isinstance(each, Job) and each.is_terminal and inspect(each).attrs.status.history.has_changes():
                 ended(session, each)
+    note_counts(session)
     _note_jobs(session, write_changes(session))
 
 

@@ -36,7 +36,9 @@ def write_changes(session: Session) -> Sequence[Any]:
         session.connection().execute(statement, rows)
         for state in states:
             if all(key in columns for key in state.committed_state):
-                state._commit_all(state.dict, session.identity_map)  # nothing is left for the flush; there is no public way
+                state._commit_all(
+                    state.dict, session.identity_map
+                )  # nothing is left for the flush; there is no public way
             else:
                 state._commit(state.dict, changed)
     return [state.obj() for states in groups.values() for state in states]
