@@ -93,7 +93,7 @@ def read_page(
     return Page(jobs, is_first=after is None, is_last=not more)
 
 
-def _ordered(session: Session, query: Select[tuple[Job]], backwards: bool) -> Sequence[Job]:
+def _ordered(session: Session, query: Select[Job], backwards: bool) -> Sequence[Job]:
     keys = (Job.created_at, Job.id) if backwards else (Job.created_at.desc(), Job.id.desc())
     return session.scalars(query.order_by(*keys).options(selectinload(Job.attempts))).all()
 

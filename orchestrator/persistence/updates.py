@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
-from sqlalchemy import Update, bindparam, update
-from sqlalchemy.orm import InstanceState, Session, attributes
+from sqlalchemy import Table, Update, bindparam, update
+from sqlalchemy.orm import InstanceState, LoaderCallableStatus, Session, attributes
 
 from orchestrator.persistence.models import Attempt, Job, Node
 
@@ -18,14 +18,15 @@ _BATCHED: tuple[type[Any], ...] = (Job, Attempt, Node)
 
 def write_changes(session: Session) -> Sequence[Any]:
     """Write the changed columns of the rows that are in the database; returns their objects. What else has changed is left to the flush."""
-    groups: dict[tuple[type[Any], tuple[str, ...]], list[InstanceState[Any]]] = defaultdict(list)
+    groups: dict[tuple[Any, tuple[str, ...]], list[InstanceState[Any]]] = defaultdict(list)
     for each in session.dirty:
         if isinstance(each, _BATCHED):
             state: InstanceState[Any] = attributes.instance_state(each)
-            columns = _columns(type(each))
+            kind: Any = type(each)
+            columns = _columns(kind)
             changed = tuple(sorted(key for key in state.committed_state if key in columns and _differs(state, key)))
             if changed:
-                groups[type(each), changed].append(state)
+                groups[kind, changed].append(state)
     for (kind, changed), states in groups.items():
         columns = _columns(kind)
         statement, keys = _statement(kind, changed)
@@ -47,21 +48,21 @@ def write_changes(session: Session) -> Sequence[Any]:
 def _differs(state: InstanceState[Any], key: str) -> bool:
     """Whether a column that was set has another value than before."""
     before = state.committed_state[key]
-    return key in state.dict and (before is attributes.NO_VALUE or before != state.dict[key])
+    return key in state.dict and (before is LoaderCallableStatus.NO_VALUE or before != state.dict[key])
 
 
 @cache
-def _columns(kind: type[Any]) -> frozenset[str]:
+def _columns(kind: Any) -> frozenset[str]:
     """Names of the attributes that are columns."""
     return frozenset(attributes.manager_of_class(kind).mapper.column_attrs.keys())
 
 
 @cache
-def _statement(kind: type[Any], changed: tuple[str, ...]) -> tuple[Update, Sequence[str]]:
+def _statement(kind: Any, changed: tuple[str, ...]) -> tuple[Update, Sequence[str]]:
     """An update of these attributes by the primary key, whose parts are named ``key_…``; and these parts."""
     mapper = attributes.manager_of_class(kind).mapper
     keys = [mapper.get_property_by_column(column).key for column in mapper.primary_key]
-    table = mapper.local_table
+    table = cast(Table, mapper.local_table)
     where = [column == bindparam(f"key_{key}") for key, column in zip(keys, mapper.primary_key, strict=True)]
-    values = {mapper.columns[name].name: bindparam(name) for name in changed}
+    values: dict[str, Any] = {mapper.columns[name].name: bindparam(name) for name in changed}
     return update(table).where(*where).values(values), keys
