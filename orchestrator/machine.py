@@ -111,6 +111,10 @@ class Machine:
         """Unix time [s]."""
         return time.time()
 
+    def processor_time(self) -> float:
+        """Processor time that the present thread has used [s]."""
+        return time.thread_time()
+
     def boot(self) -> str:
         """An identifier of this boot of the machine: it stays while the monotonic clock runs."""
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -156,6 +160,11 @@ def monotonic() -> float:
 def wall() -> float:
     """Unix time [s]."""
     return _current.wall()
+
+
+def processor_time() -> float:
+    """Processor time that the present thread has used [s]."""
+    return _current.processor_time()
 
 
 @dataclass(frozen=True)

@@ -57,12 +57,13 @@ def list_jobs(
 def _newest(client: Client, queue: str | None, all_: bool, automatic: bool) -> list[dict[str, Any]]:
     """The newest jobs, at least 20 if there are so many, or all. Unless ``automatic``, automatic evaluations do not count."""
     found: list[dict[str, Any]] = []
+    after = ""
     while True:
-        page = client.get("/api/jobs", queue=queue, offset=len(found), max=_AT_ONCE, progress=False)
+        page = client.get("/api/jobs", queue=queue, after=after, max=_AT_ONCE, progress=False)
         # the ids and names as the AWS Batch API has them, too: scripts use both
         found += [{"jobId": each["id"], "jobName": each["name"], **each} for each in page["jobs"]]
         counting = sum(automatic or not each[_AUTOMATIC] for each in found)
-        if len(page["jobs"]) < _AT_ONCE or (not all_ and counting >= _NEWEST):
+        if (after := page["next"]) is None or (not all_ and counting >= _NEWEST):
             return found
 
 

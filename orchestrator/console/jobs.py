@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
 
+from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.errors import ClientError
@@ -51,23 +52,27 @@ class _Choice:
     filter: Mapping[str, str]
     """``state``, ``queue`` and ``search``; empty for all."""
     wanted: Wanted
-    page: int
+    after: str
+    before: str
+    """The place of the page."""
 
 
 def _choice(
     state: str = Query(default="", max_length=20),
     queue: str = Query(default="", max_length=128),
     search: str = Query(default="", max_length=_LONGEST),
-    page: int = Query(default=1, ge=1, le=10**6),
+    after: str = Query(default="", max_length=_LONGEST),
+    before: str = Query(default="", max_length=_LONGEST),
 ) -> _Choice:
-    return _Choice({"state": state, "queue": queue, "search": search}, _wanted(state, queue, search), page)
+    chosen = {"state": state, "queue": queue, "search": search}
+    return _Choice(chosen, _wanted(state, queue, search), after, before)
 
 
 @router.get("/")
 def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The table."""
-    reconciler, chosen, page = reconciler_of(request), choice.filter, choice.page
-    rows, totals = _window(reconciler, choice.wanted, page)
+    reconciler, chosen = reconciler_of(request), choice.filter
+    rows, totals = _window(reconciler, choice)
     with reconciler.database.session() as session:
         queues = queue_names(session)
     return render(
@@ -79,16 +84,15 @@ def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
         groups=[(name, name or "all", _address(**{**chosen, "state": name})) for name in GROUPS],
         queues=queues,
         chosen=chosen,
-        live=f"/jobs/stream?{urlencode({**chosen, 'page': page})}",
-        earlier=_address(**chosen, page=str(page - 1)) if page > 1 else "",
-        later=_address(**chosen, page=str(page + 1)),
+        live=f"/jobs/stream?{urlencode({**chosen, 'after': choice.after, 'before': choice.before})}",
+        newest=_address(**chosen) if choice.after or choice.before else "",
     )
 
 
 @router.get("/jobs/stream")
 def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The changes in a window of the table, as events."""
-    table, look = Rows(), partial(_window, reconciler_of(request), choice.wanted, choice.page)
+    table, look = Rows(), partial(_window, reconciler_of(request), choice)
 
     def changes() -> Sequence[Event]:
         return table.changes(*look())
@@ -131,22 +135,25 @@ def _wanted(state: str, queue: str, search: str) -> Wanted:
     return Wanted(GROUPS[state], queue, search)
 
 
-def _window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Rows of a page of the table, by id, and the totals; open pages with the same choice share them."""
-    key = (id(reconciler), current_identity.get(), wanted, page)
-    return _recent.get(key, partial(_read_window, reconciler, wanted, page))
+def _window(reconciler: Reconciler, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Rows of a page of the table, by id, and the totals; open pages of all who see the same queues share them."""
+    seen = permissions.visible_queues()
+    key = (id(reconciler), None if seen is None else tuple(sorted(seen)), choice.wanted, choice.after, choice.before)
+    return _recent.get(key, partial(_read_window, reconciler, choice))
 
 
-def _read_window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    start = (page - 1) * ROWS
-    found = page_of_jobs(reconciler, wanted, start, ROWS)
+def _read_window(reconciler: Reconciler, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    found = page_of_jobs(reconciler, choice.wanted, ROWS, choice.after, choice.before)
     rows = {job["id"]: _row(job) for job in found["jobs"]}
-    total, counts = found["total"], found["counts"]
+    counts = found["counts"]
     totals = {
         name or "all": str(sum(counts.get(each, 0) for each in states or Status)) for name, states in GROUPS.items()
     }
-    shown = f"{start + 1}–{start + len(rows)} of {total}" if rows else ""
-    return rows, {**totals, "shown": shown, "more": "yes" if start + len(rows) < total else ""}
+    beside = {
+        "newer": _address(**choice.filter, before=found["previous"] or "") if found["previous"] else "",
+        "older": _address(**choice.filter, after=found["next"] or "") if found["next"] else "",
+    }
+    return rows, {**totals, **beside, "shown": f"{len(rows)} of {found['total']}" if rows else ""}
 
 
 def _row(job: Mapping[str, Any]) -> dict[str, Any]:
@@ -181,7 +188,7 @@ def _row(job: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _address(state: str = "", queue: str = "", search: str = "", page: str = "") -> str:
-    given = {"state": state, "queue": queue, "search": search, "page": page if page != "1" else ""}
+def _address(state: str = "", queue: str = "", search: str = "", after: str = "", before: str = "") -> str:
+    given = {"state": state, "queue": queue, "search": search, "after": after, "before": before}
     query = urlencode({name: value for name, value in given.items() if value})
     return f"/?{query}" if query else "/"

@@ -212,7 +212,7 @@ def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
     """The newest races of a league that the caller may see, by job, without those that are entered."""
     reconciler = reconciler_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
-    jobs = page_of_jobs(reconciler, Wanted(search=begins), 0, _READ)["jobs"]
+    jobs = page_of_jobs(reconciler, Wanted(search=begins), _READ)["jobs"]
     if not jobs:
         return {}
     described = batch.call(reconciler, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]

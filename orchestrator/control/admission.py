@@ -9,10 +9,10 @@ from functools import partial
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.attempts import Attempts
+from orchestrator.control.attempts import Attempts, Steps
 from orchestrator.control.clock import Clock
 from orchestrator.control.disk import Disk
-from orchestrator.control.isolation import Isolation
+from orchestrator.control.isolation import AT_ONCE, Isolation
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.snapshot import holding_of, take_snapshot
@@ -101,31 +101,32 @@ class Admission:
 
     def _carry_out(self, decisions: Decisions) -> None:
         """Carry out each decision by itself: one that fails does not stop the others."""
-        bodies: list[tuple[str, str, Callable[[Session, Job], None]]] = [
-            *(("cancel", each.job, partial(self._cancel, each)) for each in decisions.cancels),
-            *(("preempt", each.job, partial(self._preempt, each)) for each in decisions.preempts),
-            *(("start", each.job, partial(self._start, each)) for each in decisions.starts),
-        ]
-        for what, job_id, body in bodies:
-            if not self._backoff.waits((what, job_id)):
-                self._isolation.jobs(what, [job_id], body)
+        self._do("cancel", {each.job: partial(self._cancel, each) for each in decisions.cancels})
+        self._do("preempt", {each.job: partial(self._preempt, each) for each in decisions.preempts})
+        self._do("start", {each.job: partial(self._start, each) for each in decisions.starts})
+
+    def _do(self, what: str, bodies: Mapping[str, Callable[[Session, Job], Steps | None]]) -> None:
+        due = [job_id for job_id in bodies if not self._backoff.waits((what, job_id))]
+        for start in range(0, len(due), AT_ONCE):
+            self._isolation.jobs(what, due[start : start + AT_ONCE], lambda session, job: bodies[job.id](session, job))
 
     @staticmethod
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
         job.cancelled, job.stop_reason = True, cancel.reason
 
-    def _preempt(self, preempt: Preempt, session: Session, job: Job) -> None:
+    def _preempt(self, preempt: Preempt, session: Session, job: Job) -> Steps | None:
         by = session.get_one(Job, preempt.by)
-        if attempt := job.open_attempt:
-            self._attempts.preempt(session, job, attempt, f"preempted by job {named(by.name, by.id)}")
-            self._work_queue.hurry(job.id)
+        if (attempt := job.open_attempt) is None:
+            return None
+        self._work_queue.hurry(job.id)
+        return self._attempts.preempt(session, job, attempt, f"preempted by job {named(by.name, by.id)}")
 
-    def _start(self, start: Start, session: Session, job: Job) -> None:
+    def _start(self, start: Start, session: Session, job: Job) -> Steps | None:
         # a request may have ended the job since the snapshot was taken
         if job.status == Status.RUNNABLE and job.stop_reason is None:
-            self._attempts.begin(session, job, start)
-        else:
-            self._work_queue.look_again([job.id])
+            return self._attempts.begin(session, job, start)
+        self._work_queue.look_again([job.id])
+        return None
 
     def reason(self, job: Job) -> Reason:
         """Why a job is in its state: why it waits now, a note for its user while it runs, how it ended."""

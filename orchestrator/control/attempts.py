@@ -7,19 +7,18 @@ its ending before the gang is stopped. A controller that starts on the database 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from typing import Any
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
+from orchestrator.control.attempt_rows import GRACE, NO_EPOCH, SharedRows, state_of
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
-from orchestrator.control.compute_environments import engine_options
 from orchestrator.control.kept_texts import KeptTexts, references_of
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import CHECK_INTERVAL, Observer
@@ -27,7 +26,7 @@ from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefus
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
-from orchestrator.domain.attempt import FINISHING, Phase, State, Terms, step
+from orchestrator.domain.attempt import FINISHING, Phase, State, after, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -60,25 +59,26 @@ from orchestrator.domain.attempt_instructions import (
     Withdraw,
 )
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.job import Ending, Status, Verdict
+from orchestrator.domain.job import Status
 from orchestrator.engines.api import CannotStart, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.log_groups import record_logs
-from orchestrator.persistence.models import Attempt, Job, JobQueue, SchedulingPolicy, now
+from orchestrator.persistence.models import Attempt, Job, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
 from shared_store.epoch import Claim
 
 log = logging.getLogger("muster.controller")
 
-GRACE = 30.0
-"""Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
-NO_EPOCH = 0
-"""Of an attempt that has none yet."""
 _READERS = 16
 """Threads for the store. An open attempt has one call there at most, and of a run's closed attempts only the last one has any."""
 _LEAST, _LATER = 0.02, 60.0
 """Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
+
+
+Steps = Generator[Callable[[], None], None, None]
+"""What is done to an attempt, up to each commit: at a ``yield`` what has changed is to be committed, and then the value to be called. So
+many attempts share a commit, and everything is recorded before it is done."""
 
 
 @dataclass
@@ -92,6 +92,14 @@ class _Memory:
     """As in :class:`orchestrator.domain.attempt.State`."""
     progress: Progress | None = None
     """What the run holds once the gang is stopped."""
+    uncommitted: list[Callable[[], None]] = field(default_factory=list)
+    """What the metrics are to note after the next commit."""
+
+    def committed(self) -> None:
+        """Follows each commit."""
+        for note in self.uncommitted:
+            note()
+        self.uncommitted = []
 
 
 class Attempts:
@@ -115,6 +123,8 @@ class Attempts:
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
         self.texts = texts
         self._memories: dict[tuple[str, int], _Memory] = {}
+        self._states: dict[str, State] = {}
+        """Of the open attempts, by job: what :func:`state_of` makes of the rows as they are."""
         self._errands = Errands(machine.pool("store", _READERS), str(runs.store.path), changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
         self._stops = Stops(engine, changed, log)
@@ -124,7 +134,7 @@ class Attempts:
         self._errands.close()
         self._stops.close()
 
-    def begin(self, session: Session, job: Job, start: Start) -> None:
+    def begin(self, session: Session, job: Job, start: Start) -> Steps:
         """Record a new attempt, and go on with it: after a crash in between, the next controller goes on from there."""
         number, nodes = len(job.attempts) + 1, new_nodes(start.placements)
         attempt = Attempt(
@@ -139,16 +149,17 @@ class Attempts:
         record_logs(session, job, nodes)
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {self._state(job, attempt).terms.size}")
-        session.commit()
-        self._happened(session, job, attempt, Due())
+        yield self._memory(attempt).committed
+        yield from self._happened(session, job, attempt, Due())
 
-    def advance(self, session: Session, job: Job, attempt: Attempt) -> float:
-        """One look at an open attempt; returns the seconds until the next one, if nothing changes."""
-        self._happened(session, job, attempt, Due())
-        return self._pause(job, attempt) if attempt in job.attempts else _LATER
+    def advance(self, session: Session, job: Job, attempt: Attempt) -> Steps:
+        """One look at an open attempt."""
+        yield from self._happened(session, job, attempt, Due())
 
-    def _pause(self, job: Job, attempt: Attempt) -> float:
+    def pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
+        if attempt not in job.attempts:
+            return _LATER
         key, state = (job.id, attempt.number), self._state(job, attempt)
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
@@ -166,51 +177,44 @@ class Attempts:
             pause = _LATER
         return min(max(min(pause, self._errands.pause(key) or inf), 0.0) + _LEAST, _LATER)
 
-    def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
+    def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> Steps:
         """Have an open attempt end in favour of another job."""
-        self._happened(session, job, attempt, Preempted(reason))
+        yield from self._happened(session, job, attempt, Preempted(reason))
 
-    def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> None:
+    def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> Steps:
         """Carry out the instructions that follow from an event, and from the events that these cause."""
-        for instruction in step(self._state(job, attempt), event):
-            if (then := self._carry_out(session, job, attempt, instruction)) is not None:
-                self._happened(session, job, attempt, then)
+        state = self._state(job, attempt)
+        for instruction in step(state, event):
+            match instruction:
+                case Save():
+                    yield self._memory(attempt).committed
+                case Withdraw(reason):
+                    yield self._withdraw(job, attempt, reason)
+                case Close():
+                    yield self._close(session, job, attempt, instruction)
+                case _:
+                    then = self._carry_out(session, job, attempt, instruction)
+                    self._states[job.id] = after(state, instruction)
+                    if then is not None:
+                        yield from self._happened(session, job, attempt, then)
+                    state = self._state(job, attempt)
+
+    def share(self, session: Session, jobs: Sequence[Job]) -> None:
+        """These jobs are worked on next: what their attempts share is read once."""
+        self._rows = SharedRows(session, jobs)
+
+    def forget_states(self, jobs: Iterable[str]) -> None:
+        """The rows of these jobs were read anew."""
+        for job_id in jobs:
+            self._states.pop(job_id, None)
 
     def _state(self, job: Job, attempt: Attempt) -> State:
-        memory, gang = self._memory(attempt), job.gang
-        terms = Terms(
-            number=attempt.number,
-            hosts=[node.host for node in attempt.nodes],
-            whole=len(gang.nodes),
-            main=gang.main,
-            options=gang.options,
-            grace=GRACE,
-            timeout=job.timeout,
-            allowed=job.attempts_allowed,
-            spent=sum(1 for each in job.attempts if each.spent and each is not attempt),
-            conditions=job.evaluate_on_exit,
-            last_fault=next(
-                (each.fault for each in reversed(job.attempts) if each.spent and each is not attempt), None
-            ),
-        )
-        verdict = None
-        if attempt.ending is not None:
-            ending, reason = Ending(attempt.ending), attempt.status_reason or ""
-            main = attempt.node(gang.main)
-            error = main.reason if main is not None and attempt.handle is None else None
-            verdict = Verdict(ending, reason, attempt.exit_code, fault=attempt.fault, start_error=error)
-        return State(
-            terms,
-            prepared=attempt.epoch != NO_EPOCH,
-            launched=attempt.handle is not None,
-            started=job.status != Status.STARTING,
-            running_since=attempt.running_since,
-            verdict=verdict,
-            stop_reason=job.stop_reason,
-            cause_since=memory.cause_since,
-            done_since=memory.done_since,
-            closed=attempt.stopped_at is not None,
-        )
+        state = self._states.get(job.id)
+        if state is None or state.terms.number != attempt.number:
+            memory = self._memory(attempt)
+            state = replace(state_of(job, attempt), cause_since=memory.cause_since, done_since=memory.done_since)
+            self._states[job.id] = state
+        return state
 
     def _memory(self, attempt: Attempt) -> _Memory:
         return self._memories.setdefault((attempt.job_id, attempt.number), _Memory())
@@ -222,18 +226,17 @@ class Attempts:
             case TakeEpoch(epoch):
                 attempt.epoch = epoch
                 waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
-                self.monitoring.begun(session, job, attempt, waited / 1000)
+                self._memory(attempt).uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
                 job.first_epoch = job.first_epoch or epoch
-            case Withdraw(reason):
-                self._withdraw(session, job, attempt, reason)
             case Launch(again):
-                return self._launch(session, job, attempt, again)
+                return self._launch(job, attempt, again)
             case Keep(handle):
                 attempt.handle = handle
             case Observe():
                 return self._observer.observe(job, attempt)
             case Explain(reason):
-                job.status_reason = reason
+                if job.status_reason != reason:
+                    job.status_reason = reason
             case MarkRunning(reason, moment):
                 self._mark_running(session, job, attempt, reason, moment)
             case AwaitCause(since):
@@ -245,14 +248,10 @@ class Attempts:
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
                 if verdict.start_error is not None:
                     attempt.nodes[job.gang.main].reason = verdict.start_error
-            case Save():
-                session.commit()
             case Stop(grace):
                 return self._stop(job, attempt, grace)
             case WindUp():
                 return Gone(self.clock.now(), [], "")
-            case Close():
-                self._close(session, job, attempt, instruction)
         return None
 
     def _prepare(
@@ -267,12 +266,13 @@ class Attempts:
             if (run := memory.run) is None:
                 return self._errands.delayed(key)
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
-            known = list(session.scalars(select(Attempt.epoch).join(Job).where(Job.run == job.run)))
+            known = self._rows.epochs(job.run)
             if run.epoch not in known and run.writer:
                 raise RunRefused(f"run {job.run} is being written by {run.writer}; stop that job first")
             if job.first_epoch is not None and run.description() is None:
                 raise RunRefused(f"run {job.run} was deleted from the store while the job ran")
-            record = record_owner(session, run, job)
+            record = record_owner(session, run, job, self._rows.runs.get(job.run))
+            self._rows.runs[job.run] = record
             description = first_description(run, job, record.owner, record.queue)
             claim = Claim(self.runs.peers.id, job.id, attempt.number)
             texts = [(each, self.texts.source(session, each)) for each in references_of(job.gang)]
@@ -284,9 +284,9 @@ class Attempts:
             return PrepareRefused(str(error))
         return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
 
-    def _launch(self, session: Session, job: Job, attempt: Attempt, again: bool) -> Event:
+    def _launch(self, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:
-            gang = self.gang(session, job, attempt, job.gang)
+            gang = self.gang(job, attempt, job.gang, self._rows.options(attempt.environment, job.queue))
             return self.engine.plan(self.engine.with_secrets(gang))
 
         self.bus.expect(job.id, attempt.number, len(attempt.nodes))
@@ -297,9 +297,9 @@ class Attempts:
         except EngineError as error:
             return LaunchRefused(str(error), is_final=not isinstance(error, CannotStart))
 
-    def gang(self, session: Session, job: Job, attempt: Attempt, spec: GangSpec) -> Gang:
-        """The gang that the engine starts for an attempt."""
-        nodes, options = spec.nodes[: len(attempt.nodes)], spec.options
+    def gang(self, job: Job, attempt: Attempt, spec: GangSpec, options: Mapping[str, str]) -> Gang:
+        """The gang that the engine starts for an attempt; ``options``: those of its compute environment and queue."""
+        nodes, own = spec.nodes[: len(attempt.nodes)], spec.options
         return Gang(
             job=job.id,
             attempt=attempt.number,
@@ -314,13 +314,13 @@ class Attempts:
             environments=[node.environment for node in nodes],
             placements=placements_of(attempt),
             grace=GRACE,
-            directory=options.directory or None,
-            stall_timeout=options.stall_timeout,
-            log_limit=options.log_limit,
+            directory=own.directory or None,
+            stall_timeout=own.stall_timeout,
+            log_limit=own.log_limit,
             ranks=[node.ranks for node in nodes],
-            is_native=options.is_native,
+            is_native=own.is_native,
             is_gang=job.kind == "multinode",
-            isolated=not options.is_native,
+            isolated=not own.is_native,
             containers=[node.container for node in nodes],
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),
             bus=self.bus.endpoint,
@@ -328,7 +328,7 @@ class Attempts:
             title=job.name,
             timeout=job.timeout,
             priority=job.priority,
-            options=engine_options(session, attempt.environment, job.queue),
+            options=options,
         )
 
     @staticmethod
@@ -362,42 +362,49 @@ class Attempts:
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
         return Gone(self.clock.now(), self._observer.ends(job, attempt, status), progress)
 
-    def _withdraw(self, session: Session, job: Job, attempt: Attempt, reason: str) -> None:
+    def _withdraw(self, job: Job, attempt: Attempt, reason: str) -> Callable[[], None]:
+        """Give the room back; returns what follows the commit."""
+
+        def withdrawn() -> None:
+            self._forget(job, attempt)
+            self.withdrawn(job.id, reason)
+
         job.attempts.remove(attempt)
         job.move(Status.RUNNABLE, reason)
-        session.commit()
-        self._forget(job, attempt)
-        self.withdrawn(job.id, reason)
+        return withdrawn
 
     def _forget(self, job: Job, attempt: Attempt) -> None:
         key, release = (job.id, attempt.number), partial(self.runs.release, job.run)
+        self._states.pop(job.id, None)
         self._memories.pop(key, None)
         self._stops.forget(key)
         self._errands.forget(key, job.run, release, attempt.epoch if attempt.epoch != NO_EPOCH else None)
         self._observer.forget(key)
 
-    def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> None:
+    def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> Callable[[], None]:
+        """Record the end; returns what follows the commit."""
+
+        def closed() -> None:
+            memory.committed()
+            self._forget(job, attempt)
+            self.bus.forget(job.id, attempt.number)
+            self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
+
         memory = self._memory(attempt)
         ran = close.moment - (attempt.running_since or close.moment)
         attempt.started_at = attempt.started_at or now()
         attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
         attempt.spent = close.spent
         charge(attempt, memory.progress.saved if memory.progress else None, close.moment)
-        self.monitoring.ended(session, job, attempt)
+        memory.uncommitted.append(self.monitoring.ended(job, attempt))
         self._charge_share(session, job, attempt, close.moment)
         job.move(close.status, close.reason)
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
-        session.commit()
-        self._forget(job, attempt)
-        self.bus.forget(job.id, attempt.number)
-        self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
+        return closed
 
-    @staticmethod
-    def _charge_share(session: Session, job: Job, attempt: Attempt, moment: int) -> None:
-        queue = session.get(JobQueue, job.queue)
-        policy = session.get(SchedulingPolicy, queue.policy) if queue and queue.policy else None
-        if policy is not None:
+    def _charge_share(self, session: Session, job: Job, attempt: Attempt, moment: int) -> None:
+        if (policy := self._rows.policy(job.queue)) is not None:
             decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
             add_usage(session, job.queue, job.share or "", resource_seconds(attempt, moment), decay, moment)
 

@@ -90,8 +90,8 @@ def engine_named_by(tags: dict[str, str], first: str) -> str:
     return tags.get(ENGINE_TAG, first)
 
 
-def engine_options(session: Session, compute_environment: str, queue: str) -> dict[str, str]:
+def options_of(compute_environment: ComputeEnvironment | None, queue: JobQueue | None) -> dict[str, str]:
     """Options for an engine: ``muster:NAME=VALUE`` tags of a compute environment, and over them those of a queue."""
-    told = (session.get(ComputeEnvironment, compute_environment), session.get(JobQueue, queue))
-    tags = {name: value for each in told if each is not None for name, value in each.tags.items()}
+    found = (compute_environment, queue)
+    tags = {name: value for each in found if each is not None for name, value in each.tags.items()}
     return {name.removeprefix("muster:"): value for name, value in tags.items() if name.startswith("muster:")}

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from sqlalchemy import update
 from sqlalchemy.orm import Session
 
+from orchestrator.control.attempts import Steps
 from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
@@ -16,6 +17,9 @@ from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.columns import storable
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
+
+AT_ONCE = 200
+"""Jobs that share their commits, at most: one that fails has all of them done again, each by itself."""
 
 log = logging.getLogger("muster.controller")
 
@@ -31,6 +35,8 @@ class Isolation:
         """Whether its volume is full; jobs are ended all the same."""
         self.backoff = Backoff(log)
         """Failures, by the part of the pass, or by the action on a job and the job's id."""
+        self.before: Callable[[Session, Sequence[Job]], None] = lambda session, jobs: None
+        """Called with the jobs that are worked on next."""
 
     def part(self, what: str, body: Callable[[], None]) -> None:
         """Carry out one part of a pass."""
@@ -44,17 +50,19 @@ class Isolation:
         except Exception as error:
             self.backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
-    def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
-        """Do something to these jobs in one commit; where that fails, to each by itself. Returns the jobs for which it failed.
+    def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
+        """Do something to these jobs, with commits that they share; where that fails, to each by itself. Returns those for which it failed.
 
-        Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
+        They are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
         """
         self._heartbeat.beat()
         try:
             with self._loaded.session() as session:
-                for job in self._loaded.jobs(session, ids).values():
-                    body(session, job)
+                jobs = self._loaded.jobs(session, ids)
+                self.before(session, list(jobs.values()))
+                begun = [body(session, job) for job in jobs.values()]
+                _finish(session, [steps for steps in begun if steps is not None])
         except DatabaseError:
             raise
         except Exception as error:
@@ -77,6 +85,17 @@ class Isolation:
                 )
                 session.execute(explained)
             self._loaded.changed([job_id])
+
+
+def _finish(session: Session, steps: Sequence[Steps]) -> None:
+    """Carry all of them out, up to the next commit of each in turn."""
+    while steps:
+        with session.no_autoflush:  # none reads what another one has changed
+            reached = [(each, then) for each in steps if (then := next(each, None)) is not None]
+        session.commit()
+        for _, then in reached:
+            then()
+        steps = [each for each, _ in reached]
 
 
 def _words(error: Exception) -> str:

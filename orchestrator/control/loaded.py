@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from sqlalchemy import select
@@ -23,6 +23,8 @@ class LoadedJobs:
         """Ids of jobs that were changed elsewhere since they were loaded."""
         self._jobs: dict[str, Job] = {}
         self._session: Session | None = None
+        self.reread: Callable[[Collection[str]], None] = lambda ids: None
+        """Called with the jobs that are read from the database, also those that were known before."""
 
     def changed(self, ids: Collection[str]) -> None:
         """These jobs were changed elsewhere. Any thread may call."""
@@ -52,6 +54,7 @@ class LoadedJobs:
             if (job := self._jobs.pop(job_id, None)) is not None:
                 session.expire(job)
         if missing := [job_id for job_id in ids if job_id not in self._jobs]:
+            self.reread(missing)
             query = select(Job).where(Job.id.in_(missing)).options(selectinload(Job.attempts))
             self._jobs |= {job.id: job for job in session.scalars(query.execution_options(populate_existing=True))}
         return {job_id: self._jobs[job_id] for job_id in ids if job_id in self._jobs}

@@ -7,13 +7,13 @@ expects. Nothing here looks into the store or waits for an engine: a volume that
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
-from sqlalchemy import event, func, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.snapshot import open_attempts
@@ -96,22 +96,22 @@ class Monitoring:
         """A message was ``delivered``, has ``failed`` and is tried again, or was ``given up``."""
         self._webhooks.labels(webhook, result).inc()
 
-    def begun(self, session: Session, job: Job, attempt: Attempt, waited: float) -> None:
-        """An attempt begins once the session is committed, ``waited`` seconds after its job could."""
+    def begun(self, job: Job, attempt: Attempt, waited: float) -> Callable[[], None]:
+        """To be called once it is committed that an attempt begins, ``waited`` seconds after its job could."""
 
-        def note(_: Session) -> None:
+        def note() -> None:
             if number == 1:
                 self._waits.labels(queue).observe(max(0.0, waited))
             else:
                 self._restarts.labels(queue, engine).inc()
 
         queue, engine, number = job.queue, _engine(attempt), attempt.number
-        event.listen(session, "after_commit", note, once=True)
+        return note
 
-    def ended(self, session: Session, job: Job, attempt: Attempt) -> None:
-        """An attempt, whose usage was charged, ends once the session is committed."""
+    def ended(self, job: Job, attempt: Attempt) -> Callable[[], None]:
+        """To be called once it is committed that an attempt, whose usage was charged, has ended."""
 
-        def note(_: Session) -> None:
+        def note() -> None:
             self._attempts.labels(*labels, ending).inc()
             for counters, amounts in ((self._seconds, used), (self._lost, lost)):
                 for unit, seconds in amounts.items():
@@ -120,7 +120,7 @@ class Monitoring:
         labels, ending = (job.queue, _engine(attempt)), str(attempt.ending or "unknown")
         used = {"gpu": attempt.gpu_seconds, "cpu": attempt.cpu_seconds}
         lost = {"gpu": attempt.wasted_gpu_seconds, "cpu": attempt.wasted_cpu_seconds}
-        event.listen(session, "after_commit", note, once=True)
+        return note
 
 
 def exposition(reconciler: Reconciler) -> bytes:

@@ -122,20 +122,25 @@ class Observer:
             outcome = outcomes.get(record.index)
             if outcome is not None or (not node.running and record.index in outcomes):
                 end, stopped = node_end(outcome, node, job.gang.options.is_native, now())
-                record.exit_code, record.reason, record.error = end.exit_code, end.reason, end.error
+                _note(record, exit_code=end.exit_code, reason=end.reason, error=end.error)
                 if record.stopped_at is None:
                     record.stopped_at = stopped
                     if attempt.ending is None:  # by itself: no one ended the gang
                         record.status_reason = aws_ending(end, record.host)
                 self._bus.presence.ended(key)
             elif self._bus.presence.met(key):
-                record.met = True
+                _note(record, met=True)
             ends.append(end)
-            if node.gpus:
-                record.devices = tuple(node.gpus)
-            record.host = node.host or record.host
-            record.address = node.address or record.address or ""  # of a node that can't be seen it stays known
+            _note(record, devices=tuple(node.gpus) or record.devices, host=node.host or record.host)
+            _note(record, address=node.address or record.address or "")  # of a node that can't be seen it stays known
         return ends
 
     def _of(self, attempt: Attempt) -> _Seen:
         return self._seen.setdefault((attempt.job_id, attempt.number), _Seen())
+
+
+def _note(record: Node, **facts: object) -> None:
+    """Note what is new: a look that finds nothing new changes no row."""
+    for name, value in facts.items():
+        if getattr(record, name) != value:
+            setattr(record, name, value)

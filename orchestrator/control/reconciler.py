@@ -14,13 +14,13 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.admission import Admission
-from orchestrator.control.attempts import Attempts
+from orchestrator.control.attempts import Attempts, Steps
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.heartbeat import Heartbeat
-from orchestrator.control.isolation import Isolation
+from orchestrator.control.isolation import AT_ONCE, Isolation
 from orchestrator.control.kept_texts import KeptTexts
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
@@ -34,16 +34,14 @@ from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.group_commit import GroupCommit
-from orchestrator.persistence.models import Job, JobQueue, now
+from orchestrator.persistence.models import Attempt, Job, JobQueue, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 from shared_store.layout import Store
 from shared_store.parent import WeightsCopy
 
-_SETTLED_AT_ONCE = 200
-"""Jobs a commit, of those that only change their state."""
 _SETTLED_A_TICK = 1000
-"""The same in one pass: a large array that ends must not delay the looks at running gangs."""
+"""Jobs that only change their state, in one pass: a large array that ends must not delay the looks at running gangs."""
 _GATHERING = 0.02
 """Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
 _WITHOUT_DATABASE = 1.0
@@ -114,11 +112,15 @@ class Reconciler:
         database.committed = self._committed
         database.changed = self._look_again
         self._swept = self._kept = 0.0
+        self._kept_version = -1
+        self._is_draining = True
+        """Whether a deleted queue may still be there."""
         self._wake, self._ending = threading.Event(), threading.Event()
         self._ticking: int | None = None
         """The thread that makes a pass now."""
         self._isolation = Isolation(database, self._loaded, self.heartbeat)
         self._backoff = self._isolation.backoff
+        self._isolation.before, self._loaded.reread = self.attempts.share, self.attempts.forget_states
         self.admission = Admission(
             engine,
             self.disk,
@@ -206,30 +208,36 @@ class Reconciler:
     def _pass(self) -> None:
         self.database.reserve_connections()
         self._keep_database()
-        with self.database.session() as session:
-            if self.clock.stepped:
-                self.clock.note_step(session)
-            self.work_queue.take_dependents(session)
+        if self.clock.stepped or self.work_queue.has_ended:
+            with self.database.session() as session:
+                if self.clock.stepped:
+                    self.clock.note_step(session)
+                self.work_queue.take_dependents(session)
         taken = self.work_queue.take_due(_SETTLED_A_TICK)
         due = [job_id for job_id in taken if not self._backoff.waits(("settle", job_id))]
         self.work_queue.look_again(job_id for job_id in taken if self._backoff.waits(("settle", job_id)))
         if due and len(taken) == _SETTLED_A_TICK:
             self.wake()  # the rest comes after a look at the gangs that run
-        for start in range(0, len(due), _SETTLED_AT_ONCE):
-            self.work_queue.look_again(
-                self._isolation.jobs("settle", due[start : start + _SETTLED_AT_ONCE], self._settle)
-            )
-        self._loaded.keep(self.work_queue.active())
+        for start in range(0, len(due), AT_ONCE):
+            self.work_queue.look_again(self._isolation.jobs("settle", due[start : start + AT_ONCE], self._settle))
+        if self._kept_version != self.work_queue.version:
+            self._kept_version = self.work_queue.version
+            self._loaded.keep(self.work_queue.active())
         self.engine.look()
-        for job_id in self.work_queue.take_active(machine.monotonic()):
-            try:
-                if not self._backoff.waits(("advance", job_id)):
-                    self._isolation.jobs("advance", [job_id], self._advance)
-            finally:
-                self.work_queue.later(job_id, machine.monotonic() + _SOON)
+        self._look_at_gangs()
         self._note_silence()
         self._isolation.part("scheduling", self.admission.look)
         self._isolation.part("clearing away", self._sweep)
+
+    def _look_at_gangs(self) -> None:
+        active = self.work_queue.take_active(machine.monotonic())
+        try:
+            due = [job_id for job_id in active if not self._backoff.waits(("advance", job_id))]
+            for start in range(0, len(due), AT_ONCE):
+                self._isolation.jobs("advance", due[start : start + AT_ONCE], self._advance)
+        finally:
+            for job_id in active:
+                self.work_queue.later(job_id, machine.monotonic() + _SOON)
 
     def _note_silence(self) -> None:
         why = self.bus.presence.cut_off
@@ -254,6 +262,7 @@ class Reconciler:
     def _take_up(self, session: Session) -> None:
         """Read the jobs, and expect the nodes of all open attempts, and of no other."""
         self.work_queue.load(session)
+        self.database.counts.load(session)
         found = {(job.id, attempt.number): attempt for job, attempt in open_attempts(session, self.work_queue.active())}
         expected = self.bus.presence.expected()
         for closed in expected - found.keys():
@@ -262,10 +271,12 @@ class Reconciler:
             nodes = found[key].nodes
             self.bus.expect(*key, len(nodes), [node.index for node in nodes if node.met])
 
-    def _advance(self, session: Session, job: Job) -> None:
-        if attempt := job.open_attempt:
-            pause = self.attempts.advance(session, job, attempt)
-            self.work_queue.later(job.id, machine.monotonic() + pause)
+    def _advance(self, session: Session, job: Job) -> Steps | None:
+        return None if (attempt := job.open_attempt) is None else self._look_at(session, job, attempt)
+
+    def _look_at(self, session: Session, job: Job, attempt: Attempt) -> Steps:
+        yield from self.attempts.advance(session, job, attempt)
+        self.work_queue.later(job.id, machine.monotonic() + self.attempts.pause(job, attempt))
 
     def _committed(self, jobs: Sequence[Job]) -> None:
         """Note the jobs of a commit as they are, where this thread has made it; read them again after a commit of a request."""
@@ -304,7 +315,8 @@ class Reconciler:
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
 
     def drain(self, session: Session, queue: JobQueue) -> None:
-        """Ask all jobs of a queue to end."""
+        """Ask all jobs of a queue to end; it goes with the last of them."""
+        self._is_draining = True
         ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
     def _sweep(self) -> None:
@@ -322,11 +334,26 @@ class Reconciler:
 
     def _clear_away(self) -> None:
         self._backoff.tidy()
-        with self.database.session() as session:
-            for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
-                busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
-                if session.scalars(busy).first() is None:
-                    session.delete(queue)
-            if self.retention is not None:
+        if self._is_draining:
+            left = True
+            try:
+                with self.database.session() as session:
+                    left = _delete_drained(session)
+            finally:
+                self._is_draining = left
+        if self.retention is not None:
+            with self.database.session() as session:
                 # by the clock that is behind: nothing is forgotten too early
                 forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
+
+
+def _delete_drained(session: Session) -> bool:
+    """Delete the queues that are to go and have no open job; returns whether others are left."""
+    left = False
+    for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
+        busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
+        if session.scalars(busy).first() is None:
+            session.delete(queue)
+        else:
+            left = True
+    return left

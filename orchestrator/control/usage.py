@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session, aliased
 from orchestrator.domain.hosts import Placement
 from orchestrator.domain.job import TERMINAL, Ending
 from orchestrator.domain.resources import Resources
+from orchestrator.persistence.job_counts import note_deleted
 from orchestrator.persistence.models import (
     Attempt,
     AutomaticEvaluation,
@@ -121,9 +122,13 @@ def forget_before(session: Session, moment: int, most: int = 500) -> int:
     child = aliased(Job)
     # after its children, which have their definition from it
     last = or_(Job.kind != "array", ~select(child.id).where(child.parent == Job.id).exists())
-    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed), alone, last)
+    query = select(Job.id, Job.parent, Job.queue, Job.status).where(
+        Job.stopped_at < moment, Job.id.not_in(needed), alone, last
+    )
     query = query.order_by(Job.stopped_at).limit(most)
-    ids = list(session.scalars(query))
+    found = session.execute(query).all()
+    ids = [job_id for job_id, *_ in found]
+    note_deleted(session, [(parent, queue, status) for _, parent, queue, status in found])
     session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(ids), WebhookDelivery.next_at.is_(None)))
     session.execute(
         delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(ids), AutomaticEvaluation.open.is_(False))

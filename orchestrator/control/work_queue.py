@@ -6,7 +6,7 @@ It follows every commit, and is read anew from the database at a start, so that 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import islice
 from math import inf
 
@@ -96,23 +96,23 @@ class WorkQueue:
             if job in self._active:
                 self._active[job] = 0.0
 
-    def take_active(self, moment: float) -> Iterator[str]:
-        """The jobs whose gang is to be looked at by now (monotonic [s]), one after the other; each gets its next look by :meth:`later`."""
+    def take_active(self, moment: float) -> Sequence[str]:
+        """The jobs whose gang is to be looked at by now (monotonic [s]); each gets its next look by :meth:`later`."""
         with self._lock:
             due = [job for job, look in self._active.items() if look <= moment]
-        for job in due:
-            with self._lock:
-                is_due = self._active.get(job, inf) <= moment
-                if is_due:
-                    self._active[job] = inf
-            if is_due:
-                yield job
+            self._active.update(dict.fromkeys(due, inf))
+        return due
 
     def later(self, job: str, moment: float) -> None:
         """Look at a gang next at this moment (monotonic [s]), unless something has changed since it was taken."""
         with self._lock:
             if self._active.get(job) == inf:
                 self._active[job] = moment
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether jobs have ended since the last :meth:`take_dependents`."""
+        return bool(self._ended)
 
     def take_dependents(self, session: Session) -> None:
         """Make the jobs due that depend on jobs that ended since the last call."""

@@ -276,6 +276,9 @@ _EXPLAINED = (NodePhase.QUEUED, NodePhase.STARTING, NodePhase.UNREACHABLE)
 
 GangStatus = Sequence[NodeStatus]
 
+Look = GangStatus | BaseException
+"""A gang's status, or the error in its place where the engine can't look at that gang now."""
+
 
 @dataclass(frozen=True)
 class Option:
@@ -334,6 +337,8 @@ class Traits:
     as_owner: bool = False
     """Nodes run as the owner of the store's directory, whoever the controller is."""
     secrets: SecretValues = SecretValues.NONE
+    launches: int = 1
+    """Gangs that it can start at once. Of more than one, :meth:`Engine.launch` is called on so many threads."""
     gpu_ids: bool = False
     """The ids of its hosts' GPUs are those of the devices; else they are numbers until a node's status has its ``gpus``."""
 
@@ -353,8 +358,9 @@ class EngineType:
 class Engine(Protocol):
     """Starts gangs, tells how they are, ends them. Every method may be called again after a controller restart.
 
-    Threads: the controller gives each engine a thread of its own (:mod:`orchestrator.engines.runner`). :meth:`capacity`, :meth:`launch`
-    and :meth:`observe` are called on that thread alone, one at a time, so a call that takes long delays this engine's gangs only.
+    Threads: the controller gives each engine a thread of its own (:mod:`orchestrator.engines.runner`). :meth:`capacity`, :meth:`observe`
+    and, unless :attr:`Traits.launches` says otherwise, :meth:`launch` are called on that thread alone, one at a time, so a call that
+    takes long delays this engine's gangs only. No gang is launched by two threads at a time.
     :meth:`stop` is called on another thread for each gang, at the same time as everything else, other stops included. :meth:`plan` is
     called on any thread. What these share with the engine's thread must be guarded by a lock, or replaced as a whole and never
     changed in place.
@@ -392,8 +398,12 @@ class Engine(Protocol):
         """
         ...
 
-    def observe(self, handle: Handle) -> GangStatus:
-        """The gang's nodes by index."""
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        """The nodes, by index, of each of these gangs, in the order of ``handles``; in few requests, however many gangs there are.
+
+        A gang that can't be looked at has its error in its place and hides no other one; an error that is raised is all gangs'. An
+        engine that looks at one gang at a time uses :func:`orchestrator.engines.toolkit.looks.one_by_one`.
+        """
         ...
 
     def stop(self, handle: Handle, grace: float) -> None:

@@ -1,4 +1,4 @@
-"""One thread for each engine: the controller asks, reads the newest answer, and never waits for an engine.
+"""Threads for each engine: the controller asks, reads the newest answer, and never waits for an engine.
 
 An engine that hangs (a Docker daemon that accepts connections and does not answer, a cloud behind a broken route) delays its own gangs
 alone. Those keep the state that was seen last, and can still be timed out and asked to stop; gangs of other engines notice nothing.
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from orchestrator import machine
 from orchestrator.domain.hosts import Capacity
@@ -24,6 +24,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodeStatus,
     NotYet,
@@ -31,6 +32,7 @@ from orchestrator.engines.api import (
     Transient,
 )
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.engines.toolkit.looks import status_of
 from orchestrator.engines.transience import is_final
 
 log = logging.getLogger("muster.engines")
@@ -41,6 +43,12 @@ _LAST_LOOK = 60.0
 """Seconds that :meth:`Runner.stop` waits for the last status of a gang that was stopped."""
 _CLOSING = 5.0
 """Seconds that :meth:`Runner.close` gives the call that is being carried out."""
+
+_LOOKS = "looks"
+"""Subject of a failure of all looks."""
+_LOOKING, _SELDOM = 50.0, 2.0
+"""Pause between two looks at all gangs, in multiples of the processor time of the first, so that looks take 2 % of a core; and its
+limit [s]."""
 
 T = TypeVar("T")
 
@@ -67,7 +75,7 @@ class Underway(NotYet):
 
 
 class Runner:
-    """Carries out the calls of one engine, in their order, on a thread of its own. Any thread may ask."""
+    """Carries out the calls of one engine, in their order, on a thread of its own, and its launches beside it. Any thread may ask."""
 
     def __init__(self, engine: Engine, changed: Callable[[str], None]) -> None:
         """``changed`` is called, on the engine's thread, when an answer differs from the one before: with the gang's name, or empty."""
@@ -79,22 +87,29 @@ class Runner:
         """By gang: what its last launch has to wait for."""
         self._observed: dict[Handle, None] = {}
         """Handles of the gangs whose status the controller wants."""
-        self._looks: set[Handle] = set()
-        """Those that are being looked at."""
-        self._seen: dict[Handle, tuple[GangStatus, float]] = {}
+        self._unseen: dict[Handle, None] = {}
+        """Those of them that were not looked at yet."""
+        self._seen: dict[Handle, GangStatus] = {}
+        self._asked: dict[Handle, float] = {}
         """By handle: the newest status, and when the engine was asked for it (monotonic [s])."""
+        self._is_looking = False
+        self._next_look = 0.0
+        """When the next look at all gangs is due (monotonic [s])."""
         self._telling: Future[Capacity] | None = None
         self._capacity: Capacity | None = None
         self._told_at: int | None = None
         self._backoff = Backoff(log)
         self._was_silent = False
         self._thread = machine.pool(f"engine {engine.name}", 1)
+        at_once = engine.traits.launches
+        self._launching = machine.pool(f"launch {engine.name}", at_once) if at_once > 1 else self._thread
         self.first = self.ask_capacity()
         """Done once the engine has told its capacity for the first time, or has failed to."""
 
     def close(self) -> None:
         """Give the present call a few seconds, drop those that wait, and close the engine; its gangs go on."""
-        self._thread.close(_CLOSING)
+        for pool in {self._launching, self._thread}:
+            pool.close(_CLOSING)
         self.engine.close()
 
     @property
@@ -120,7 +135,10 @@ class Runner:
     def health(self) -> Health:
         """The engine's answers just now."""
         problem = self.silence or self._backoff.failure("hosts") or self.unknown
-        gangs = {subject[1]: pause for subject, pause in self._backoff.pauses().items() if isinstance(subject, tuple)}
+        pauses = self._backoff.pauses()
+        gangs = {subject[1]: pause for subject, pause in pauses.items() if isinstance(subject, tuple)}
+        if _LOOKS in pauses:
+            gangs |= dict.fromkeys(self._observed, pauses[_LOOKS])
         return Health(self._told_at, problem, len(gangs), min(gangs.values(), default=None))
 
     # -- what the controller asks -------------------------------------------------------------------------------------
@@ -164,7 +182,7 @@ class Runner:
                 self._failed(("launch", gang), error)
                 raise
             self._refused.pop(gang, None)
-            launch = self._launches[gang] = self._submit(lambda: self._start(planned))
+            launch = self._launches[gang] = self._submit(lambda: self._start(planned), self._launching)
             launch.add_done_callback(lambda _: self._changed(gang))
         if not launch.done():
             raise Underway(self.silence or "")
@@ -184,14 +202,14 @@ class Runner:
     def observe(self, handle: Handle) -> GangStatus | None:
         """The newest status of a gang, of which :meth:`look` asks for newer ones from now on; None before the first.
 
-        Nodes that were seen running, or not yet at all, are unreachable where there is no newer picture, and say why.
+        Nodes that were seen running, or not yet at all, are unreachable where there is no newer status, and say why.
         """
-        subject = ("look", handle)
         if handle not in self._observed:
-            self._observed[handle] = None
-            self.look([handle])
-        seen, _ = self._seen.get(handle, (None, 0.0))
-        if trouble := self.silence or self._backoff.failure(subject):
+            with self._lock:
+                self._observed[handle] = self._unseen[handle] = None
+            self._submit(self._look_at_new)
+        seen = self._seen.get(handle)
+        if trouble := self._trouble(handle):
             away = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
             return [
                 replace(each, phase=away.phase, words=trouble) if each.running else each
@@ -199,8 +217,8 @@ class Runner:
             ]
         return seen
 
-    def look(self, handles: Iterable[Handle] | None = None) -> None:
-        """Ask for a newer status of these gangs, or of all that are observed; of none twice at a time.
+    def look(self) -> None:
+        """Ask for newer statuses of all gangs that are observed, unless that is under way.
 
         Reports, too, that the engine has begun or ceased to be silent: its gangs look different then.
         """
@@ -208,21 +226,30 @@ class Runner:
             self._was_silent = not self._was_silent
             for gang in {*self._launches, *(handle.gang for handle in self._observed)}:
                 self._changed(gang)
-        for handle in list(self._observed) if handles is None else handles:
-            if handle not in self._looks and not self._backoff.waits(("look", handle)):
-                self._looks.add(handle)
-                self._submit(partial(self._look, handle))
+        if (
+            self._is_looking
+            or not self._observed
+            or machine.monotonic() < self._next_look
+            or self._backoff.waits(_LOOKS)
+        ):
+            return
+        self._is_looking = True
+        self._submit(self._look_at_all)
 
     def asked(self, handle: Handle) -> float | None:
         """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
-        if handle not in self._seen or self.silence or self._backoff.failure(("look", handle)):
+        if handle not in self._seen or self._trouble(handle):
             return None
-        return machine.monotonic() - self._seen[handle][1]
+        return machine.monotonic() - self._asked[handle]
+
+    def _trouble(self, handle: Handle) -> str | None:
+        """Why there is no newer status of a gang."""
+        return self.silence or self._backoff.failure(_LOOKS) or self._backoff.failure(("look", handle))
 
     def stop(self, handle: Handle, grace: float) -> GangStatus:
         """Stop the gang on the caller's thread, which may take long, and look at it once more. Raises EngineError."""
         self._call("stop the gang", lambda: self.engine.stop(handle, grace))
-        looking = self._submit(lambda: self._call("look at the gang", lambda: self.engine.observe(handle)))
+        looking = self._submit(lambda: self._call("look at the gang", lambda: status_of(self.engine, handle)))
         try:
             return machine.result(looking, _LAST_LOOK)
         except TimeoutError:
@@ -236,14 +263,14 @@ class Runner:
             self._launches.pop(gang, None)
             self._refused.pop(gang, None)
             if handle is not None:
-                self._observed.pop(handle, None)
-                self._seen.pop(handle, None)
+                for known in (self._observed, self._unseen, self._seen, self._asked):
+                    known.pop(handle, None)
         self._backoff.worked(("launch", gang))
         self._backoff.worked(("look", handle))
 
-    # -- on the engine's thread ---------------------------------------------------------------------------------------
+    # -- on the engine's threads --------------------------------------------------------------------------------------
 
-    def _submit(self, body: Callable[[], T]) -> Future[T]:
+    def _submit(self, body: Callable[[], T], pool: machine.Pool | None = None) -> Future[T]:
         def call() -> T:
             try:
                 return body()
@@ -256,7 +283,7 @@ class Runner:
                 if self._backoff.worked("silence"):
                     log.warning("the %s engine answers again", self.engine.name)
 
-        return self._thread.submit(call)
+        return (pool or self._thread).submit(call)
 
     def _call(self, what: str, body: Callable[[], T]) -> T:
         """Carry out a call. Raises EngineError, whatever the engine raises; ``what``: for the message."""
@@ -299,22 +326,55 @@ class Runner:
         self._backoff.worked(subject)
         return handle
 
-    def _look(self, handle: Handle) -> None:
-        subject = ("look", handle)
-        before = self._seen.get(handle, (None, 0.0))[0], self._backoff.failure(subject)
+    def _look_at_new(self) -> None:
+        """The first look at all gangs that are observed and were not looked at yet."""
+        with self._lock:
+            new, self._unseen = list(self._unseen), {}
+        if new:
+            self._look(new)
+
+    def _look_at_all(self) -> None:
+        """One look at all gangs. The more processor time it takes, the longer the pause until the next one."""
+        began = machine.processor_time()
+        try:
+            self._look([handle for handle in list(self._observed) if not self._backoff.waits(("look", handle))])
+        finally:
+            pause = min(_LOOKING * (machine.processor_time() - began), _SELDOM)
+            self._next_look, self._is_looking = machine.monotonic() + pause, False
+
+    def _look(self, handles: Sequence[Handle]) -> None:
+        before = self._backoff.failure(_LOOKS)
         asked = machine.monotonic()
         try:
-            status = self._call("look at the gang", lambda: self.engine.observe(handle))
+            looks = self._call("look at its gangs", lambda: self.engine.observe(handles))
         except EngineError as error:
-            self._failed(subject, error)
+            self._failed(_LOOKS, error)
+            looks = []
         else:
-            self._backoff.worked(subject)
-            with self._lock:
-                if handle in self._observed:  # else it was forgotten meanwhile
-                    self._seen[handle] = status, asked
-        self._looks.discard(handle)
-        if before != (self._seen.get(handle, (None, 0.0))[0], self._backoff.failure(subject)):
+            self._backoff.worked(_LOOKS)
+        changed = [handle for handle, look in zip(handles, looks, strict=False) if self._note(handle, look, asked)]
+        for handle in changed if before == self._backoff.failure(_LOOKS) else list(self._observed):
             self._changed(handle.gang)
+
+    def _note(self, handle: Handle, look: Look, asked: float) -> bool:
+        """Keep what a look has found; returns whether it differs from what was known."""
+        subject = ("look", handle)
+        if isinstance(look, BaseException):
+            try:
+                self._call("look at the gang", partial(_raise, look))
+            except EngineError as error:
+                before = self._backoff.failure(subject)
+                self._failed(subject, error)
+                return before != self._backoff.failure(subject)
+        with self._lock:
+            if handle not in self._observed:
+                return False  # it was forgotten meanwhile
+            known, self._seen[handle], self._asked[handle] = self._seen.get(handle), look, asked
+        return self._backoff.worked(subject) or known != look
+
+
+def _raise(error: BaseException) -> NoReturn:
+    raise error
 
 
 def _lasting(body: Callable[[], T]) -> T:

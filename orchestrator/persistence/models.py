@@ -131,6 +131,8 @@ class Job(Base):
         UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
         Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
         Index("ix_jobs_queue_created", "queue", "created_at", "id"),
+        Index("ix_jobs_list", "parent", "created_at", "id"),
+        Index("ix_jobs_list_kind", "parent", "queue", "status", "created_at", "id"),
     )
     id: Mapped[str] = mapped_column(primary_key=True)
     """A UUID; of an array's child ``<parent>:<index>``."""
@@ -176,7 +178,7 @@ class Job(Base):
     parameters = _OfArray[dict[str, str]]("own_parameters")
     own_tags: Mapped[dict[str, str] | None] = mapped_column("tags", _JSON_OR_NULL, default=dict)
     tags = _OfArray[dict[str, str]]("own_tags")
-    parent: Mapped[str | None] = mapped_column(default=None, index=True)
+    parent: Mapped[str | None] = mapped_column(default=None)
     array_index: Mapped[int | None] = mapped_column(default=None)
     array_size: Mapped[int | None] = mapped_column(default=None)
     """Of the array that it is, or belongs to."""
@@ -200,7 +202,11 @@ class Job(Base):
     @property
     def gang(self) -> GangSpec:
         """Commands and resources, from its definition; read once for an array. Raises ValueError if the definition is damaged."""
-        return gangs.of((self.array or self).id, self.node_properties)
+        properties, known = self.node_properties, self.__dict__.get("_gang")
+        if known is None or known[0] is not properties:
+            known = self.__dict__["_gang"] = properties, gangs.of((self.array or self).id, properties)
+        gang: GangSpec = known[1]
+        return gang
 
     @property
     def open_attempt(self) -> Attempt | None:

@@ -91,14 +91,16 @@ def forget_gone_run(session: Session, run: FoundRun) -> None:
         session.commit()
 
 
-def record_owner(session: Session, run: FoundRun, job: Job) -> RunRecord:
+def record_owner(session: Session, run: FoundRun, job: Job, record: RunRecord | None) -> RunRecord:
     """The record of a run that ``job`` is about to create or continue, added to the session where there was none.
+
+    ``record``: the present one.
 
     A run that exists and says nothing about its queue belongs to that of ``job`` from now on: only a key with all queues gets
     that far. The record of an earlier run of that name, which is gone from the store, is replaced and committed: ``run.json``
     is written next, and a controller that is killed in between must not leave the new run to the old owner.
     """
-    record, is_missing = session.get(RunRecord, run.name), run.is_missing()
+    is_missing = run.is_missing()
     if record is None:
         found = None if is_missing else owner_of(session, run)
         record = found if found and found.queue else _record(run, job.queue, job.owner)

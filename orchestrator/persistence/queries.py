@@ -78,12 +78,16 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
     among = select(Job).where(Job.parent.is_(None))
     if queues is not None:
         among = among.where(Job.queue.in_(queues))
-    named = session.scalars(among.where(Job.name == reference).order_by(Job.created_at.desc())).first()
+    named = session.scalars(among.where(Job.name == reference).order_by(Job.created_at.desc()).limit(1)).first()
     if named:
         return named
     if len(reference) < 4:
         return None
-    prefixed = session.scalars(among.where(Job.id.startswith(reference, autoescape=True)).limit(_NAMED + 1)).all()
+    within = and_(
+        Job.id >= reference, Job.id < f"{reference}g"
+    )  # by the index, which LIKE does not use: ids are hexadecimal
+    starts = among.where(within, Job.id.startswith(reference, autoescape=True))
+    prefixed = session.scalars(starts.order_by(Job.id).limit(_NAMED + 1)).all()
     if len(prefixed) > 1:
         shown = ", ".join(f"{each.id} ({each.name})" for each in prefixed[:_NAMED])
         more = ", …" * (len(prefixed) > _NAMED)

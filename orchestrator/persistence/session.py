@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -27,8 +27,10 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import Unavailable
+from orchestrator.persistence.job_counts import JobCounts, note_counts
 from orchestrator.persistence.models import Attempt, Job
 from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
+from orchestrator.persistence.updates import write_changes
 
 _RESERVE = 5 << 20
 """Bytes; SQLite's write-ahead log has 4 MiB when it is copied into the file."""
@@ -66,6 +68,8 @@ class Database:
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
         self.ended: Callable[[Session, Job], None] | None = None
         """Called with each job that a transaction ends, before it is written: what it adds to the session is committed with that."""
+        self.counts = JobCounts()
+        """Of its jobs, once they are loaded."""
         self._lock: Connection | None = None
         self._file_lock: IO[bytes] | None = None
         self._damage: str | None = None
@@ -368,6 +372,7 @@ class _Session(Session):
 def _tell(session: Session) -> None:
     jobs, ids = session.info.pop("jobs", None), session.info.pop("ids", None)
     database = session.info["database"]
+    database.counts.add(session.info.pop("counts", {}))
     if jobs and database.committed:
         database.committed(list(jobs.values()))
     if ids and database.changed:
@@ -378,26 +383,32 @@ def _tell(session: Session) -> None:
 def _forget(session: Session) -> None:
     session.info.pop("jobs", None)
     session.info.pop("ids", None)
+    session.info.pop("counts", None)
 
 
 @event.listens_for(_Session, "before_flush")
-def _tell_ends(session: Session, _context: object, _instances: object) -> None:
-    if (ended := session.info["database"].ended) is None:
-        return
-    for each in list(session.dirty):
-        if isinstance(each, Job) and each.is_terminal and inspect(each).attrs.status.history.has_changes():
-            ended(session, each)
+def _write_changes(session: Session, _context: object, _instances: object) -> None:
+    if (ended := session.info["database"].ended) is not None:
+        for each in list(session.dirty):
+            if isinstance(each, Job) and each.is_terminal and inspect(each).attrs.status.history.has_changes():
+                ended(session, each)
+    note_counts(session)
+    _note_jobs(session, write_changes(session))
 
 
 @event.listens_for(_Session, "after_flush")
-def _note_jobs(session: Session, _context: object) -> None:
+def _note_flushed(session: Session, _context: object) -> None:
+    _note_jobs(session, session.new)
+    _note_jobs(session, session.dirty)
+
+
+def _note_jobs(session: Session, changed: Iterable[object]) -> None:
     jobs = session.info.setdefault("jobs", {})
-    for changed in (session.new, session.dirty):
-        for each in changed:
-            if isinstance(each, Job):
-                jobs[each.id] = each
-            elif isinstance(each, Attempt) and each.job is not None:
-                jobs[each.job.id] = each.job
+    for each in changed:
+        if isinstance(each, Job):
+            jobs[each.id] = each
+        elif isinstance(each, Attempt) and each.job is not None:
+            jobs[each.job.id] = each.job
 
 
 def _tune_sqlite(connection: Any, _record: object) -> None:

@@ -15,6 +15,7 @@ import pytest
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.engines.ray.folder import Folder
+from orchestrator.engines.toolkit.looks import status_of
 from shared_store import __version__
 from shared_store.outcomes import read_outcome
 from tests.conftest import wait_for
@@ -98,14 +99,14 @@ def test_it_waits_in_words_for_room_that_others_hold_and_starts_when_they_leave(
     other = bench.ready(bench.gang(hosts=("n2",), suffix="-other", cpus=2.0))
     handle = bench.launch(bench.gang(nodes=2))
     reason = "waits for room on ray/n2: other work of the Ray cluster holds it"
-    wait_for(lambda: [node.words for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
+    wait_for(lambda: [node.words for node in status_of(bench.engine, handle)] == [reason] * 2, 30, "it says why")
     bench.engine.stop(other, 1.0)
-    wait_for(lambda: bench.engine.observe(handle) and bench.log().count("ready") == 2, 60, "it starts")
-    assert not any(node.words for node in bench.engine.observe(handle))
+    wait_for(lambda: status_of(bench.engine, handle) and bench.log().count("ready") == 2, 60, "it starts")
+    assert not any(node.words for node in status_of(bench.engine, handle))
     waiting = bench.launch(bench.gang(nodes=2, suffix="-third", cpus=2.0))
-    wait_for(lambda: "holds it" in bench.engine.observe(waiting)[0].words, 30, "a third one waits")
+    wait_for(lambda: "holds it" in status_of(bench.engine, waiting)[0].words, 30, "a third one waits")
     bench.engine.stop(waiting, 1.0)
-    assert not any(node.running for node in bench.engine.observe(waiting)), "one that waits can be stopped"
+    assert not any(node.running for node in status_of(bench.engine, waiting)), "one that waits can be stopped"
 
 
 def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: RayBench) -> None:
@@ -143,10 +144,10 @@ def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_run
 def test_a_controller_that_starts_again_finds_the_gang(bench: RayBench) -> None:
     gang = bench.gang()
     handle = bench.ready(gang)
-    driver, seen = bench.driver(), bench.engine.observe(handle)
+    driver, seen = bench.driver(), status_of(bench.engine, handle)
     bench.engine.close()
     bench.engine = bench.new_engine()
-    assert bench.engine.observe(handle) == seen
+    assert status_of(bench.engine, handle) == seen
     assert bench.engine.launch(bench.engine.plan(gang)) == handle and bench.driver() == driver
     assert bench.log().count("ready") == 3, "found, not started twice"
     assert bench.stopped(handle) == [143, 143, 143]
@@ -161,9 +162,9 @@ def test_an_actor_or_a_shim_that_is_killed_takes_what_its_rank_started_with_it(b
     wait_for(lambda: os.getsid(apart) == apart, 5, "a session of its own")
     shim = parent(supervisor)
     os.kill(shim if killed == "shim" else parent(shim), signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 30, "the node's end is seen")
+    wait_for(lambda: not status_of(bench.engine, handle)[1].running, 30, "the node's end is seen")
     await_end(apart)  # nothing of the node is left
-    assert bench.engine.observe(handle)[0].running, "the other node goes on"
+    assert status_of(bench.engine, handle)[0].running, "the other node goes on"
     bench.engine.stop(handle, 5.0)
 
 
@@ -180,14 +181,14 @@ def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: RayBench) -> None
 def test_a_driver_or_an_actor_that_dies_before_anything_was_started_costs_no_attempt(bench: RayBench) -> None:
     other = bench.ready(bench.gang(hosts=("n2",), suffix="-other", cpus=2.0))
     waiting = bench.launch(bench.gang(nodes=2))
-    wait_for(lambda: "waits for room" in bench.engine.observe(waiting)[0].words, 30, "it is placed")
+    wait_for(lambda: "waits for room" in status_of(bench.engine, waiting)[0].words, 30, "it is placed")
     state = Folder.of(bench.home / "home", bench.job).state(waiting.gang)
     driver = json.loads(state.read_text())["driver"]
     os.kill(driver, signal.SIGKILL)
     died = "its driver died before it had started anything ("
-    wait_for(lambda: bench.engine.observe(waiting)[0].words.startswith(died), 10, "its end is seen")
+    wait_for(lambda: status_of(bench.engine, waiting)[0].words.startswith(died), 10, "its end is seen")
     bench.engine.stop(other, 1.0)
-    wait_for(lambda: bench.engine.observe(waiting) and bench.log().count("ready") == 2, 60, "another one starts it")
+    wait_for(lambda: status_of(bench.engine, waiting) and bench.log().count("ready") == 2, 60, "another one starts it")
     assert bench.stopped(waiting) == [143, 143]
     # what an actor imports first kills it, once
     fake = bench.cluster.modules / "shared_store"
@@ -202,8 +203,8 @@ def test_a_driver_or_an_actor_that_dies_before_anything_was_started_costs_no_att
 def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: RayBench) -> None:
     handle = bench.ready(bench.gang())
     bench.cluster.kill("n3")
-    wait_for(lambda: not bench.engine.observe(handle)[2].running, 60, "its end is seen")
-    assert [node.running for node in bench.engine.observe(handle)] == [True, True, False]
+    wait_for(lambda: not status_of(bench.engine, handle)[2].running, 60, "its end is seen")
+    assert [node.running for node in status_of(bench.engine, handle)] == [True, True, False]
     assert bench.stopped(handle)[:2] == [143, 143]
     wait_for(lambda: len(bench.engine.capacity().machines) == 2, 60, "the host is gone")
     bench.cluster.add("n3", PYTHONPATH=str(bench.cluster.modules))
@@ -229,7 +230,7 @@ def test_a_driver_that_is_told_to_end_has_its_gang_save_and_leaves_one_that_wait
 ) -> None:
     handle = bench.ready(bench.gang(POLITE, cpus=2.0))
     waiting = bench.launch(bench.gang(POLITE, cpus=2.0, suffix="-2"))  # for room
-    wait_for(lambda: "waits for room" in bench.engine.observe(waiting)[0].words, 20, "it is placed")
+    wait_for(lambda: "waits for room" in status_of(bench.engine, waiting)[0].words, 20, "it is placed")
     for driver in processes_of(bench.home / "home"):
         os.kill(driver, signal.SIGTERM)
     wait_for(lambda: bench.log().count("saved") == 3, 30, "all have saved")
@@ -249,10 +250,10 @@ def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> 
     late = bench.gang(suffix="-late")
     with pytest.raises(EngineError, match=r"^the Ray head at .* does not answer; waiting for it$"):
         bench.engine.launch(bench.engine.plan(late))
-    assert all(node.running for node in bench.engine.observe(handle))
+    assert all(node.running for node in status_of(bench.engine, handle))
     bench.cluster.start_head()
     wait_for(lambda: not bench.engine._watch.problem(), 60, "it is back")
-    assert all(node.running for node in bench.engine.observe(handle)) and bench.driver() == driver
+    assert all(node.running for node in status_of(bench.engine, handle)) and bench.driver() == driver
     assert len(bench.engine.capacity().machines) == 3
     assert bench.stopped(handle) == [75, 75, 75]
     after = bench.ready(bench.gang(attempt=2))
@@ -313,7 +314,7 @@ def test_a_raylet_that_freezes_is_given_up_and_what_it_ran_ends(bench: RayBench)
     raylet = bench.cluster.raylet("n3")
     os.kill(raylet, signal.SIGSTOP)
     try:
-        wait_for(lambda: not bench.engine.observe(handle)[2].running, 100, "Ray gives it up")
+        wait_for(lambda: not status_of(bench.engine, handle)[2].running, 100, "Ray gives it up")
         assert bench.stopped_there(handle) == [143, 143]
         wait_for(lambda: not processes_of(bench.store.path), 40, "the node that nobody reaches ends itself")
     finally:

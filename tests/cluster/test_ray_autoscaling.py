@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from orchestrator.engines.toolkit.looks import status_of
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.engines.ray_bench import RayBench
 from tests.support.engines.ray_cluster import RayCluster
@@ -95,8 +96,8 @@ def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path)
         assert names() == ["ray/+1", "ray/+2"], "what may be added is there to be planned with"
         handle = bench.launch(bench.gang(hosts=("+1", "+2"), cpus=1.0))
         reason = "waits for 2 more nodes with 1 CPUs, 256 MiB: Ray's autoscaler was asked"
-        wait_for(lambda: [node.words for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
-        wait_for(lambda: bench.log().count("ready") == 2, 90, f"machines come: {bench.engine.observe(handle)}")
+        wait_for(lambda: [node.words for node in status_of(bench.engine, handle)] == [reason] * 2, 30, "it says why")
+        wait_for(lambda: bench.log().count("ready") == 2, 90, f"machines come: {status_of(bench.engine, handle)}")
         assert sorted(names()) == ["ray/+1", "ray/+2"], "as long as it runs there, they are called as it was planned"
         # The watch looks once a second: what has printed may have a machine that it has not seen yet.
         wait_for(lambda: machines() == 2, 30, "each node came on a machine of its own")

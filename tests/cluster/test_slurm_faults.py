@@ -15,6 +15,7 @@ from orchestrator.engines.api import EngineError, NotYet
 from orchestrator.engines.slurm import engine as slurm
 from orchestrator.engines.slurm.commands import call
 from orchestrator.engines.slurm.engine import SlurmEngine
+from orchestrator.engines.toolkit.looks import status_of
 from shared_store.checkpoints import list_checkpoints
 from shared_store.outcomes import read_outcome
 from tests.conftest import MUSTER, PATIENCE, Serving, wait_for
@@ -34,13 +35,13 @@ def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: SlurmBenc
     parents = {pid: parent(pid) for pid in ranks(bench)}
     nodes = {environment(pid)["AWS_BATCH_JOB_NODE_INDEX"]: pid for pid in parents}
     os.kill(nodes["0"], signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[0].running, 20, "its end is seen")
+    wait_for(lambda: not status_of(bench.engine, handle)[0].running, 20, "its end is seen")
     outcome = bench.outcome(0)
     assert (outcome.exit_code, outcome.reason) == (137, "rank 0 was killed by SIGKILL")
-    assert [node.running for node in bench.engine.observe(handle)] == [False, True, True], "the others go on"
+    assert [node.running for node in status_of(bench.engine, handle)] == [False, True, True], "the others go on"
     os.kill(parents[nodes["1"]], signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "its end is seen")
-    assert bench.engine.observe(handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
+    wait_for(lambda: not status_of(bench.engine, handle)[1].running, 20, "its end is seen")
+    assert status_of(bench.engine, handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
     wait_for(lambda: ranks(bench) == [nodes["2"]], 5, "its rank went with it")
     step = parent(parent(parents[nodes["2"]]))  # between them is the shim
     assert "slurmstepd" in command(step)[0]
@@ -92,7 +93,7 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
         assert log.stat().st_size == size, "not a line"
         assert [checkpoint.name for checkpoint in list_checkpoints(bench.run)] == checkpoints, "and no checkpoint"
         assert read_outcome(bench.run, bench.job, 1, 1) is None
-        assert all(node.running for node in bench.engine.observe(second))
+        assert all(node.running for node in status_of(bench.engine, second))
     finally:
         bench.cluster.start("n2")
 
@@ -131,7 +132,7 @@ def test_a_stop_that_began_without_slurmctld_leaves_the_whole_grace_from_when_th
     time.sleep(6.0)
     bench.cluster.start("slurmctld")
     stopping.join(60 * PATIENCE)
-    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75] and bench.log().count("saved") == 2
+    assert [node.exit_code for node in status_of(bench.engine, handle)] == [75, 75] and bench.log().count("saved") == 2
 
 
 def test_a_frozen_slurmctld_is_named_by_the_gangs_that_run_and_by_those_that_are_stopped(
@@ -177,7 +178,7 @@ def test_slurmctld_is_away_for_a_while(bench: SlurmBench) -> None:
     bench.cluster.kill("slurmctld")
     with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
         bench.launch(bench.gang(suffix="2"))  # asks again while there is no answer
-    assert all(node.running for node in bench.engine.observe(handle)), "no news is no end"
+    assert all(node.running for node in status_of(bench.engine, handle)), "no news is no end"
     with pytest.raises(EngineError, match=r"^slurmctld does not answer \(.*\); see `scontrol ping`$"):
         SlurmEngine()
     bench.cluster.start("slurmctld")
@@ -192,7 +193,7 @@ def test_slurmctld_is_away_for_a_while(bench: SlurmBench) -> None:
     second = wait_for(launched, 30, "it is submitted")
     assert [node.exit_code for node in bench.ended(second)] == [4]
     bench.engine.stop(handle, 30.0)
-    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75] and bench.log().count("saved") == 2
+    assert [node.exit_code for node in status_of(bench.engine, handle)] == [75, 75] and bench.log().count("saved") == 2
 
 
 def test_the_time_limit_is_announced_so_that_the_nodes_save_and_leave(bench: SlurmBench) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,6 +23,7 @@ from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
+from orchestrator.persistence.job_pages import Cursor, read_page
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
@@ -57,8 +58,8 @@ class Wanted:
     search: str = ""
 
     def conditions(self) -> list[ColumnElement[bool]]:
-        """Of the rows, but for the states; jobs that the caller may not see are left out."""
-        found: list[ColumnElement[bool]] = [Job.parent.is_(None)]
+        """Of the rows, but for the states and arrays' children; jobs that the caller may not see are left out."""
+        found: list[ColumnElement[bool]] = []
         if (queues := permissions.visible_queues()) is not None:
             found.append(Job.queue.in_(queues))
         if self.queue:
@@ -68,6 +69,17 @@ class Wanted:
             within = [each.icontains(text, autoescape=True) for each in places]
             found.append(or_(*within, Job.id.istartswith(text, autoescape=True)))
         return found
+
+    def queues(self) -> Collection[str] | None:
+        """Those whose jobs are wanted and may be seen by the caller; None: all."""
+        visible = permissions.visible_queues()
+        if not self.queue:
+            return visible
+        return [self.queue] if visible is None or self.queue in visible else []
+
+    def is_any(self) -> bool:
+        """Whether all jobs are wanted."""
+        return not self.statuses and not self.search.strip() and self.queues() is None
 
     @property
     def in_states(self) -> list[ColumnElement[bool]]:
@@ -80,42 +92,70 @@ def find_jobs(
     status: list[Status] = Query(default=[], description="states; all where absent"),
     queue: str = Query(default="", max_length=128),
     search: str = Query(default="", max_length=200, description="part of a name, run or owner, or the start of an id"),
-    offset: int = Query(default=0, ge=0, lt=2**31),
+    after: str = Query(default="", max_length=200, description="`next` of a page: the jobs that are older"),
+    before: str = Query(default="", max_length=200, description="`previous` of a page: the jobs that are newer"),
     most: int = Query(default=JOBS_A_PAGE, ge=1, le=JOBS_A_PAGE, alias="max"),
     progress: bool = Query(default=True, description="whether to read the progress of trainings in the store"),
 ) -> dict[str, Any]:
-    """The jobs that the caller may see, the newest first, with the progress of trainings; ``total`` of them, and how many in each state."""
+    """The jobs that the caller may see, the newest first, with the progress of trainings; ``total`` of them, and how many in each state.
+
+    ``next`` and ``previous`` are the places of the pages beside this one; null where there is none.
+    """
     reconciler = reconciler_of(request)
     if queue:
         with reconciler.database.session() as session:
             if queue not in (known := queue_names(session)):
                 raise UnknownQueue(queue, known, 404)
-    return page_of_jobs(reconciler, Wanted(tuple(status), queue, search), offset, most, progress)
+    return page_of_jobs(reconciler, Wanted(tuple(status), queue, search), most, after, before, with_progress=progress)
 
 
 def page_of_jobs(
-    reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE, with_progress: bool = True
+    reconciler: Reconciler,
+    wanted: Wanted,
+    most: int = JOBS_A_PAGE,
+    after: str = "",
+    before: str = "",
+    *,
+    with_progress: bool = True,
 ) -> dict[str, Any]:
-    """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter."""
-    conditions = wanted.conditions()
+    """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter, and the places of the pages beside this one.
+
+    Raises RequestError for a place that is none.
+    """
+    places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
     with reconciler.database.session() as session:
-        grouped = select(Job.status, func.count()).where(*conditions).group_by(Job.status)
-        counts = {str(status): int(count) for status, count in session.execute(grouped)}
-        query = select(Job).where(*conditions, *wanted.in_states).order_by(Job.created_at.desc(), Job.id.desc())
-        query = query.options(selectinload(Job.attempts)).offset(offset).limit(most)
-        jobs = session.scalars(query).all()
-        rows = [_row(reconciler, session, job) for job in jobs]
+        if wanted.search.strip():  # only the rows tell
+            grouped = select(Job.status, func.count()).where(Job.parent.is_(None), *wanted.conditions())
+            counts = {str(status): int(count) for status, count in session.execute(grouped.group_by(Job.status))}
+            page = read_page(session, [*wanted.conditions(), *wanted.in_states], None, most, **places)
+        else:
+            kinds = reconciler.database.counts.of(wanted.queues())
+            counts = Counter[str]()
+            for (_, status), count in kinds.items():
+                counts[status] += count
+            own = [kind for kind in kinds if not wanted.statuses or kind[1] in wanted.statuses]
+            page = read_page(session, [], None if wanted.is_any() else own, most, **places)
+        rows = [_row(reconciler, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
     progress = _progress(reconciler, trainings)
-    found = [{**row, "progress": progress.get(row["id"])} for row, _ in rows]
     states = wanted.statuses or tuple(Status)
-    return {"jobs": found, "total": sum(counts.get(each, 0) for each in states), "counts": counts}
+    return {
+        "jobs": [{**row, "progress": progress.get(row["id"])} for row, _ in rows],
+        "total": sum(counts.get(each, 0) for each in states),
+        "counts": counts,
+        "next": None if page.is_last or not page.jobs else str(Cursor.of(page.jobs[-1])),
+        "previous": None if page.is_first or not page.jobs else str(Cursor.of(page.jobs[0])),
+    }
 
 
 def ids_of(session: Session, wanted: Wanted) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
     active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
-    query = select(Job.id).where(*wanted.conditions(), Job.status.in_(active)).order_by(Job.created_at, Job.id)
+    query = (
+        select(Job.id)
+        .where(Job.parent.is_(None), *wanted.conditions(), Job.status.in_(active))
+        .order_by(Job.created_at, Job.id)
+    )
     return list(session.scalars(query))
 
 

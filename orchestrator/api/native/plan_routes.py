@@ -19,13 +19,14 @@ from orchestrator.api.native.fitting import fit_of, named_queue
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
+from orchestrator.control.compute_environments import options_of
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import new_nodes
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
 
 router = APIRouter(route_class=StoreRoute)
@@ -71,7 +72,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             priority=definition.get("schedulingPriority", 0),
         )
         attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
-        gang = reconciler.attempts.gang(session, job, attempt, wanted)  # neither of them is stored
+        options = options_of(session.get(ComputeEnvironment, compute_environment), queue)
+        gang = reconciler.attempts.gang(job, attempt, wanted, options)  # neither of the two is stored
     planned = _planned(reconciler, replace(gang, bus_token="…") if gang.bus_token else gang)
     nodes = [
         {

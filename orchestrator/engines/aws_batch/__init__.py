@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orchestrator.engines.api import Engine, EngineError, EngineType, Option, SecretValues, Setting, Traits
 
-TRAITS = Traits(elastic=True, images=True, users=True, secrets=SecretValues.REFERENCES)
+TRAITS = Traits(elastic=True, images=True, users=True, secrets=SecretValues.REFERENCES, launches=8)
 
 
 def _make(setting: Setting) -> Engine:

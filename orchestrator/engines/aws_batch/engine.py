@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -32,6 +32,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodeStatus,
     NotYet,
@@ -43,6 +44,7 @@ from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
 from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
@@ -74,6 +76,8 @@ _TRANSIENT = (
 )
 _FAILURES = (ClientError, BotoCoreError, ResponseParserError)
 """Exceptions of boto3: AWS refuses, is not reached, or answers nonsense."""
+_DESCRIBED = 100
+"""Jobs and nodes that AWS describes in one request, at most."""
 _AWAY = 15.0
 """Seconds for which an AWS that did not answer is left alone."""
 
@@ -84,7 +88,8 @@ class _Watched:
 
     next: float = 0.0
     """When AWS is asked again (monotonic [s])."""
-    status: GangStatus | None = None
+    look: Look = ()
+    """The last status, empty before the first; or the error in its place."""
     trouble: str = ""
     """Why AWS could not be asked the last time."""
     over_since: float | None = None
@@ -96,6 +101,13 @@ class _Watched:
     logs: GangLogs | None = None
     stopped: bool = False
     """It was stopped: nothing of it runs, and nothing copies its logs."""
+
+    @property
+    def is_due(self) -> bool:
+        """Whether AWS is to be asked now: a gang of which nothing runs does not change any more."""
+        if isinstance(self.look, BaseException) or not self.look:
+            return True
+        return time.monotonic() >= self.next and any(node.running for node in self.look)
 
     @property
     def straggled(self) -> bool:
@@ -176,18 +188,15 @@ class AwsBatchEngine:
         }
         return Handle(self.name, gang.name, len(plan.nodes), facts)
 
-    def observe(self, handle: Handle) -> GangStatus:
-        with self._lock:
-            watched = self._gangs.setdefault(handle.gang, _Watched())
-        over = watched.status is not None and not any(node.running for node in watched.status)
-        if watched.status is None or (not over and time.monotonic() >= watched.next):
-            return self._look_again(handle, watched)
-        return watched.status
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        """AWS is asked for up to 100 jobs and nodes in a request, and for no gang twice within the interval of the configuration."""
+        watched = {handle: self._watched(handle) for handle in handles}
+        self._look_again([handle for handle in handles if watched[handle].is_due])
+        return [watched[handle].look for handle in handles]
 
     def stop(self, handle: Handle, grace: float) -> None:
         """AWS's own grace is 30 s, whatever ``grace`` says."""
-        with self._lock:
-            watched = self._gangs.setdefault(handle.gang, _Watched())
+        watched = self._watched(handle)
         job, asked = f"job {handle.facts['aws']}", False
 
         def step() -> str:
@@ -199,7 +208,10 @@ class AwsBatchEngine:
                     asked = True
             except EngineError as error:
                 problem = error
-            running = sum(node.running for node in self._look_again(handle, watched))
+            self._look_again([handle])
+            if isinstance(watched.look, BaseException):
+                raise watched.look
+            running = sum(node.running for node in watched.look)
             if problem is not None and running:  # else AWS has forgotten the job
                 raise problem
             return (watched.trouble or f"{counted(running, 'node')} of {job} running") if running else ""
@@ -269,43 +281,50 @@ class AwsBatchEngine:
 
     # -- watching -----------------------------------------------------------------------------------------------------
 
-    def _look_again(self, handle: Handle, watched: _Watched) -> GangStatus:
-        """Ask AWS; where it does not answer, the last status stays, and says that it is an old one."""
-        try:
-            watched.status, watched.trouble, pause = self._look(handle, watched), "", self.config.poll
-        except _FAILURES as error:
-            watched.trouble, pause = f"AWS Batch does not answer: {_words(error)}", _AWAY
-            known = watched.status or [NodeStatus(NodePhase.UNREACHABLE, words=watched.trouble)] * handle.nodes
-            watched.status = [
-                dataclasses.replace(node, stale=watched.trouble) if node.running else node for node in known
-            ]
-        watched.next = time.monotonic() + pause
-        return watched.status
+    def _watched(self, handle: Handle) -> _Watched:
+        with self._lock:
+            return self._gangs.setdefault(handle.gang, _Watched())
 
-    def _look(self, handle: Handle, watched: _Watched) -> GangStatus:
-        """AWS's status of every node."""
-        count, main = handle.nodes, handle.facts["main"]
-        parent, nodes = self._describe(handle)
-        if parent is None:
-            return [NodeStatus(NodePhase.ENDED, words=f"AWS Batch has no job {handle.facts['aws']} any more")] * count
-        if parent["status"] in TERMINAL and watched.over_since is None:
+    def _look_again(self, handles: Sequence[Handle]) -> None:
+        """Ask AWS; where it does not answer, the last status stays, and says that it is an old one."""
+        trouble, pause, described = "", self.config.poll, dict[str, Mapping[str, Any]]()
+        try:
+            described = self._describe([name for handle in handles for name in _ids(handle)])
+        except _FAILURES as error:
+            trouble, pause = f"AWS Batch does not answer: {_words(error)}", _AWAY
+        for handle in handles:
+            watched = self._watched(handle)
+            watched.trouble, watched.next = trouble, time.monotonic() + pause
+            if trouble:
+                unknown = [NodeStatus(NodePhase.UNREACHABLE, words=trouble)] * handle.nodes
+                known = unknown if isinstance(watched.look, BaseException) else watched.look or unknown
+                watched.look = [dataclasses.replace(node, stale=trouble) if node.running else node for node in known]
+            else:
+                [watched.look] = one_by_one(lambda handle: self._look(handle, described), [handle])
+
+    def _look(self, handle: Handle, described: Mapping[str, Mapping[str, Any]]) -> GangStatus:
+        """The status of every node, by what AWS has described."""
+        job, *nodes = [described.get(name) for name in _ids(handle)]
+        watched, main = self._watched(handle), handle.facts["main"]
+        if job is None:
+            gone = NodeStatus(NodePhase.ENDED, words=f"AWS Batch has no job {handle.facts['aws']} any more")
+            return [gone] * handle.nodes
+        if job["status"] in TERMINAL and watched.over_since is None:
             watched.over_since = time.monotonic()
-        watched.main_stopped = (nodes.get(main) or {}).get("stoppedAt")
-        status = [self._node(handle, watched, index, nodes.get(index) or parent, parent) for index in range(count)]
+        watched.main_stopped = (nodes[main] or {}).get("stoppedAt")
+        status = [self._node(handle, watched, index, node or job, job) for index, node in enumerate(nodes)]
         failed = not status[main].running and status[main].exit_code not in (0, EX_TEMPFAIL)
         if failed and any(node.running for node in status) and time.monotonic() - watched.ended[main] < _BLAME:
             status[main] = NodeStatus(NodePhase.RUNNING, status[main].address)
         return status
 
-    def _describe(self, handle: Handle) -> tuple[dict[str, Any] | None, dict[int, dict[str, Any]]]:
-        """The job, and its nodes by index: those that AWS tells of."""
-        ids = [handle.facts["aws"], *(f"{handle.facts['aws']}#{index}" for index in range(handle.nodes))]
-        found: dict[str, dict[str, Any]] = {}
-        for start in range(0, len(ids), 100):
-            for job in self._batch.describe_jobs(jobs=ids[start : start + 100])["jobs"]:
+    def _describe(self, ids: Sequence[str]) -> dict[str, Mapping[str, Any]]:
+        """What AWS tells of these jobs and nodes, by id; nothing of those that it does not have."""
+        found: dict[str, Mapping[str, Any]] = {}
+        for start in range(0, len(ids), _DESCRIBED):
+            for job in self._batch.describe_jobs(jobs=ids[start : start + _DESCRIBED])["jobs"]:
                 found[job["jobId"]] = job
-        nodes = {index: found[name] for index, name in enumerate(ids[1:]) if name in found}
-        return found.get(ids[0]), nodes
+        return found
 
     def _node(
         self,
@@ -423,6 +442,11 @@ def _is_transient(error: ClientError) -> bool:
     answer = error.response
     status = int(answer.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
     return answer.get("Error", {}).get("Code") in _TRANSIENT or status >= 500 or status == 429
+
+
+def _ids(handle: Handle) -> Sequence[str]:
+    """AWS's ids of the job and of each of its nodes."""
+    return [handle.facts["aws"], *(f"{handle.facts['aws']}#{index}" for index in range(handle.nodes))]
 
 
 def _words(error: Exception) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orchestrator.engines.api import Engine, EngineError, EngineType, SecretValues, Setting, Traits
 
-TRAITS = Traits(images=True, users=True, as_owner=True, secrets=SecretValues.ENVIRONMENT, gpu_ids=True)
+TRAITS = Traits(images=True, users=True, as_owner=True, secrets=SecretValues.ENVIRONMENT, launches=4, gpu_ids=True)
 
 
 def _make(setting: Setting) -> Engine:

@@ -38,6 +38,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodeStatus,
     NotYet,
@@ -50,6 +51,7 @@ from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.gpus import visible_gpus
+from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store import __version__
@@ -71,6 +73,8 @@ _LOOK = 1.0
 """Seconds for which a look at a node waits for the rest of its log."""
 _COPYING = 300.0
 """Seconds for which a stop waits for the logs of containers that have ended."""
+_RUNNING = ("created", "running", "paused", "restarting")
+"""States of a container that has not ended."""
 
 
 class DockerEngine:
@@ -125,18 +129,24 @@ class DockerEngine:
         with answered():
             return self._launch(plan)
 
-    def observe(self, handle: Handle) -> GangStatus:
-        """While Docker Engine does not answer, the nodes count as running."""
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        """In one request for all gangs, and one more for each container that has ended or whose log is not copied yet.
+
+        While Docker Engine does not answer, the nodes count as running.
+        """
         try:
             with answered():
-                status = self._observe(handle)
-            self._away = False
+                listed = self._listed()
         except NoAnswer as error:
             if not self._away:  # said once, not at every look
                 log.warning("engine docker: %s", error)
             self._away = True
-            return [NodeStatus(NodePhase.UNREACHABLE, address, str(error)) for address in handle.facts["addresses"]]
-        return status
+            return [
+                [NodeStatus(NodePhase.UNREACHABLE, address, str(error)) for address in handle.facts["addresses"]]
+                for handle in handles
+            ]
+        self._away = False
+        return one_by_one(lambda handle: self._observe(handle, listed.get(handle.gang, {})), handles)
 
     def stop(self, handle: Handle, grace: float) -> None:
         with answered():
@@ -147,7 +157,9 @@ class DockerEngine:
                 # what is not copied yet would go with the container
                 copies = list(self._copies_of(handle.gang).values())
                 stop_within(_COPYING, lambda: _uncopied(copies), engine=self.name, gang=handle.gang, pause=0.05)
-            self._ended[handle.gang] = dict(enumerate(self._observe(handle)))
+            self._ended[handle.gang] = dict(
+                enumerate(self._observe(handle, self._listed(handle.gang).get(handle.gang, {})))
+            )
             for gang in list(self._ended)[:-_REMEMBERED]:  # other stops do the same
                 self._ended.pop(gang, None)
             self._remove(handle.gang)
@@ -262,21 +274,32 @@ class DockerEngine:
         found = self._client.containers.list(all=True, filters={"label": f"{GANG}={gang}"}, ignore_removed=True)
         return {int(container.labels[NODE]): container for container in found}
 
-    def _observe(self, handle: Handle) -> GangStatus:
-        found, over = self._containers(handle.gang), self._ended.get(handle.gang, {})
-        status = []
-        for index, address in enumerate(handle.facts["addresses"]):
-            container = found.get(index)
-            if container is None:
-                status.append(over.get(index) or ended(address, None))
-                continue
-            self._follow(container, handle, index)
-            status.append(self._status(container, handle, index, address))
-        return status
+    def _listed(self, gang: str = "") -> dict[str, dict[int, Mapping[str, Any]]]:
+        """What Docker lists of the containers of all gangs, or of one, by gang and index of the node."""
+        found: dict[str, dict[int, Mapping[str, Any]]] = {}
+        for each in self._client.api.containers(all=True, filters={"label": f"{GANG}={gang}" if gang else GANG}):
+            found.setdefault(each["Labels"][GANG], {})[int(each["Labels"][NODE])] = each
+        return found
+
+    def _observe(self, handle: Handle, listed: Mapping[int, Mapping[str, Any]]) -> GangStatus:
+        with answered():
+            return [self._node(handle, index, listed.get(index)) for index in range(handle.nodes)]
+
+    def _node(self, handle: Handle, index: int, listed: Mapping[str, Any] | None) -> NodeStatus:
+        address, container = handle.facts["addresses"][index], None
+        if listed is not None:
+            if listed["State"] in _RUNNING and (PLAIN not in listed["Labels"] or self._is_followed(handle, index)):
+                return NodeStatus(NodePhase.RUNNING, address)
+            with contextlib.suppress(NotFound):  # a stop has removed it since it was listed
+                container = self._client.containers.get(listed["Id"])
+        if container is None:
+            return self._ended.get(handle.gang, {}).get(index) or ended(address, None)
+        self._follow(container, handle, index)
+        return self._status(container, handle, index, address)
 
     def _status(self, container: Container, handle: Handle, index: int, address: str) -> NodeStatus:
         state = container.attrs["State"]
-        if state["Status"] in ("created", "running", "paused", "restarting"):
+        if state["Status"] in _RUNNING:
             return NodeStatus(NodePhase.RUNNING, address)
         status = _ended(state, address)
         if container.labels.get(PLAIN):
@@ -302,19 +325,21 @@ class DockerEngine:
         record(handle, seen(handle, index, int(state["ExitCode"]), words, time.time()))
         return True
 
+    def _is_followed(self, handle: Handle, index: int) -> bool:
+        """Whether the log of a node is being copied."""
+        copy = self._copies.get(f"{handle.gang}/{index}")
+        return copy is not None and not copy.is_due_again
+
     def _follow(self, container: Container, handle: Handle, index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""
         if not container.labels.get(PLAIN):
             return
         key = f"{handle.gang}/{index}"
         with self._copying:  # a gang that is being stopped is looked at by two threads
-            before = self._copies.get(key)
-            if before is not None and not before.is_due_again:
-                return
-            if recorded(handle, index) is not None:
+            if self._is_followed(handle, index) or recorded(handle, index) is not None:
                 return
             path, limit = log_of(handle, index)
-            self._copies[key] = FollowedLog(container, path, limit, before)
+            self._copies[key] = FollowedLog(container, path, limit, self._copies.get(key))
 
     def _remove(self, gang: str) -> None:
         for container in self._containers(gang).values():

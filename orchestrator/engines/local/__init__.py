@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orchestrator.engines.api import Engine, EngineType, SecretValues, Setting, Traits
 
-TRAITS = Traits(users=True, secrets=SecretValues.ENVIRONMENT, gpu_ids=True)
+TRAITS = Traits(users=True, secrets=SecretValues.ENVIRONMENT, launches=4, gpu_ids=True)
 
 
 def _make(setting: Setting) -> Engine:

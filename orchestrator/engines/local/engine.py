@@ -27,6 +27,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodePlan,
     NodeStatus,
@@ -40,6 +41,7 @@ from orchestrator.engines.local.gangs import parent_of
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.environment import inherited
 from orchestrator.engines.toolkit.gpus import visible_gpus
+from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.cgroups import own_group, remove_abandoned_groups
@@ -130,7 +132,7 @@ class LocalEngine:
         port = next((shim.port for shim in found.values()), 0) or _port(gang.name)
         run = Store(gang.store).run(gang.run)
         nodes: dict[int, dict[str, object]] = {}
-        before = set(self._children)
+        started: list[int] = []
         try:
             for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
                 if index in found:
@@ -139,14 +141,14 @@ class LocalEngine:
                     pid, group = 0, ""
                 else:
                     group = plan.request[index].group
-                    pid = self._start(plan.request[index], port, gang.name, index)
+                    pid = self._start(plan.request[index], port, gang.name, index, started)
                 process, address = find_process(pid), plan.nodes[index].contract.address
                 start = process.start if process else ""
                 memory = plan.nodes[index].contract.memory_group
                 nodes[index] = {"pid": pid, "start": start, "address": address, "group": group, "memory": memory}
         except BaseException as error:  # never half a gang
             # by its pid: for a moment after it was started a process has no environment yet by which it would be found
-            for pid in self._children.keys() - before:
+            for pid in started:
                 child = self._children.pop(pid)
                 child.kill()
                 child.wait()
@@ -159,7 +161,10 @@ class LocalEngine:
             raise
         return Handle(self.name, gang.name, len(nodes), {"nodes": [nodes[index] for index in range(len(nodes))]})
 
-    def observe(self, handle: Handle) -> GangStatus:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        return one_by_one(self._observe, handles)
+
+    def _observe(self, handle: Handle) -> GangStatus:
         if handle.gang in self._ended:
             return self._ended[handle.gang]
         return [self._observe_node(handle.gang, index, node) for index, node in enumerate(handle.facts["nodes"])]
@@ -174,7 +179,7 @@ class LocalEngine:
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
         if left := end_nodes(nodes, [f"MUSTER_GANG={gang}"]):
             raise EngineError(f"{unkillable(left)}; its CPUs and GPUs are not given to other jobs until it is gone")
-        self._ended[gang] = self.observe(handle)
+        self._ended[gang] = self._observe(handle)
         while len(self._ended) > _REMEMBERED:
             self._ended.pop(next(iter(self._ended)), None)
         self._forget(gang, handle.facts["nodes"])
@@ -223,8 +228,8 @@ class LocalEngine:
         )
         return NodeProcess(whole, environment, group, gang.directory)
 
-    def _start(self, node: NodeProcess, port: int, gang: str, index: int) -> int:
-        """``port``: where the gang meets."""
+    def _start(self, node: NodeProcess, port: int, gang: str, index: int, started: list[int]) -> int:
+        """``port``: where the gang meets; ``started``: gets the pid as soon as there is one."""
         errors = self._left(gang, index, "err")
         errors.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         make_exit_file(str(self._left(gang, index, "exit")))
@@ -239,6 +244,7 @@ class LocalEngine:
                 start_new_session=True,
             )
         self._children[process.pid] = process
+        started.append(process.pid)
         await_marks(process.pid)
         return process.pid
 

@@ -29,6 +29,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodePlan,
     NodeStatus,
@@ -42,6 +43,7 @@ from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, r
 from orchestrator.engines.ray.folder import LEASE, NEW, UNSTARTED, Folder
 from orchestrator.engines.ray.request import GangRequest, NodeRequest
 from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store.files import read_json, write_json
@@ -178,7 +180,10 @@ class RayEngine:
         self._note(handle)
         return handle
 
-    def observe(self, handle: Handle) -> GangStatus:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        return one_by_one(self._observe, handles)
+
+    def _observe(self, handle: Handle) -> GangStatus:
         gang, count = handle.gang, handle.nodes
         folder = Folder.of(self.home, _job(gang))
         state = read_json(folder.state(gang))

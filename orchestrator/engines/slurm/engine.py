@@ -32,6 +32,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodeStatus,
     NotYet,
@@ -50,6 +51,7 @@ from orchestrator.engines.slurm.commands import (
 from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
@@ -134,7 +136,10 @@ class SlurmEngine:
         except Unreachable as error:
             raise NotYet(f"Slurm: {error}", unknown=True) from error
 
-    def observe(self, handle: Handle) -> GangStatus:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        return one_by_one(self._observe, handles)
+
+    def _observe(self, handle: Handle) -> GangStatus:
         facts, count = handle.facts, handle.nodes
         try:
             job = self._job(handle)

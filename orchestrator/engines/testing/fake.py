@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from orchestrator.domain.hosts import Capacity, Host, Hosts
-from orchestrator.engines.api import Cause, Gang, GangStatus, Handle, NodePhase, NodeStatus, Plan, Traits, node_plans
+from orchestrator.engines.api import (
+    Cause,
+    Gang,
+    GangStatus,
+    Handle,
+    Look,
+    NodePhase,
+    NodeStatus,
+    Plan,
+    Traits,
+    node_plans,
+)
 from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.looks import one_by_one
 
 
 @dataclass
@@ -48,6 +61,8 @@ class FakeEngine:
         """Names of the threads on which it was called for its hosts, launches and looks."""
         self.closed = 0
         """Number of times that it was closed."""
+        self.looks = 0
+        """Number of times that it was asked for statuses."""
 
     def capacity(self) -> Capacity:
         self._called()
@@ -65,10 +80,14 @@ class FakeEngine:
             self.cluster.gangs[name] = nodes
         return Handle(self.name, name, len(plan.nodes), {})
 
-    def observe(self, handle: Handle) -> GangStatus:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
         self._called()
-        unknown = [ended("", None)] * handle.nodes
-        return list(self.cluster.gangs.get(handle.gang, unknown))
+        self.looks += 1
+        return one_by_one(self._observe, handles)
+
+    def _observe(self, handle: Handle) -> GangStatus:
+        nodes = self.cluster.gangs.get(handle.gang)
+        return [ended("", None)] * handle.nodes if nodes is None else list(nodes)
 
     def stop(self, handle: Handle, grace: float) -> None:
         if self.error is not None:

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.api import Handle, NodePhase, NodeStatus, NotYet, read_handle
 from orchestrator.engines.testing.rigs import Rig
+from orchestrator.engines.toolkit.looks import status_of
 
 LIMIT = 120.0
 """Seconds after which a test fails that waits for an engine."""
@@ -77,20 +78,20 @@ class EngineSuite:
         for index in range(2):
             await_node(rig, found, index, NodePhase.RUNNING)
         successor.stop(found, 1.0)
-        assert not any(node.running for node in successor.observe(found))
+        assert not any(node.running for node in status_of(successor, found))
 
     def test_a_stop_leaves_nothing_that_runs_and_may_be_asked_for_again(self, rig: Rig) -> None:
         handle = launch(rig, "stopped", 2)
         for _ in range(2):
             rig.engine.stop(handle, 1.0)
-            status = rig.engine.observe(handle)
+            status = status_of(rig.engine, handle)
             assert [node.phase for node in status] == [NodePhase.ENDED] * 2, status
 
     def test_stopping_one_gang_leaves_the_others_alone(self, rig: Rig) -> None:
         first, second = launch(rig, "first", 1), launch(rig, "second", 1)
         rig.engine.stop(first, 1.0)
-        assert [node.running for node in rig.engine.observe(second)] == [True]
-        assert [node.running for node in rig.engine.observe(first)] == [False]
+        assert [node.running for node in status_of(rig.engine, second)] == [True]
+        assert [node.running for node in status_of(rig.engine, first)] == [False]
 
     def test_gangs_are_stopped_on_other_threads_while_they_are_looked_at(self, rig: Rig) -> None:
         handles = [launch(rig, f"beside-{number}", 1) for number in range(3)]
@@ -107,9 +108,9 @@ class EngineSuite:
             thread.start()
         while any(thread.is_alive() for thread in threads):
             for handle in handles:
-                assert len(rig.engine.observe(handle)) == 1
+                assert len(status_of(rig.engine, handle)) == 1
         assert errors == [], "of a stop"
-        assert not any(node.running for handle in handles for node in rig.engine.observe(handle))
+        assert not any(node.running for handle in handles for node in status_of(rig.engine, handle))
 
     def test_an_engine_that_was_never_used_can_be_closed(self, rig: Rig) -> None:
         rig.new_engine().close()
@@ -141,7 +142,7 @@ def await_node(rig: Rig, handle: Handle, index: int, phase: NodePhase) -> NodeSt
     """Look until the node is in that phase."""
     deadline = time.monotonic() + LIMIT
     while True:
-        status = rig.engine.observe(handle)
+        status = status_of(rig.engine, handle)
         assert len(status) == handle.nodes, f"{len(status)} nodes of {handle.nodes}"
         if status[index].phase is phase:
             return status[index]

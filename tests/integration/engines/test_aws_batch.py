@@ -21,6 +21,7 @@ from orchestrator.engines.api import EngineError, Gang, NotYet, Transient
 from orchestrator.engines.aws_batch import engine as aws_batch
 from orchestrator.engines.aws_batch.config import AwsConfig, is_mounted_from, save_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
+from orchestrator.engines.toolkit.looks import status_of
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
 from tests.conftest import Serving, call_muster, wait_for
@@ -262,7 +263,7 @@ def test_gangs_that_come_and_go_double_no_line_of_another(bench: AwsBench, monke
     monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
     script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"
     running = bench.launch(bench.gang(script, 1, native=False))
-    wait_for(lambda: bench.engine.observe(running) and "tick 1" in bench.log(), 20, "its first line")
+    wait_for(lambda: status_of(bench.engine, running) and "tick 1" in bench.log(), 20, "its first line")
     for attempt in (2, 3):
         short = bench.launch(bench.gang("true", 1, native=False, attempt=attempt))
         bench.ended(short)
@@ -314,7 +315,7 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
     handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
 
     def reason() -> str:
-        [node] = bench.engine.observe(handle)
+        [node] = status_of(bench.engine, handle)
         assert node.running
         return node.words if "500" in node.words else ""
 
@@ -325,7 +326,7 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
     away = AwsBench(bench.aws, bench.home)
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
     away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
-    [node] = away.engine.observe(handle)
+    [node] = status_of(away.engine, handle)
     assert node.running and "does not answer" in node.words and node.stale == node.words
     bench.engine._batch, there = nowhere, bench.engine._batch
     monkeypatch.setattr(aws_batch, "_ENDING", 0.1)
@@ -333,7 +334,7 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
         Transient, match=r"^the aws-batch engine has not ended gang .*; last answer: AWS Batch does not"
     ):
         bench.engine.stop(handle, 0)
-    [node] = bench.engine.observe(handle)
+    [node] = status_of(bench.engine, handle)
     assert "500" in node.words and "does not answer" in node.stale, "the last status, told as an old one"
     monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
     with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):

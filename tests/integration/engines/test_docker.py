@@ -18,6 +18,7 @@ from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import CannotStart, EngineError, Gang, NotYet
 from orchestrator.engines.docker import engine as docker_engine
 from orchestrator.engines.docker.engine import DockerEngine
+from orchestrator.engines.toolkit.looks import status_of
 from shared_store import __version__
 from shared_store.log_files import LogWriter
 from tests.conftest import REPOSITORY, wait_for
@@ -251,7 +252,7 @@ def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: DockerBench)
 
     def refused() -> bool:
         try:
-            return not bench.engine.observe(handle)
+            return not status_of(bench.engine, handle)
         except IsADirectoryError:
             return True
 
@@ -278,9 +279,9 @@ def test_a_gang_that_does_not_heed_sigterm_gets_sigkill_after_the_grace(bench: D
 def test_a_killed_or_removed_container_is_a_node_that_ended(bench: DockerBench, blow: Callable[[Any], None]) -> None:
     handle = bench.launch(bench.gang(nodes=2))
     blow(bench.engine._containers(f"{bench.job}/1/1")[1])
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 10, "its end is seen")
-    assert bench.engine.observe(handle)[0].running
-    assert bench.engine.observe(handle)[1].exit_code in (137, None)
+    wait_for(lambda: not status_of(bench.engine, handle)[1].running, 10, "its end is seen")
+    assert status_of(bench.engine, handle)[0].running
+    assert status_of(bench.engine, handle)[1].exit_code in (137, None)
 
 
 def test_a_missing_image_fails_in_docker_s_words_and_leaves_nothing(bench: DockerBench) -> None:

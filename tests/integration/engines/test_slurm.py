@@ -18,6 +18,7 @@ from orchestrator.engines.slurm import script as slurm_script
 from orchestrator.engines.slurm.commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm.engine import SlurmEngine
 from orchestrator.engines.slurm.states import ending, waiting
+from orchestrator.engines.toolkit.looks import status_of
 from tests.conftest import Serving, wait_for
 from tests.support.engines.sites import STUBBORN, WAIT
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
@@ -34,7 +35,7 @@ def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBenc
     try:
         assert [host.away for host in SlurmEngine().capacity().machines] == [False, True, False]
         handle = bench.launch(bench.gang(nodes=3))
-        wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].words, 20, "it is queued")
+        wait_for(lambda: "nodes that it needs are down" in status_of(bench.engine, handle)[0].words, 20, "it is queued")
         bench.engine.stop(handle, 0.0)
     finally:
         bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
@@ -109,8 +110,8 @@ def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, m
     assert [env["SLURMD_NODENAME"] for env in told] == ["n2", "n1", "n3"], "which comes first"
     addresses = bench.cluster.addresses
     assert [env["MUSTER_ADDRESS"] for env in told] == [addresses[name] for name in ("n2", "n1", "n3")]
-    assert [node.address for node in bench.engine.observe(handle)] == [env["MUSTER_ADDRESS"] for env in told]
-    assert [node.host for node in bench.engine.observe(handle)] == ["slurm/n2", "slurm/n1", "slurm/n3"]
+    assert [node.address for node in status_of(bench.engine, handle)] == [env["MUSTER_ADDRESS"] for env in told]
+    assert [node.host for node in status_of(bench.engine, handle)] == ["slurm/n2", "slurm/n1", "slurm/n3"]
     for env in told:
         assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
         assert env["SLURM_JOB_NAME"] == gang.title
@@ -149,8 +150,8 @@ def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitt
     successor = bench.new_engine()
     assert successor.launch(successor.plan(gang)) == handle, "found, not submitted twice"
     bench.ready(gang)
-    assert all(node.running for node in SlurmEngine().observe(handle)) or wait_for(
-        lambda: all(node.running and not node.words for node in successor.observe(handle)), 10, "known by its handle"
+    assert all(node.running for node in status_of(SlurmEngine(), handle)) or wait_for(
+        lambda: all(node.running and not node.words for node in status_of(successor, handle)), 10, "known by its handle"
     )
     bench.engine.stop(handle, 0.0)
     assert successor.launch(successor.plan(gang)) == handle, "an ended one, too"
@@ -172,7 +173,7 @@ def look(handle: Handle) -> list[NodeStatus]:
     """The status that a new engine, without a memory, gets from Slurm."""
     engine = SlurmEngine()
     return wait_for(
-        lambda: status if not (status := list(engine.observe(handle)))[0].running else None, 10, "an answer"
+        lambda: status if not (status := list(status_of(engine, handle)))[0].running else None, 10, "an answer"
     )
 
 
@@ -181,7 +182,7 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
     small = bench.launch(bench.gang(cpus=4, suffix="2"))
 
     def waits(text: str, handle: Handle = small) -> bool:
-        [first, *_] = bench.engine.observe(handle)
+        [first, *_] = status_of(bench.engine, handle)
         return first.running and not first.address and text in first.words
 
     wait_for(lambda: waits("waits for nodes to become free (Resources; job"), 20, "its reason")
@@ -195,7 +196,7 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
     [node] = bench.ended(closed)
     assert node.words.startswith("it was cancelled in Slurm, not by Muster (job "), node
     bench.engine.stop(small, 5.0)
-    assert bench.state(small) == "CANCELLED" and not bench.engine.observe(small)[0].running
+    assert bench.state(small) == "CANCELLED" and not status_of(bench.engine, small)[0].running
     bench.engine.stop(big, 0.0)
 
 
@@ -264,7 +265,7 @@ def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: SlurmBench
         handle = bench.launch(bench.gang(nodes=2, suffix=str(number)))
         time.sleep(pause)
         bench.engine.stop(handle, 3.0)
-        assert not bench.processes() and not any(n.running for n in bench.engine.observe(handle))
+        assert not bench.processes() and not any(n.running for n in status_of(bench.engine, handle))
 
 
 def test_a_directory_missing_on_a_node_is_one_line_with_the_node_s_name(bench: SlurmBench) -> None:

@@ -38,6 +38,7 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.engines.toolkit.looks import status_of
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.transience import is_final
 from orchestrator.spec.compile import compile_definition
@@ -141,8 +142,8 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
         handle = launched(several, gang(tmp_path))
         wait_for(lambda: observed(several, handle), 10, "the first picture")
         for error, said in (
-            (OSError(errno.EMFILE, "Too many"), "can't look at the gang now ([Errno 24] Too many)"),
-            (RuntimeError("no\nwords"), "failed to look at the gang (RuntimeError: no words)"),
+            (OSError(errno.EMFILE, "Too many"), "can't look at its gangs now ([Errno 24] Too many)"),
+            (RuntimeError("no\nwords"), "failed to look at its gangs (RuntimeError: no words)"),
         ):
             fake.error = error
             [node] = wait_for(
@@ -156,7 +157,7 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
         fake.error = None
         wait_for(lambda: (s := observed(several, handle)) and not s[0].words, 20, "that it is seen again")
         assert [node.running for node in several.stop(handle, 0)] == [False]
-    looks = [record for record in caplog.records if "look at the gang" in record.getMessage()]
+    looks = [record for record in caplog.records if "look at its gangs" in record.getMessage()]
     assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
 
 
@@ -174,7 +175,7 @@ def test_without_descriptors_no_gang_counts_as_dead_and_no_half_gang_is_started(
                 while True:
                     taken.append(os.open("/dev/null", os.O_RDONLY))
             with pytest.raises(OSError, match="Too many open files"):
-                engine.observe(read_handle(handle))
+                status_of(engine, read_handle(handle))
             for spare in range(12):  # wherever it runs out of them
                 for descriptor in taken[-spare:] if spare else []:
                     os.close(descriptor)

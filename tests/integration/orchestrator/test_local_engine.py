@@ -18,6 +18,7 @@ import pytest
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Cause, EngineError, Gang, Handle
 from orchestrator.engines.local.engine import LocalEngine
+from orchestrator.engines.toolkit.looks import status_of
 from shared_store.epoch import raise_epoch
 from shared_store.processes import children, end_all, find_process, marked
 from tests.conftest import wait_for
@@ -226,11 +227,11 @@ def test_launching_again_starts_only_the_node_that_is_missing(bench: LocalBench)
     assert bench.launch(gang) == handle == bench.launch(gang, bench.new_engine()), "none is, here"
     assert sorted(bench.processes()) == before
     os.kill(pids(handle)[1], signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 5, "the end of node 1")
+    wait_for(lambda: not status_of(bench.engine, handle)[1].running, 5, "the end of node 1")
     again = bench.launch(gang)
     assert pids(again)[0] == pids(handle)[0]
     assert pids(again)[1] != pids(handle)[1]
-    assert [node.running for node in bench.engine.observe(again)] == [True, True]
+    assert [node.running for node in status_of(bench.engine, again)] == [True, True]
 
 
 def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: LocalBench) -> None:
@@ -243,7 +244,7 @@ def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: Loc
     handle = bench.launch(gang)
     wait_for(lambda: len(bench.printed()) == 2, 10, "two nodes")
     os.kill(pids(handle)[1], signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 5, "the end of node 1")
+    wait_for(lambda: not status_of(bench.engine, handle)[1].running, 5, "the end of node 1")
     bench.launch(gang)
     wait_for(lambda: len(bench.printed()) == 3, 10, "node 1 again")
     assert len({text for _, text in bench.printed()}) == 1
@@ -253,7 +254,7 @@ def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench
     handle = bench.ready(bench.gang(nodes=1))
     [node] = handle.facts["nodes"]
     other = replace(handle, facts={"nodes": [{**node, "start": "1"}]})
-    assert not bench.new_engine().observe(other)[0].running
+    assert not status_of(bench.new_engine(), other)[0].running
 
 
 def test_output_of_a_supervisor_before_it_reaches_the_store_is_reported(bench: LocalBench) -> None:
@@ -262,7 +263,7 @@ def test_output_of_a_supervisor_before_it_reaches_the_store_is_reported(bench: L
     [node] = bench.ended(handle)
     said = "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving"
     assert (node.exit_code, node.words) == (3, said)
-    assert bench.new_engine().observe(handle) == [node], "a later controller knows it, too"
+    assert status_of(bench.new_engine(), handle) == [node], "a later controller knows it, too"
 
 
 # -- stopping ---------------------------------------------------------------------------------------------------------
@@ -320,7 +321,9 @@ def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: LocalBench) -> None:
     bench.ended(handles[2])
     for handle in handles:
         bench.engine.stop(handle, 5.0)
-    assert bench.engine.observe(handles[2])[0].words.startswith("muster supervisor: run run: this attempt has epoch 4")
+    assert status_of(bench.engine, handles[2])[0].words.startswith(
+        "muster supervisor: run run: this attempt has epoch 4"
+    )
     assert list((bench.home / "home" / "supervisors").iterdir()) == []
     assert not bench.engine._children
 

@@ -134,9 +134,9 @@ class PoisonedEngine(FakeEngine):
         self._check("launch", plan.gang.job)
         return super().launch(plan)
 
-    def observe(self, handle: Handle) -> GangStatus:
+    def _observe(self, handle: Handle) -> GangStatus:
         self._check("observe", handle.gang.partition("/")[0])
-        return super().observe(handle)
+        return super()._observe(handle)
 
     def stop(self, handle: Handle, grace: float) -> None:
         self._check("stop", handle.gang.partition("/")[0])

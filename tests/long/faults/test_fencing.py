@@ -11,6 +11,7 @@ from orchestrator.domain.gang import gang_needs
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Gang
 from orchestrator.engines.local.engine import LocalEngine
+from orchestrator.engines.toolkit.looks import status_of
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition
 from shared_store.checkpoints import list_checkpoints
@@ -66,11 +67,11 @@ def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(
         signal_all(frozen, signal.SIGCONT)
         wait_for(lambda: not processes_of(store.path, MUSTER_JOB_ID=STALE), 10, "the end of the gang that woke")
 
-        wait_for(lambda: not engine.observe(stale)[0].running, 5, "its supervisor's end")
-        assert engine.observe(stale)[0].exit_code == 3
+        wait_for(lambda: not status_of(engine, stale)[0].running, 5, "its supervisor's end")
+        assert status_of(engine, stale)[0].exit_code == 3
         assert (log.stat().st_size, (run.metrics / "metrics-e1.jsonl").stat().st_size) == before
         assert not run.outcome(STALE, 1, 0).exists()
-        assert engine.observe(successor)[0].running
+        assert status_of(engine, successor)[0].running
         newest = list_checkpoints(run)[-1]
         wait_for(lambda: list_checkpoints(run)[-1].iteration > newest.iteration + 3, 60, "undisturbed progress")
         assert all(checkpoint.epoch == 2 for checkpoint in list_checkpoints(run)[-3:])

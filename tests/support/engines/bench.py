@@ -9,6 +9,7 @@ from typing import Any
 
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
+from orchestrator.engines.toolkit.looks import status_of
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower, LogLine
@@ -98,7 +99,7 @@ class Bench(ABC):
         handle = self.launch(gang)
 
         def said() -> bool:
-            self.engine.observe(handle)  # as a controller does all the time
+            status_of(self.engine, handle)  # as a controller does all the time
             return self.log(gang.attempt, job=gang.job, run=gang.run).count("ready") == len(gang.commands)
 
         wait_for(said, 60, f"{len(gang.commands)} ready nodes")
@@ -108,7 +109,7 @@ class Bench(ABC):
         """Wait until all nodes have ended; returns how."""
 
         def over() -> list[NodeStatus] | None:
-            status = list((engine or self.engine).observe(handle))
+            status = list(status_of(engine or self.engine, handle))
             return None if any(node.running for node in status) else status
 
         found: list[NodeStatus] = wait_for(over, 60, "the gang's end")
@@ -118,7 +119,7 @@ class Bench(ABC):
         """Stop the only gang and check that nothing of it is left; returns the exit codes."""
         self.engine.stop(handle, grace)
         self.nothing_is_left()
-        return [node.exit_code for node in self.engine.observe(handle)]
+        return [node.exit_code for node in status_of(self.engine, handle)]
 
     # -- logs, outcomes, processes ------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from typing import Any
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Gang, Handle
 from orchestrator.engines.ray.engine import RayEngine
+from orchestrator.engines.toolkit.looks import status_of
 from tests.support.engines.bench import Bench
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.engines.sites import WAIT
@@ -44,7 +45,7 @@ class RayBench(Bench):
     def stopped_there(self, handle: Handle) -> list[int | None]:
         """Exit codes of a gang that lost its third node, where that may go on until it ends itself."""
         self.engine.stop(handle, 5.0)
-        return [node.exit_code for node in self.engine.observe(handle)][:2]
+        return [node.exit_code for node in status_of(self.engine, handle)][:2]
 
     def driver(self) -> int:
         [pid] = processes_of(self.home / "home")

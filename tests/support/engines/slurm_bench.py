@@ -12,6 +12,7 @@ import pytest
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Gang, Handle
 from orchestrator.engines.slurm.engine import SlurmEngine
+from orchestrator.engines.toolkit.looks import status_of
 from tests.support.engines.bench import Bench
 from tests.support.engines.sites import WAIT
 from tests.support.engines.slurm_cluster import SlurmCluster
@@ -48,7 +49,7 @@ class SlurmBench(Bench):
 
     def ready(self, gang: Gang) -> Handle:
         handle = super().ready(gang)
-        wait_for(lambda: all(node.address for node in self.engine.observe(handle)), 10, "Slurm says so")
+        wait_for(lambda: all(node.address for node in status_of(self.engine, handle)), 10, "Slurm says so")
         return handle
 
     def state(self, handle: Handle) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from orchestrator.domain.hosts import Capacity, Host, Hosts
@@ -10,6 +11,7 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
+    Look,
     NodePhase,
     NodeStatus,
     NotYet,
@@ -18,6 +20,7 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.looks import one_by_one
 from tests.support.simulation.cluster import SimulatedNode
 
 if TYPE_CHECKING:
@@ -57,8 +60,11 @@ class SimulatedEngine:
         self._reach()  # the answer may be lost
         return Handle(self.name, gang.name, len(plan.nodes), {})
 
-    def observe(self, handle: Handle) -> GangStatus:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
         self._reach()
+        return one_by_one(self._observe, handles)
+
+    def _observe(self, handle: Handle) -> GangStatus:
         found = self._world.cluster.gangs.get(handle.gang)
         return [ended("", None)] * handle.nodes if found is None else [_status(node) for node in found.nodes]
 

@@ -43,6 +43,9 @@ class SimulatedMachine(Machine):
         self._count = 0
         self._hub = greenlet.getcurrent()
 
+    def processor_time(self) -> float:
+        return 0.0
+
     def monotonic(self) -> float:
         return self.time
 

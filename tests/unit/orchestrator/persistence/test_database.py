@@ -158,6 +158,10 @@ def submitted(session: Session, name: str, queue: str, at: int) -> Job:
     return added
 
 
+def recorded(session: Session, run: Run, job: Job) -> RunRecord:
+    return record_owner(session, run, job, session.get(RunRecord, run.name))
+
+
 def known(record: RunRecord | None) -> tuple[str, str | None] | None:
     return (record.queue, record.owner) if record else None
 
@@ -167,14 +171,14 @@ def test_a_run_belongs_to_its_first_job_until_a_later_one_creates_it(session: Se
     submitted(session, "a", "robots", 1)
     later = submitted(session, "b", "lab", 2)
     assert known(owner_of(session, run)) == ("robots", "key robots")
-    assert known(record_owner(session, run, later)) == ("lab", "key lab")
+    assert known(recorded(session, run, later)) == ("lab", "key lab")
     run.create({"run": "r", "queue": "other"})
     assert known(owner_of(session, run)) == ("lab", "key lab")  # the database's record comes first
 
 
 def test_a_recreated_run_of_an_old_name_belongs_to_its_new_creator(session: Session, run: Run) -> None:
     first = submitted(session, "a", "robots", 1)
-    record_owner(session, run, first)
+    recorded(session, run, first)
     run.create({"run": "r", "queue": "robots"})
     first.status = "SUCCEEDED"
     session.commit()
@@ -182,7 +186,7 @@ def test_a_recreated_run_of_an_old_name_belongs_to_its_new_creator(session: Sess
     assert owner_of(session, run) is None, "no caller is refused a run that does not exist"
     second = submitted(session, "b", "lab", 2)
     assert known(owner_of(session, run)) == ("lab", "key lab"), "before it has started, too"
-    record_owner(session, run, second)
+    recorded(session, run, second)
     run.create({"run": "r", "queue": "lab"})
     session.rollback()  # as where the controller is killed before it records the attempt
     assert known(owner_of(session, run)) == ("lab", "key lab")
@@ -190,19 +194,19 @@ def test_a_recreated_run_of_an_old_name_belongs_to_its_new_creator(session: Sess
 
 def test_a_run_keeps_its_owner_while_the_volume_of_the_store_is_away(session: Session, run: Run) -> None:
     first = submitted(session, "a", "robots", 1)
-    record_owner(session, run, first)
+    recorded(session, run, first)
     run.create({"run": "r", "queue": "robots"})
     first.status = "SUCCEEDED"
     store = run.path.parent.parent
     store.rename(store.with_name("away"))
     later = submitted(session, "b", "lab", 2)
-    assert known(owner_of(session, run)) == known(record_owner(session, run, later)) == ("robots", "key robots")
+    assert known(owner_of(session, run)) == known(recorded(session, run, later)) == ("robots", "key robots")
 
 
 def test_an_existing_run_keeps_its_owner_whichever_job_continues_it(session: Session, run: Run) -> None:
     run.create({"run": "r", "queue": "robots", "owner": "key x"})
     later = submitted(session, "a", "lab", 1)
-    assert known(record_owner(session, run, later)) == ("robots", "key x")
+    assert known(recorded(session, run, later)) == ("robots", "key x")
 
 
 @pytest.mark.parametrize("content", [b"{}", b"damaged", b'{"queue": 7}', b"[" * 100_000])
@@ -210,7 +214,7 @@ def test_a_run_without_a_queue_exists_and_has_no_owner(session: Session, run: Ru
     run.path.mkdir()
     (run.path / "run.json").write_bytes(content)
     assert known(owner_of(session, run)) == ("", None)
-    assert known(record_owner(session, run, submitted(session, "a", "lab", 1))) == ("lab", "key lab")
+    assert known(recorded(session, run, submitted(session, "a", "lab", 1))) == ("lab", "key lab")
 
 
 _CANCELLED, _TERMINATED, _LEFT = ("c", True), ("t", False), (None, False)
