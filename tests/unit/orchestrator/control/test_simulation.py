@@ -17,7 +17,7 @@ FOUND_AT = {
     "B1": (0, "is ended without a cause: lost"),
     "B2": (0, "is ended without a cause: lost"),
     "B3": (1, "the loop waits for a call"),
-    "B4": (1, "the loop waits for a call"),
+    "B4": (21, "the loop waits for a call"),
     "B9": (0, "is to be launched, although it is preempted"),
     "fault": (0, "is launched after ValueError in train.py, line 3 ended attempts"),
     "look": (0, "runs, and its job is STARTING"),
