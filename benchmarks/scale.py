@@ -5,7 +5,7 @@
     python -m benchmarks.scale durable [--gangs 3000]    # gangs of one node, started and ended: store and database on this disk
     python -m benchmarks.scale memory [--gangs 10000]    # the same with the store in memory
 
-Processor time is that of the whole process, so of the fake engine, too. A loaded machine is refused: :mod:`benchmarks.load`.
+Processor time is that of the whole process, so of the submission and the fake engine, too. A loaded machine is refused: :mod:`benchmarks.load`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import func, select
-
 from benchmarks.load import Watch, add_option
+from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.peers import Peers
@@ -141,9 +141,16 @@ class Bench:
             queued_since=self_now(),
         )
 
-    def count(self, *states: str) -> int:
-        with self.database.session() as session:
-            return session.scalar(select(func.count()).where(Job.status.in_(states))) or 0
+    def have(self, count: int, *states: str) -> bool:
+        """Whether so many jobs are in these states."""
+        return sum(number for (_, state), number in self.database.counts.of().items() if state in states) == count
+
+    def is_stopped(self, gang: str) -> bool:
+        return not self.engine.cluster.gangs[gang][0].running
+
+    def is_newest_other(self, gang: str) -> bool:
+        """Whether another gang was launched since this one."""
+        return next(reversed(self.engine.cluster.gangs)) != gang
 
     def wait(self, condition: Callable[[], bool], what: str, seconds: float = 600.0, pause: float = 0.1) -> None:
         deadline = time.monotonic() + seconds
@@ -168,6 +175,7 @@ def self_now() -> int:
 @contextmanager
 def controller(engine: FakeEngine, store_type: type[RunStore], watch: Watch) -> Iterator[Bench]:
     """A controller that runs, on a database in a folder of its own."""
+    machine.collect_seldom()  # as the server does
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         home = Path(folder)
         (home / "store").mkdir()
@@ -194,20 +202,20 @@ def running(count: int, watch: Watch) -> None:
     with controller(FakeEngine(capacity=large(count)), MemoryStore, watch) as bench:
         began, used = time.monotonic(), time.process_time()
         bench.submit(count)
-        bench.wait(lambda: bench.count(Status.RUNNING) == count, "all run")
+        bench.wait(partial(bench.have, count, Status.RUNNING), "all run")
         print(
             f"{count} gangs run after {time.monotonic() - began:.1f} s, {time.process_time() - used:.1f} s of CPU",
             flush=True,
         )
         print(f"idle: {100 * bench.idle():.2f} % of a core", flush=True)
-        for name in [f"job-{count // 2:06d}", "job-000001", f"job-{count - 1:06d}"]:
+        for number, name in enumerate((f"job-{count // 2:06d}", "job-000001", f"job-{count - 1:06d}")):
             began, used = time.monotonic(), time.process_time()
             with bench.database.session() as session:
                 ask_to_end(session, Job.id == name, "stopped by the benchmark")
             gang = f"{name}/1/1"
-            bench.wait(lambda gang=gang: not bench.engine.cluster.gangs[gang][0].running, "stopped", pause=0.002)
+            bench.wait(partial(bench.is_stopped, gang), "stopped", pause=0.002)
             taken = time.monotonic() - began
-            bench.wait(lambda: bench.count(*TERMINAL) > 0, "ended", pause=0.02)
+            bench.wait(partial(bench.have, 1 + number, *TERMINAL), "ended", pause=0.02)
             print(f"a stop reaches the engine after {taken:.3f} s; CPU {time.process_time() - used:.3f} s", flush=True)
         print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
@@ -216,18 +224,18 @@ def gang(nodes: int, watch: Watch) -> None:
     """One gang of many nodes: idle, and a restart."""
     with controller(FakeEngine(capacity=large(nodes)), WithoutOutcomes, watch) as bench:
         bench.submit(1, nodes=nodes, attempts=9)
-        bench.wait(lambda: bench.count(Status.RUNNING) == 1, "it runs")
+        bench.wait(partial(bench.have, 1, Status.RUNNING), "it runs")
         print(f"idle: {100 * bench.idle():.2f} % of a core", flush=True)
         for attempt in (1, 2, 3):
             began, used = time.monotonic(), time.process_time()
-            name = next(iter(reversed(bench.engine.cluster.gangs)))
+            name = next(reversed(bench.engine.cluster.gangs))
             bench.engine.cluster.end(name, nodes // 2, 137)
-            bench.wait(lambda name=name: list(bench.engine.cluster.gangs)[-1] != name, "launched anew", pause=0.01)
+            bench.wait(partial(bench.is_newest_other, name), "launched anew", pause=0.01)
             print(
                 f"restart {attempt}: {time.monotonic() - began:.2f} s, CPU {time.process_time() - used:.2f} s",
                 flush=True,
             )
-            bench.wait(lambda: bench.count(Status.RUNNING) == 1, "it runs")
+            bench.wait(partial(bench.have, 1, Status.RUNNING), "it runs")
             time.sleep(2.0)
 
 
@@ -239,10 +247,10 @@ def short(count: int, watch: Watch, *, durable: bool) -> None:
         for first, more in ((0, count // 10), (count // 10, count)):  # the first warm up
             began, used = time.monotonic(), time.process_time()
             bench.submit(more, first=first)
-            bench.wait(lambda first=first, more=more: bench.count(*TERMINAL) == first + more, "all have ended")
+            bench.wait(partial(bench.have, first + more, *TERMINAL), "all have ended")
             wall, cpu = time.monotonic() - began, time.process_time() - used
             print(f"{more} gangs: {more / wall:.0f} a second; CPU {1000 * cpu / more:.2f} ms each", flush=True)
-        assert bench.count(Status.SUCCEEDED) == count + count // 10
+        assert bench.have(count + count // 10, Status.SUCCEEDED)
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import uvicorn
 
+from orchestrator import machine
 from orchestrator.api import arns
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
@@ -187,6 +188,7 @@ class Server:
 
     def start(self) -> None:
         """Start the controller and the server, and tell commands on this machine where it is."""
+        machine.collect_seldom()
         self.bus.open()
         self.peers.start()
         self.reconciler.start()

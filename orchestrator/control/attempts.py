@@ -22,7 +22,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.kept_texts import KeptTexts, references_of
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import CHECK_INTERVAL, Observer
-from orchestrator.control.run_store import Errands, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
+from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
@@ -41,8 +41,6 @@ from orchestrator.domain.attempt_events import (
     PrepareRefused,
 )
 from orchestrator.domain.attempt_instructions import (
-    AwaitCause,
-    AwaitChildren,
     Close,
     Decide,
     Explain,
@@ -81,15 +79,18 @@ Steps = Generator[Callable[[], None], None, None]
 many attempts share a commit, and everything is recorded before it is done."""
 
 
-@dataclass
-class _Memory:
-    """Facts about an attempt that its row does not hold, until it is closed."""
+@dataclass(slots=True)
+class _Open:
+    """What is known of an open attempt beside its rows."""
 
+    key: Key
+    state: State
+    is_current: bool = True
+    """Whether the state is that of the rows: they were not read anew since."""
     run: RunFacts | None = None
     """The run, as it was found before the attempt takes it."""
-    cause_since: int | None = None
-    done_since: int | None = None
-    """As in :class:`orchestrator.domain.attempt.State`."""
+    taking: Callable[[], int] | None = None
+    """Takes the run; returns the epoch."""
     progress: Progress | None = None
     """What the run holds once the gang is stopped."""
     uncommitted: list[Callable[[], None]] = field(default_factory=list)
@@ -122,9 +123,8 @@ class Attempts:
         self.engine, self.runs, self.bus = engine, runs, bus
         self.clock, self.monitoring, self.changed, self.withdrawn = clock, monitoring, changed, withdrawn
         self.texts = texts
-        self._memories: dict[tuple[str, int], _Memory] = {}
-        self._states: dict[str, State] = {}
-        """Of the open attempts, by job: what :func:`state_of` makes of the rows as they are."""
+        self._open: dict[str, _Open] = {}
+        """By job."""
         self._errands = Errands(machine.pool("store", _READERS), str(runs.store.path), changed)
         self._observer = Observer(engine, runs, self._errands, bus, clock)
         self._stops = Stops(engine, changed, log)
@@ -147,20 +147,22 @@ class Attempts:
         )
         attempt.held_since = self.clock.now()
         record_logs(session, job, nodes)
+        opened = self._open[job.id] = _Open((job.id, number), replace(state_of(job, attempt), started=False))
         job.attempts.append(attempt)
-        job.move(Status.STARTING, f"starting {state_of(job, attempt).terms.size}")
-        yield self._memory(attempt).committed
-        yield from self._happened(session, job, attempt, Due())
+        job.move(Status.STARTING, f"starting {opened.state.terms.size}")
+        yield opened.committed
+        yield from self._happened(session, job, attempt, opened, Due())
 
     def advance(self, session: Session, job: Job, attempt: Attempt) -> Steps:
         """One look at an open attempt."""
-        yield from self._happened(session, job, attempt, Due())
+        return self._happened(session, job, attempt, self._opened(job, attempt), Due())
 
     def pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
         if attempt not in job.attempts:
             return _LATER
-        key, state = (job.id, attempt.number), self._state(job, attempt)
+        opened = self._opened(job, attempt)
+        key, state = opened.key, opened.state
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
         elif self._stops.has_begun(key):
@@ -179,25 +181,23 @@ class Attempts:
 
     def preempt(self, session: Session, job: Job, attempt: Attempt, reason: str) -> Steps:
         """Have an open attempt end in favour of another job."""
-        yield from self._happened(session, job, attempt, Preempted(reason))
+        return self._happened(session, job, attempt, self._opened(job, attempt), Preempted(reason))
 
-    def _happened(self, session: Session, job: Job, attempt: Attempt, event: Event) -> Steps:
+    def _happened(self, session: Session, job: Job, attempt: Attempt, opened: _Open, event: Event) -> Steps:
         """Carry out the instructions that follow from an event, and from the events that these cause."""
-        state = self._state(job, attempt)
-        for instruction in step(state, event):
+        for instruction in step(opened.state, event):
             match instruction:
                 case Save():
-                    yield self._memory(attempt).committed
+                    yield opened.committed
                 case Withdraw(reason):
-                    yield self._withdraw(job, attempt, reason)
+                    yield self._withdraw(job, attempt, opened, reason)
                 case Close():
-                    yield self._close(session, job, attempt, instruction)
+                    yield self._close(session, job, attempt, opened, instruction)
                 case _:
-                    then = self._carry_out(session, job, attempt, instruction)
-                    self._states[job.id] = after(state, instruction)
+                    then = self._carry_out(session, job, attempt, opened, instruction)
+                    opened.state = after(opened.state, instruction)
                     if then is not None:
-                        yield from self._happened(session, job, attempt, then)
-                    state = self._state(job, attempt)
+                        yield from self._happened(session, job, attempt, opened, then)
 
     def share(self, session: Session, jobs: Sequence[Job]) -> None:
         """These jobs are worked on next: what their attempts share is read once."""
@@ -206,27 +206,29 @@ class Attempts:
     def forget_states(self, jobs: Iterable[str]) -> None:
         """The rows of these jobs were read anew."""
         for job_id in jobs:
-            self._states.pop(job_id, None)
+            if (opened := self._open.get(job_id)) is not None:
+                opened.is_current, opened.taking = False, None
 
-    def _state(self, job: Job, attempt: Attempt) -> State:
-        state = self._states.get(job.id)
-        if state is None or state.terms.number != attempt.number:
-            memory = self._memory(attempt)
-            state = replace(state_of(job, attempt), cause_since=memory.cause_since, done_since=memory.done_since)
-            self._states[job.id] = state
-        return state
+    def _opened(self, job: Job, attempt: Attempt) -> _Open:
+        opened = self._open.get(job.id)
+        if opened is None or opened.state.terms.number != attempt.number:
+            opened = self._open[job.id] = _Open((job.id, attempt.number), state_of(job, attempt))
+        elif not opened.is_current:
+            known = opened.state
+            opened.state = replace(state_of(job, attempt), cause_since=known.cause_since, done_since=known.done_since)
+            opened.is_current = True
+        return opened
 
-    def _memory(self, attempt: Attempt) -> _Memory:
-        return self._memories.setdefault((attempt.job_id, attempt.number), _Memory())
-
-    def _carry_out(self, session: Session, job: Job, attempt: Attempt, instruction: Instruction) -> Event | None:
+    def _carry_out(
+        self, session: Session, job: Job, attempt: Attempt, opened: _Open, instruction: Instruction
+    ) -> Event | None:
         match instruction:
             case Prepare():
-                return self._prepare(session, job, attempt)
+                return self._prepare(session, job, attempt, opened)
             case TakeEpoch(epoch):
                 attempt.epoch = epoch
                 waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
-                self._memory(attempt).uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
+                opened.uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
                 job.first_epoch = job.first_epoch or epoch
             case Launch(again):
                 return self._launch(job, attempt, again)
@@ -239,50 +241,51 @@ class Attempts:
                     job.status_reason = reason
             case MarkRunning(reason, moment):
                 self._mark_running(session, job, attempt, reason, moment)
-            case AwaitCause(since):
-                self._memory(attempt).cause_since = since
-            case AwaitChildren(since):
-                self._memory(attempt).done_since = since
             case Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
                 if verdict.start_error is not None:
                     attempt.nodes[job.gang.main].reason = verdict.start_error
             case Stop(grace):
-                return self._stop(job, attempt, grace)
+                return self._stop(job, attempt, opened, grace)
             case WindUp():
                 return Gone(self.clock.now(), [], "")
         return None
 
     def _prepare(
-        self, session: Session, job: Job, attempt: Attempt
+        self, session: Session, job: Job, attempt: Attempt, opened: _Open
     ) -> Prepared | PrepareDelayed | PrepareRefused | Delayed | None:
         """Look at the run, record its owner, then take it."""
-        memory, key = self._memory(attempt), (job.id, attempt.number)
+        key = opened.key
         try:
-            if memory.run is None:
+            if opened.run is None:
                 self._errands.await_earlier(job.run)
-                memory.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run), again=False)
-            if (run := memory.run) is None:
+                opened.run = self._errands.result(key, "examine", partial(self.runs.examine, job.run), again=False)
+            if opened.run is None:
                 return self._errands.delayed(key)
-            # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
-            known = self._rows.epochs(job.run)
-            if run.epoch not in known and run.writer:
-                raise RunRefused(f"run {job.run} is being written by {run.writer}; stop that job first")
-            if job.first_epoch is not None and run.description() is None:
-                raise RunRefused(f"run {job.run} was deleted from the store while the job ran")
-            record = record_owner(session, run, job, self._rows.runs.get(job.run))
-            self._rows.runs[job.run] = record
-            description = first_description(run, job, record.owner, record.queue)
-            claim = Claim(self.runs.peers.id, job.id, attempt.number)
-            texts = [(each, self.texts.source(session, each)) for each in references_of(job.gang)]
-            taking = partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim, texts)
-            epoch = self._errands.result(key, "claim", taking, again=False)
+            if opened.taking is None:
+                opened.taking = self._take(session, job, attempt, opened.run)
+            epoch = self._errands.result(key, "claim", opened.taking, again=False)
         except StoreUnavailable as error:
             return PrepareDelayed(str(error))
         except (RunRefused, ValueError) as error:
             return PrepareRefused(str(error))
         return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
+
+    def _take(self, session: Session, job: Job, attempt: Attempt, run: RunFacts) -> Callable[[], int]:
+        """The call that takes the run, whose owner is recorded here. Raises RunRefused."""
+        # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
+        known = self._rows.epochs(job.run)
+        if run.epoch not in known and run.writer:
+            raise RunRefused(f"run {job.run} is being written by {run.writer}; stop that job first")
+        if job.first_epoch is not None and run.description() is None:
+            raise RunRefused(f"run {job.run} was deleted from the store while the job ran")
+        record = record_owner(session, run, job, self._rows.runs.get(job.run))
+        self._rows.runs[job.run] = record
+        description = first_description(run, job, record.owner, record.queue)
+        claim = Claim(self.runs.peers.id, job.id, attempt.number)
+        texts = [(each, self.texts.source(session, each)) for each in references_of(job.gang)]
+        return partial(self.runs.claim, job.run, description, max([run.epoch, *known]), claim, texts)
 
     def _launch(self, job: Job, attempt: Attempt, again: bool) -> Event:
         def plan() -> Plan[Any]:
@@ -339,64 +342,63 @@ class Attempts:
             array.started_at = job.started_at
         job.move(Status.RUNNING, reason)
 
-    def _stop(self, job: Job, attempt: Attempt, grace: float) -> Gone | Delayed | None:
+    def _stop(self, job: Job, attempt: Attempt, opened: _Open, grace: float) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
-        key = (job.id, attempt.number)
+        key = opened.key
         assert attempt.handle is not None
         if (stopped := self._stops.ask(key, attempt.handle, grace)) is not None:
-            return self._wind_up(job, attempt, stopped)
+            return self._wind_up(job, attempt, opened, stopped)
         reason = self._stops.reason(key)
         return Delayed(reason) if reason else None
 
-    def _wind_up(self, job: Job, attempt: Attempt, status: GangStatus) -> Gone | Delayed | None:
+    def _wind_up(self, job: Job, attempt: Attempt, opened: _Open, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""
-        memory, key = self._memory(attempt), (job.id, attempt.number)
+        key = opened.key
         if not self._observer.know_outcomes(job, attempt, status, [None] * len(status)):
             return self._errands.delayed(key)
-        if memory.progress is None:
+        opened.progress = opened.progress or self._observer.progress(key)
+        if opened.progress is None:
             reading = partial(self.runs.progress, job.run, attempt.epoch)
-            memory.progress = self._errands.result(key, "progress", reading)
-        if memory.progress is None:
+            opened.progress = self._errands.result(key, "progress", reading)
+        if opened.progress is None:
             return self._errands.delayed(key)
-        iteration = memory.progress.iteration
+        iteration = opened.progress.iteration
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
         return Gone(self.clock.now(), self._observer.ends(job, attempt, status), progress)
 
-    def _withdraw(self, job: Job, attempt: Attempt, reason: str) -> Callable[[], None]:
+    def _withdraw(self, job: Job, attempt: Attempt, opened: _Open, reason: str) -> Callable[[], None]:
         """Give the room back; returns what follows the commit."""
 
         def withdrawn() -> None:
-            self._forget(job, attempt)
+            self._forget(job, attempt, opened)
             self.withdrawn(job.id, reason)
 
         job.attempts.remove(attempt)
         job.move(Status.RUNNABLE, reason)
         return withdrawn
 
-    def _forget(self, job: Job, attempt: Attempt) -> None:
-        key, release = (job.id, attempt.number), partial(self.runs.release, job.run)
-        self._states.pop(job.id, None)
-        self._memories.pop(key, None)
+    def _forget(self, job: Job, attempt: Attempt, opened: _Open) -> None:
+        key, release = opened.key, partial(self.runs.release, job.run)
+        self._open.pop(job.id, None)
         self._stops.forget(key)
         self._errands.forget(key, job.run, release, attempt.epoch if attempt.epoch != NO_EPOCH else None)
         self._observer.forget(key)
 
-    def _close(self, session: Session, job: Job, attempt: Attempt, close: Close) -> Callable[[], None]:
+    def _close(self, session: Session, job: Job, attempt: Attempt, opened: _Open, close: Close) -> Callable[[], None]:
         """Record the end; returns what follows the commit."""
 
         def closed() -> None:
-            memory.committed()
-            self._forget(job, attempt)
-            self.bus.forget(job.id, attempt.number)
+            opened.committed()
+            self._forget(job, attempt, opened)
+            self.bus.forget(*opened.key)
             self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
 
-        memory = self._memory(attempt)
         ran = close.moment - (attempt.running_since or close.moment)
         attempt.started_at = attempt.started_at or now()
         attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
         attempt.spent = close.spent
-        charge(attempt, memory.progress.saved if memory.progress else None, close.moment)
-        memory.uncommitted.append(self.monitoring.ended(job, attempt))
+        charge(attempt, opened.progress.saved if opened.progress else None, close.moment)
+        opened.uncommitted.append(self.monitoring.ended(job, attempt))
         self._charge_share(session, job, attempt, close.moment)
         job.move(close.status, close.reason)
         if job.stopped_at is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -10,7 +10,7 @@ from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.endings import node_end
-from orchestrator.control.run_store import Errands, Key, RunStore
+from orchestrator.control.run_store import Errands, Key, Progress, RunStore
 from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import NodeEnd, aws_ending
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
@@ -30,6 +30,8 @@ class _Seen:
     """Of nodes that have ended, by index; None for one that has left none."""
     checked: float | None = None
     """When they were read last (monotonic [s])."""
+    progress: Progress | None = None
+    """What the run holds, read after the last of them was found."""
     is_silent: bool = False
     """Whether a node was silent at the last look."""
 
@@ -105,14 +107,28 @@ class Observer:
         ]
         if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < CHECK_INTERVAL)):
             return True
-        reading = partial(self._runs.outcomes, job.run, job.id, attempt.number, [*ended, *hidden])
-        found = self._errands.result((job.id, attempt.number), "outcomes", lambda: (moment, ended, reading()))
+        missing = {index for index in range(len(status)) if memory.outcomes.get(index) is None}
+        reading = partial(
+            self._read, job.run, attempt.epoch, (job.id, attempt.number), [*ended, *hidden], frozenset(missing)
+        )
+        found = self._errands.result((job.id, attempt.number), "outcomes", lambda: (moment, ended, *reading()))
         if found is None:
             return not ended
         # of the call that has returned: a node that has ended since may have left its outcome after it was looked for
-        memory.checked, over, outcomes = found
+        memory.checked, over, outcomes, memory.progress = found
         memory.outcomes |= {**dict.fromkeys(over), **outcomes}
         return all(index in memory.outcomes for index in ended) or self.know_outcomes(job, attempt, status, silences)
+
+    def _read(
+        self, run: str, epoch: int, key: Key, nodes: Sequence[int], missing: frozenset[int]
+    ) -> tuple[Mapping[int, Outcome], Progress | None]:
+        """The outcomes of these nodes; where none is ``missing`` any more, so that nothing writes into the run, what that holds, too."""
+        found = self._runs.outcomes(run, *key, nodes)
+        return found, self._runs.progress(run, epoch) if missing <= found.keys() else None
+
+    def progress(self, key: Key) -> Progress | None:
+        """What the run held after all nodes of an attempt had left their outcomes; None where that was not read."""
+        return self._seen[key].progress if key in self._seen else None
 
     def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node, None while it is not known; noted in the attempt's record with the other facts about its nodes."""

@@ -53,25 +53,24 @@ class WorkQueue:
                 self._note(job)
 
     def _note(self, job: Job) -> None:
-        before, next_look = (job.id in self._waiting, job.id in self._active), self._active.get(job.id, 0.0)
+        job_id, status = job.id, Status(job.status)
+        waited, next_look = self._waiting.pop(job_id, None), self._active.pop(job_id, None)
         # not out of _due: whoever asked for another look may know of a change that came after this one was read
-        for group in (self._waiting, self._active):
-            group.pop(job.id, None)
-        if job.is_terminal:
-            self._ended[job.id] = None
+        if status.is_terminal:
+            self._ended[job_id] = None
             if job.parent is not None:
                 self._due[job.parent] = None
-        elif job.status in (Status.STARTING, Status.RUNNING):
-            self._active[job.id] = next_look
-        elif job.status == Status.RUNNABLE and job.stop_reason is None:
+        elif status in (Status.STARTING, Status.RUNNING):
+            self._active[job_id] = next_look or 0.0
+        elif status is Status.RUNNABLE and job.stop_reason is None:
             try:
-                self._waiting[job.id] = self._entry(job)
+                self._waiting[job_id] = self._entry(job)
             except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
-                self._due[job.id] = None
-        elif job.stop_reason is not None or job.status == Status.SUBMITTED:
-            self._due[job.id] = None
+                self._due[job_id] = None
+        elif status is Status.SUBMITTED or job.stop_reason is not None:
+            self._due[job_id] = None
         # a PENDING job is looked at when one that it waits for, or a child of it, has ended
-        if before != (job.id in self._waiting, job.id in self._active):
+        if (waited is None, next_look is None) != (job_id not in self._waiting, job_id not in self._active):
             self.version += 1
 
     def take_due(self, most: int | None = None) -> Sequence[str]:

@@ -45,16 +45,16 @@ class JobCounts:
             return {kind: count for kind, count in self._counts.items() if queues is None or kind[0] in queues}
 
 
-def note_counts(session: Session) -> None:
-    """Note, before a flush, what its objects change of the counts, for :meth:`JobCounts.add` after the commit."""
+def note_counts(session: Session, changed: Iterable[object]) -> None:
+    """Note, before a flush, what its new, ``changed`` and deleted objects change of the counts, for :meth:`JobCounts.add` after the commit."""
     changes = session.info.setdefault("counts", Counter())
     for each in session.new:
         if isinstance(each, Job) and each.parent is None:
             changes[each.queue, str(each.status or Status.SUBMITTED)] += 1
-    for each in session.dirty:
-        if isinstance(each, Job) and each.parent is None:
+    for each in changed:
+        if isinstance(each, Job):
             before = attributes.instance_state(each).committed_state.get("status")
-            if before is not None and before != each.status:
+            if before is not None and before != each.status and each.parent is None:
                 changes[each.queue, str(before)] -= 1
                 changes[each.queue, str(each.status)] += 1
     for each in session.deleted:

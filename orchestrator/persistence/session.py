@@ -388,12 +388,13 @@ def _forget(session: Session) -> None:
 
 @event.listens_for(_Session, "before_flush")
 def _write_changes(session: Session, _context: object, _instances: object) -> None:
+    changed = list(session.dirty)
     if (ended := session.info["database"].ended) is not None:
-        for each in list(session.dirty):
+        for each in changed:
             if isinstance(each, Job) and each.is_terminal and inspect(each).attrs.status.history.has_changes():
                 ended(session, each)
-    note_counts(session)
-    _note_jobs(session, write_changes(session))
+    note_counts(session, changed)
+    _note_jobs(session, write_changes(session, changed))
 
 
 @event.listens_for(_Session, "after_flush")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any, cast
 
@@ -16,10 +16,10 @@ _BATCHED: tuple[type[Any], ...] = (Job, Attempt, Node)
 """Tables whose rows change together. Their keys never change."""
 
 
-def write_changes(session: Session) -> Sequence[Any]:
-    """Write the changed columns of the rows that are in the database; returns their objects. What else has changed is left to the flush."""
+def write_changes(session: Session, changed_objects: Iterable[object]) -> Sequence[Any]:
+    """Write the changed columns of rows that are in the database; returns their objects. What else has changed is left to the flush."""
     groups: dict[tuple[Any, tuple[str, ...]], list[InstanceState[Any]]] = defaultdict(list)
-    for each in session.dirty:
+    for each in changed_objects:
         if isinstance(each, _BATCHED):
             state: InstanceState[Any] = attributes.instance_state(each)
             kind: Any = type(each)
