@@ -12,6 +12,9 @@ from typing import Any
 from orchestrator.domain.native_options import MalformedOptions, NativeOptions
 from orchestrator.domain.resources import Resources
 
+MOST_NODES = 5000
+"""Nodes of a gang from YAML; the Batch API takes AWS's 1,000."""
+
 
 @dataclass(frozen=True)
 class Shape:

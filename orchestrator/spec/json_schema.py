@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import PydanticUserError, TypeAdapter
 
+from orchestrator.domain.gang import MOST_NODES
 from orchestrator.spec.model import ALGORITHMS, Spec
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.track import track_schema
@@ -19,7 +20,9 @@ def schema() -> dict[str, Any]:
     """JSON Schema of the job YAML, for editors."""
     document = Spec.model_json_schema()
     definitions = document["$defs"]
-    definitions["NodeRange"] = {"anyOf": [{"type": "integer", "minimum": 1, "maximum": 250}, definitions["NodeRange"]]}
+    definitions["NodeRange"] = {
+        "anyOf": [{"type": "integer", "minimum": 1, "maximum": MOST_NODES}, definitions["NodeRange"]]
+    }
     definitions["Track"] = track_schema(definitions["Track"])
     definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
     definitions["Train"]["properties"]["algorithm"]["examples"] = list(ALGORITHMS)

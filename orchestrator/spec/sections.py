@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from orchestrator.domain.gang import MOST_NODES
 from orchestrator.spec.values import Memory, Section, Size
 from shared_store.log_files import LEAST_LIMIT, LIMIT
 
@@ -15,8 +16,8 @@ Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
 class NodeRange(Section):
     """Number of nodes: ``nodes: 3`` or ``nodes: {min: 2, max: 4}`` (start with as many as are free)."""
 
-    min: int = Field(ge=1, le=250)
-    max: int = Field(ge=1, le=250)
+    min: int = Field(ge=1, le=MOST_NODES)
+    max: int = Field(ge=1, le=MOST_NODES)
 
     @model_validator(mode="before")
     @classmethod

@@ -12,7 +12,7 @@ from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_e
 from orchestrator.api.batch.members import check_consumables, check_members
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.limits import LARGEST_COMMANDS
-from orchestrator.domain.gang import GangSpec, gang_needs, target_nodes
+from orchestrator.domain.gang import MOST_NODES, GangSpec, gang_needs, target_nodes
 from orchestrator.domain.native_options import MalformedOptions
 from shared_store.log_files import LEAST_LIMIT
 from shared_store.wording import shown
@@ -90,8 +90,8 @@ def check_nodes(properties: Mapping[str, Any], kind: str) -> GangSpec:
     ``properties``: as :func:`node_properties` gives them. Returns the gang that they ask for.
     """
     count, main, ranges = properties["numNodes"], properties["mainNode"], properties["nodeRangeProperties"]
-    if not 1 <= count <= _MOST_NODES:
-        raise ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
+    if not 1 <= count <= MOST_NODES:
+        raise _too_many(count)
     if not 0 <= main < count:
         raise ClientError(f"mainNode is {main}; it must be less than numNodes ({count})")
     if not 1 <= len(ranges) <= _MOST_RANGES:
@@ -107,8 +107,14 @@ def check_nodes(properties: Mapping[str, Any], kind: str) -> GangSpec:
         raise ClientError(_MALFORMED) from None
     except ValueError as error:
         raise ClientError(str(error)) from None
+    if count > _MOST_NODES and not gang.options.is_native:
+        raise _too_many(count)
     _check_options(gang)
     return gang
+
+
+def _too_many(count: int) -> ClientError:
+    return ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
 
 
 def _check_options(gang: GangSpec) -> None:

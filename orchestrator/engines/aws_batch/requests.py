@@ -19,7 +19,7 @@ from shared_store.contract import sealed_in_image
 
 DIGEST, GANG = "muster:digest", "muster:gang"
 """Tags: of a definition, of what it says; of a job, the attempt that it is."""
-_MOST_RANGES = 5
+_MOST_NODES, _MOST_RANGES = 1000, 5
 _TIMEOUT_SLACK = 600
 """Seconds after the controller's own timeout at which AWS ends an attempt whose controller is away."""
 _OURS = ("vcpus", "memory", *FARGATE_MEMBERS)
@@ -58,6 +58,8 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
     An image with Muster in it (``muster``, the stack's own, or whatever a job from YAML names) runs its command under the
     supervisor; any other one, of a job that came through the Batch API, runs it as it is.
     """
+    if len(nodes) > _MOST_NODES:
+        raise EngineError(f"{len(nodes)} nodes: AWS Batch takes at most {_MOST_NODES} in one job")
     plain = [not _has_muster(gang, index, config) for index in range(len(nodes))]
     if missing := [index for index, each in enumerate(plain) if not each and not nodes[index].command]:
         raise EngineError(

@@ -65,7 +65,7 @@ LINES = {
     "nodes: true": f"nodes: {NODES}, found True",
     "nodes: 1.5": f"nodes: {NODES}, found 1.5",
     "nodes: 0": "nodes.min: expected a value greater than or equal to 1, found 0 (and 1 more)",
-    "nodes: 251": "nodes.min: expected a value less than or equal to 250, found 251 (and 1 more)",
+    "nodes: 5001": "nodes.min: expected a value less than or equal to 5000, found 5001 (and 1 more)",
     "nodes: {min: 3, max: 2}": "nodes: min (3) is more than max (2)",
     "resources: 3": "resources: expected a mapping, found a whole number (3)",
     "resources: {memory: 1MiB}": "resources.memory: expected a value greater than or equal to 4, found 1",
