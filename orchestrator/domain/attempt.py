@@ -1,7 +1,7 @@
 """An attempt as a state machine: from a state and an event to instructions. No I/O, no clock, no database.
 
 :func:`step` and the three tables below it hold every rule. :mod:`orchestrator.control.attempts` gathers facts into events, carries the
-instructions out and reads the state anew from the database; :func:`after` says what it finds there.
+instructions out and keeps the state; :func:`after` says what it is then.
 """
 
 from __future__ import annotations
