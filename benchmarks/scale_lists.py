@@ -144,7 +144,11 @@ async def measure(name: str, call: Callable[[], Awaitable[Answer]], requests: in
             used.append(1000 * (time.process_time() - cpu))
         if status != 200:
             raise SystemExit(f"{name}: {status} {body[:300].decode()}")
-    return f"| {name} | " + " | ".join(f"{at(values, share):.1f}" for values in (walls, used) for share in (0.5, 0.99)) + " |"
+    return (
+        f"| {name} | "
+        + " | ".join(f"{at(values, share):.1f}" for values in (walls, used) for share in (0.5, 0.99))
+        + " |"
+    )
 
 
 def at(values: list[float], share: float) -> float:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Generic, Self, TypeVar, overload
 
-from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint
+from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
 from orchestrator import machine
@@ -123,6 +123,12 @@ class _OfArray(Generic[_T]):
         setattr(job, self._own, value)
 
 
+def _listed(name: str, *columns: str) -> Index:
+    """An index with a part of the list of jobs, which has no children of arrays, in its order."""
+    within = text("parent IS NULL")
+    return Index(name, *columns, "created_at", "id", sqlite_where=within, postgresql_where=within)
+
+
 class Job(Base):
     """A submitted job: a multi-node job, a single-node one, an array of such, or one child of an array."""
 
@@ -130,9 +136,10 @@ class Job(Base):
     __table_args__ = (
         UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
         Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
-        Index("ix_jobs_queue_created", "queue", "created_at", "id"),
-        Index("ix_jobs_list", "parent", "created_at", "id"),
-        Index("ix_jobs_list_kind", "parent", "queue", "status", "created_at", "id"),
+        _listed("ix_jobs_list"),
+        _listed("ix_jobs_list_queue", "queue"),
+        _listed("ix_jobs_list_status", "status"),
+        _listed("ix_jobs_list_kind", "queue", "status"),
     )
     id: Mapped[str] = mapped_column(primary_key=True)
     """A UUID; of an array's child ``<parent>:<index>``."""
@@ -150,7 +157,7 @@ class Job(Base):
     node_properties = _OfArray[dict[str, Any]]("own_node_properties")
     """Of the definition, with overrides and parameters applied; a ``container`` job is a gang of one node here."""
     run: Mapped[str] = mapped_column(index=True)
-    status: Mapped[str] = mapped_column(index=True, default=Status.SUBMITTED)
+    status: Mapped[str] = mapped_column(default=Status.SUBMITTED, active_history=True)
     status_reason: Mapped[str | None] = mapped_column(default=None)
     created_at: Mapped[int] = mapped_column(default=now, index=True)
     runnable_at: Mapped[int | None] = mapped_column(default=None)
@@ -178,7 +185,7 @@ class Job(Base):
     parameters = _OfArray[dict[str, str]]("own_parameters")
     own_tags: Mapped[dict[str, str] | None] = mapped_column("tags", _JSON_OR_NULL, default=dict)
     tags = _OfArray[dict[str, str]]("own_tags")
-    parent: Mapped[str | None] = mapped_column(default=None)
+    parent: Mapped[str | None] = mapped_column(default=None, index=True)
     array_index: Mapped[int | None] = mapped_column(default=None)
     array_size: Mapped[int | None] = mapped_column(default=None)
     """Of the array that it is, or belongs to."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
+from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
 from orchestrator.persistence.job_pages import Cursor, read_page
@@ -58,17 +59,11 @@ class Wanted:
     search: str = ""
 
     def conditions(self) -> list[ColumnElement[bool]]:
-        """Of the rows, but for the states and arrays' children; jobs that the caller may not see are left out."""
-        found: list[ColumnElement[bool]] = []
-        if (queues := permissions.visible_queues()) is not None:
-            found.append(Job.queue.in_(queues))
-        if self.queue:
-            found.append(Job.queue == self.queue)
-        if text := self.search.strip():
-            places = (Job.name, Job.run, Job.owner)
-            within = [each.icontains(text, autoescape=True) for each in places]
-            found.append(or_(*within, Job.id.istartswith(text, autoescape=True)))
-        return found
+        """Of the rows, by the text."""
+        if not (text := self.search.strip()):
+            return []
+        within = [each.icontains(text, autoescape=True) for each in (Job.name, Job.run, Job.owner)]
+        return [or_(*within, Job.id.istartswith(text, autoescape=True))]
 
     def queues(self) -> Collection[str] | None:
         """Those whose jobs are wanted and may be seen by the caller; None: all."""
@@ -76,14 +71,6 @@ class Wanted:
         if not self.queue:
             return visible
         return [self.queue] if visible is None or self.queue in visible else []
-
-    def is_any(self) -> bool:
-        """Whether all jobs are wanted."""
-        return not self.statuses and not self.search.strip() and self.queues() is None
-
-    @property
-    def in_states(self) -> list[ColumnElement[bool]]:
-        return [Job.status.in_(self.statuses)] if self.statuses else []
 
 
 @router.get("/jobs")
@@ -120,21 +107,15 @@ def page_of_jobs(
 ) -> dict[str, Any]:
     """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter, and the places of the pages beside this one.
 
-    Raises RequestError for a place that is none.
+    Raises RequestError for a place that is none, and for two of them.
     """
+    if after and before:
+        raise RequestError("a page is after a place or before one, not both; leave one of them out")
     places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
+    queues, conditions = wanted.queues(), wanted.conditions()
     with reconciler.database.session() as session:
-        if wanted.search.strip():  # only the rows tell
-            grouped = select(Job.status, func.count()).where(Job.parent.is_(None), *wanted.conditions())
-            counts = {str(status): int(count) for status, count in session.execute(grouped.group_by(Job.status))}
-            page = read_page(session, [*wanted.conditions(), *wanted.in_states], None, most, **places)
-        else:
-            kinds = reconciler.database.counts.of(wanted.queues())
-            counts = Counter[str]()
-            for (_, status), count in kinds.items():
-                counts[status] += count
-            own = [kind for kind in kinds if not wanted.statuses or kind[1] in wanted.statuses]
-            page = read_page(session, [], None if wanted.is_any() else own, most, **places)
+        counts = _count(session, queues, conditions) if conditions else reconciler.database.counts.by_status(queues)
+        page = read_page(session, most, queues, wanted.statuses, conditions, **places)
         rows = [_row(reconciler, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
     progress = _progress(reconciler, trainings)
@@ -148,15 +129,23 @@ def page_of_jobs(
     }
 
 
+def _count(
+    session: Session, queues: Collection[str] | None, conditions: Sequence[ColumnElement[bool]]
+) -> Mapping[str, int]:
+    """Jobs by state that meet the conditions: all rows are looked through."""
+    query = select(Job.status, func.count()).where(Job.parent.is_(None), *conditions).group_by(Job.status)
+    if queues is not None:
+        query = query.where(Job.queue.in_(queues))
+    return {str(status): int(count) for status, count in session.execute(query)}
+
+
 def ids_of(session: Session, wanted: Wanted) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
     active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
-    query = (
-        select(Job.id)
-        .where(Job.parent.is_(None), *wanted.conditions(), Job.status.in_(active))
-        .order_by(Job.created_at, Job.id)
-    )
-    return list(session.scalars(query))
+    query = select(Job.id).where(Job.parent.is_(None), *wanted.conditions(), Job.status.in_(active))
+    if (queues := wanted.queues()) is not None:
+        query = query.where(Job.queue.in_(queues))
+    return list(session.scalars(query.order_by(Job.created_at, Job.id)))
 
 
 def kind_of(spec: Mapping[str, Any] | None) -> str:
