@@ -123,10 +123,13 @@ class _OfArray(Generic[_T]):
         setattr(job, self._own, value)
 
 
+_CHILDREN = text("parent IS NOT NULL")
+
+
 def _listed(name: str, *columns: str) -> Index:
     """An index with a part of the list of jobs, which has no children of arrays, in its order."""
-    within = text("parent IS NULL")
-    return Index(name, *columns, "created_at", "id", sqlite_where=within, postgresql_where=within)
+    within = text("parent IS NULL")  # and the column itself, since SQLite looks at it in spite of that
+    return Index(name, *columns, "created_at", "id", "parent", sqlite_where=within, postgresql_where=within)
 
 
 class Job(Base):
@@ -136,6 +139,7 @@ class Job(Base):
     __table_args__ = (
         UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
         Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
+        Index("ix_jobs_parent", "parent", sqlite_where=_CHILDREN, postgresql_where=_CHILDREN),
         _listed("ix_jobs_list"),
         _listed("ix_jobs_list_queue", "queue"),
         _listed("ix_jobs_list_status", "status"),
@@ -185,7 +189,7 @@ class Job(Base):
     parameters = _OfArray[dict[str, str]]("own_parameters")
     own_tags: Mapped[dict[str, str] | None] = mapped_column("tags", _JSON_OR_NULL, default=dict)
     tags = _OfArray[dict[str, str]]("own_tags")
-    parent: Mapped[str | None] = mapped_column(default=None, index=True)
+    parent: Mapped[str | None] = mapped_column(default=None)
     array_index: Mapped[int | None] = mapped_column(default=None)
     array_size: Mapped[int | None] = mapped_column(default=None)
     """Of the array that it is, or belongs to."""

@@ -24,11 +24,11 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import ORMExecuteState, Session
 
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.job_counts import JobCounts, note_counts
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
 from orchestrator.persistence.updates import write_changes
 
@@ -384,6 +384,14 @@ def _forget(session: Session) -> None:
     session.info.pop("jobs", None)
     session.info.pop("ids", None)
     session.info.pop("counts", None)
+
+
+@event.listens_for(_Session, "do_orm_execute")
+def _look_up_nodes(state: ORMExecuteState) -> None:
+    """SQLite reads the whole table of nodes to find those of several attempts, by pairs of keys; by the jobs it uses the index."""
+    if state.is_relationship_load and state.bind_mapper is inspect(Node) and isinstance(state.parameters, dict):
+        jobs = {job for job, _ in state.parameters.get("primary_keys", ())}
+        state.statement = state.statement.where(Node.job_id.in_(jobs))
 
 
 @event.listens_for(_Session, "before_flush")

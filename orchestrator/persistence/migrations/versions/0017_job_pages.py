@@ -12,19 +12,28 @@ _NEW = {
     "ix_jobs_list_status": ["status"],
     "ix_jobs_list_kind": ["queue", "status"],
 }
-_OLD = {"ix_jobs_status": ["status"], "ix_jobs_queue_created": ["queue", "created_at", "id"]}
+_OLD = {
+    "ix_jobs_parent": ["parent"],
+    "ix_jobs_status": ["status"],
+    "ix_jobs_queue_created": ["queue", "created_at", "id"],
+}
 
 
 def upgrade() -> None:
-    within = sa.text("parent IS NULL")
-    for name, columns in _NEW.items():
-        op.create_index(name, "jobs", [*columns, "created_at", "id"], sqlite_where=within, postgresql_where=within)
     for name in _OLD:
         op.drop_index(name, "jobs")
+    for name, columns in _NEW.items():
+        _create(name, [*columns, "created_at", "id", "parent"], "parent IS NULL")
+    _create("ix_jobs_parent", ["parent"], "parent IS NOT NULL")
+
+
+def _create(name: str, columns: list[str], within: str) -> None:
+    where = sa.text(within)
+    op.create_index(name, "jobs", columns, sqlite_where=where, postgresql_where=where)
 
 
 def downgrade() -> None:
+    for name in (*_NEW, "ix_jobs_parent"):
+        op.drop_index(name, "jobs")
     for name, columns in _OLD.items():
         op.create_index(name, "jobs", columns)
-    for name in _NEW:
-        op.drop_index(name, "jobs")
