@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import ipaddress
 import logging
 import os
@@ -193,10 +194,13 @@ class Server:
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
+        gc.collect()
+        gc.freeze()  # what is loaded now stays: a collection that passes over it all would hold up requests
         self._lock.publish(self.url, self._temporary, arns.here().region)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
+        gc.unfreeze()
         self._lock.withdraw()
         self.app.state.closing.set()
         self._uvicorn.should_exit = True

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Self
 
-from sqlalchemy import ColumnElement, select, union_all
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy import ColumnElement, func, or_, select, union_all
+from sqlalchemy.orm import Session, defer, selectinload
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.persistence.keyset import behind
@@ -65,7 +65,7 @@ def read_page(
     after: Cursor | None = None,
     before: Cursor | None = None,
 ) -> Page:
-    """A page, with the attempts of its jobs.
+    """A page, with the attempts of its jobs, without their requests.
 
     Args:
         session: Of the database.
@@ -87,12 +87,34 @@ def read_page(
     found = union_all(*parts).subquery()
     ids = select(found.c.id).order_by(*_order(found.c, backwards)).limit(most + 1)
     # one statement: a job that changes its state meanwhile is neither found twice nor missed
-    whole = select(Job).where(Job.id.in_(ids)).order_by(*_order(Job, backwards)).options(selectinload(Job.attempts))
-    read = session.scalars(whole).all()
+    whole = select(Job).where(Job.id.in_(ids)).order_by(*_order(Job, backwards))
+    read = session.scalars(whole.options(selectinload(Job.attempts), defer(Job.request))).all()
     has_more, jobs = len(read) > most, read[:most]
     if backwards:
         return Page(jobs[::-1], is_first=not has_more, is_last=False)
     return Page(jobs, is_first=after is None, is_last=not has_more)
+
+
+def contains(session: Session, text: str) -> ColumnElement[bool]:
+    """Whether a job's name, run or owner has this text, or its id begins with it; upper and lower case are the same."""
+    columns = (Job.name, Job.run, Job.owner)
+    if session.get_bind().dialect.name == "sqlite":  # its LIKE heeds no case, and its lower() costs more than all else
+        places = [each.contains(text, autoescape=True) for each in columns]
+        return or_(*places, Job.id.startswith(text, autoescape=True))
+    places = [each.icontains(text, autoescape=True) for each in columns]
+    return or_(*places, Job.id.istartswith(text, autoescape=True))
+
+
+def count(
+    session: Session, queues: Collection[str] | None, conditions: Sequence[ColumnElement[bool]], most: int
+) -> Mapping[str, int]:
+    """The jobs of these queues that meet the conditions, by state; at most so many are counted, the newest."""
+    query = select(Job.id).where(Job.parent.is_(None), *conditions)
+    if queues is not None:
+        query = query.where(Job.queue.in_(queues))
+    ids = query.order_by(*_order(Job, False)).limit(most)
+    grouped = select(Job.status, func.count()).where(Job.id.in_(ids)).group_by(Job.status)
+    return {str(status): int(number) for status, number in session.execute(grouped)}
 
 
 def _parts(queues: Collection[str] | None, statuses: Collection[str]) -> Sequence[Sequence[ColumnElement[bool]]]:

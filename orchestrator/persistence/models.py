@@ -5,6 +5,7 @@ Times are Unix milliseconds, as in the Batch API. A change here needs a migratio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Generic, Self, TypeVar, overload
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint, text
@@ -126,10 +127,11 @@ class _OfArray(Generic[_T]):
 _CHILDREN = text("parent IS NOT NULL")
 
 
-def _listed(name: str, *columns: str) -> Index:
-    """An index with a part of the list of jobs, which has no children of arrays, in its order."""
+def _listed(name: str, *columns: str, searched: Sequence[str] = ()) -> Index:
+    """An index with a part of the list of jobs, which has no children of arrays, in its order. A search in it reads no row."""
     within = text("parent IS NULL")  # and the column itself, since SQLite looks at it in spite of that
-    return Index(name, *columns, "created_at", "id", "parent", sqlite_where=within, postgresql_where=within)
+    of_all = (*columns, "created_at", "id", *searched, "parent")
+    return Index(name, *of_all, sqlite_where=within, postgresql_where=within)
 
 
 class Job(Base):
@@ -140,7 +142,7 @@ class Job(Base):
         UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
         Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
         Index("ix_jobs_parent", "parent", sqlite_where=_CHILDREN, postgresql_where=_CHILDREN),
-        _listed("ix_jobs_list"),
+        _listed("ix_jobs_list", searched=("queue", "name", "run", "owner")),
         _listed("ix_jobs_list_queue", "queue"),
         _listed("ix_jobs_list_status", "status"),
         _listed("ix_jobs_list_kind", "queue", "status"),

@@ -10,12 +10,13 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from sqlalchemy import (
     URL,
     Connection,
     Engine,
+    Select,
     create_engine,
     event,
     inspect,
@@ -391,7 +392,7 @@ def _look_up_nodes(state: ORMExecuteState) -> None:
     """SQLite reads the whole table of nodes to find those of several attempts, by pairs of keys; by the jobs it uses the index."""
     if state.is_relationship_load and state.bind_mapper is inspect(Node) and isinstance(state.parameters, dict):
         jobs = {job for job, _ in state.parameters.get("primary_keys", ())}
-        state.statement = state.statement.where(Node.job_id.in_(jobs))
+        state.statement = cast(Select[Any], state.statement).where(Node.job_id.in_(jobs))
 
 
 @event.listens_for(_Session, "before_flush")

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Query, Request
-from sqlalchemy import ColumnElement, case, func, or_, select
+from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.api import permissions
@@ -24,7 +24,7 @@ from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
-from orchestrator.persistence.job_pages import Cursor, read_page
+from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
@@ -36,6 +36,8 @@ from shared_store.metrics import finite, sampled
 router = APIRouter()
 
 JOBS_A_PAGE = 100
+MOST_COUNTED = 5000
+"""Jobs of a search that are counted, the newest."""
 REWARDS = 40
 """Rewards of a job that tell its curve."""
 _FRESH = 1.0
@@ -58,12 +60,9 @@ class Wanted:
     queue: str = ""
     search: str = ""
 
-    def conditions(self) -> list[ColumnElement[bool]]:
+    def conditions(self, session: Session) -> list[ColumnElement[bool]]:
         """Of the rows, by the text."""
-        if not (text := self.search.strip()):
-            return []
-        within = [each.icontains(text, autoescape=True) for each in (Job.name, Job.run, Job.owner)]
-        return [or_(*within, Job.id.istartswith(text, autoescape=True))]
+        return [contains(session, text)] if (text := self.search.strip()) else []
 
     def queues(self) -> Collection[str] | None:
         """Those whose jobs are wanted and may be seen by the caller; None: all."""
@@ -107,14 +106,19 @@ def page_of_jobs(
 ) -> dict[str, Any]:
     """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter, and the places of the pages beside this one.
 
+    A search counts its newest 5,000 jobs; ``areMore``: there may be others.
+
     Raises RequestError for a place that is none, and for two of them.
     """
     if after and before:
         raise RequestError("a page is after a place or before one, not both; leave one of them out")
     places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
-    queues, conditions = wanted.queues(), wanted.conditions()
+    queues = wanted.queues()
     with reconciler.database.session() as session:
-        counts = _count(session, queues, conditions) if conditions else reconciler.database.counts.by_status(queues)
+        if conditions := wanted.conditions(session):
+            counts = count(session, queues, conditions, MOST_COUNTED)
+        else:
+            counts = reconciler.database.counts.by_status(queues)
         page = read_page(session, most, queues, wanted.statuses, conditions, **places)
         rows = [_row(reconciler, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
@@ -124,25 +128,16 @@ def page_of_jobs(
         "jobs": [{**row, "progress": progress.get(row["id"])} for row, _ in rows],
         "total": sum(counts.get(each, 0) for each in states),
         "counts": counts,
+        "areMore": bool(conditions) and sum(counts.values()) == MOST_COUNTED,
         "next": None if page.is_last or not page.jobs else str(Cursor.of(page.jobs[-1])),
         "previous": None if page.is_first or not page.jobs else str(Cursor.of(page.jobs[0])),
     }
 
 
-def _count(
-    session: Session, queues: Collection[str] | None, conditions: Sequence[ColumnElement[bool]]
-) -> Mapping[str, int]:
-    """Jobs by state that meet the conditions: all rows are looked through."""
-    query = select(Job.status, func.count()).where(Job.parent.is_(None), *conditions).group_by(Job.status)
-    if queues is not None:
-        query = query.where(Job.queue.in_(queues))
-    return {str(status): int(count) for status, count in session.execute(query)}
-
-
 def ids_of(session: Session, wanted: Wanted) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
     active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
-    query = select(Job.id).where(Job.parent.is_(None), *wanted.conditions(), Job.status.in_(active))
+    query = select(Job.id).where(Job.parent.is_(None), *wanted.conditions(session), Job.status.in_(active))
     if (queues := wanted.queues()) is not None:
         query = query.where(Job.queue.in_(queues))
     return list(session.scalars(query.order_by(Job.created_at, Job.id)))

@@ -7,10 +7,10 @@ revision = "0017"
 down_revision = "0016"
 
 _NEW = {
-    "ix_jobs_list": [],
-    "ix_jobs_list_queue": ["queue"],
-    "ix_jobs_list_status": ["status"],
-    "ix_jobs_list_kind": ["queue", "status"],
+    "ix_jobs_list": ["created_at", "id", "queue", "name", "run", "owner"],
+    "ix_jobs_list_queue": ["queue", "created_at", "id"],
+    "ix_jobs_list_status": ["status", "created_at", "id"],
+    "ix_jobs_list_kind": ["queue", "status", "created_at", "id"],
 }
 _OLD = {
     "ix_jobs_parent": ["parent"],
@@ -23,7 +23,7 @@ def upgrade() -> None:
     for name in _OLD:
         op.drop_index(name, "jobs")
     for name, columns in _NEW.items():
-        _create(name, [*columns, "created_at", "id", "parent"], "parent IS NULL")
+        _create(name, [*columns, "parent"], "parent IS NULL")
     _create("ix_jobs_parent", ["parent"], "parent IS NOT NULL")
 
 
