@@ -234,8 +234,8 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
             session.delete(one)
         case 5:
             session.flush()
-            rows = session.execute(select(Job.parent, Job.queue, Job.status).where(Job.id == one.id)).tuples().all()
-            note_deleted(session, rows)
+            rows = session.execute(select(Job.parent, Job.queue, Job.status).where(Job.id == one.id)).all()
+            note_deleted(session, [tuple(row) for row in rows])
             session.expunge(one)
             session.execute(delete(Job).where(Job.id == one.id))
 
