@@ -1,6 +1,6 @@
-"""Lists of jobs at 100,000: ``python -m benchmarks.scale_lists [--jobs 100000] [--loaded-anyway]`` prints a table for ``benchmarks/scale.md``.
+"""Lists of jobs at 100,000: ``python -m benchmarks.scale_lists [--jobs 125000] [--loaded-anyway]`` prints a table for ``benchmarks/scale.md``.
 
-The database has the jobs of job_specs/cartpole.yaml in five queues: three in five wait, the others have ended. Requests reach the
+The database has the jobs of job_specs/cartpole.yaml in five queues: four in five wait, the others have ended. Requests reach the
 server's application without a socket, one after the other; the controller has loaded its work queue and makes no pass. Nothing is kept
 between two looks, as a page keeps it for half a second. Time and processor time are those of the whole process.
 """
@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import base64
+import gc
+import json
 import resource
 import tempfile
 import time
@@ -22,11 +25,13 @@ from uuid import UUID
 from sqlalchemy import insert
 
 from benchmarks.load import Watch, add_option, machine, told
+from orchestrator.api.arns import definition_arn
 from orchestrator.console import jobs as jobs_page
+from orchestrator.console import live
 from orchestrator.console.live import Recent
 from orchestrator.domain.job import Status
 from orchestrator.keys import KeyStore
-from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
+from orchestrator.persistence.models import Attempt, Job, JobDefinition, JobQueue, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition, compile_submission
@@ -35,8 +40,8 @@ from tests.support.console.fixtures import secret_of
 
 REQUESTS = 300
 QUEUES = ("default", "lab", "night", "robots", "students")
-STATES = (*3 * (Status.RUNNABLE,), Status.SUCCEEDED, Status.FAILED)
-BATCH = "/v1/listjobs"
+STATES = (*8 * (Status.RUNNABLE,), Status.SUCCEEDED, Status.FAILED)
+DEFINITION = definition_arn("bench", 1)
 AT_ONCE = 2000
 Answer = tuple[int, bytes]
 
@@ -45,9 +50,10 @@ def fill(home: Path, count: int) -> None:
     """The database of a home directory, with so many jobs."""
     spec = load("job_specs/cartpole.yaml", [])
     definition = compile_definition(spec, str(home))
-    request, properties = compile_submission(spec, "arn:bench:1", None), definition["nodeProperties"]
+    request, properties = compile_submission(spec, DEFINITION, None), definition["nodeProperties"]
     database = Database.at(home)
     with database.session() as session:
+        session.add(JobDefinition(name="bench", revision=1, document=definition))
         session.add_all(JobQueue(name=name, priority=1, compute_environments=["local"]) for name in QUEUES[1:])
     for start in range(0, count, AT_ONCE):
         numbers = range(start, min(count, start + AT_ONCE))
@@ -61,15 +67,20 @@ def fill(home: Path, count: int) -> None:
     database.close()
 
 
+def identity(number: int) -> str:
+    """The id of a job."""
+    return str(UUID(int=number * 0x9E3779B97F4A7C15F39CC0605CEDC835 % 2**128))
+
+
 def _row(number: int, request: Mapping[str, Any], properties: Mapping[str, Any]) -> dict[str, Any]:
     status, name = STATES[number // len(QUEUES) % len(STATES)], f"ant-{number % 1000}"
     is_over, moment = status != Status.RUNNABLE, 1_750_000_000_000 + 1000 * number
     return {
-        "id": str(UUID(int=number * 0x9E3779B97F4A7C15F39CC0605CEDC835 % 2**128)),
+        "id": identity(number),
         "name": name,
         "queue": QUEUES[number % len(QUEUES)],
         "owner": f"key person-{number % 12}",
-        "definition": "arn:bench:1",
+        "definition": DEFINITION,
         "request": request,
         "own_node_properties": properties,
         "run": f"{name}-{number}",
@@ -163,8 +174,8 @@ def rows(server: Server, secrets: Mapping[str, str]) -> Iterator[tuple[str, Call
     def get(path: str, client: Client = admin, **query: Any) -> Callable[[], Awaitable[Answer]]:
         return lambda: client.get(f"{path}?{urlencode(query, doseq=True)}")
 
-    def listed(body: bytes) -> Callable[[], Awaitable[Answer]]:
-        return lambda: admin.get(BATCH, method="POST", body=body)
+    def batch(operation: str, **request: Any) -> Callable[[], Awaitable[Answer]]:
+        return lambda: admin.get(f"/v1/{operation}", method="POST", body=json.dumps(request).encode())
 
     middle = "1750000050000-0"
     yield "`GET /api/jobs`", get("/api/jobs")
@@ -173,14 +184,20 @@ def rows(server: Server, secrets: Mapping[str, str]) -> Iterator[tuple[str, Call
     yield "… in the state SUCCEEDED", get("/api/jobs", status="SUCCEEDED")
     yield "… of one queue", get("/api/jobs", queue="lab")
     yield "… by a key of two queues, in two states", get("/api/jobs", lab, status=["FAILED", "RUNNABLE"])
-    yield "… `search=` that finds 1,100", get("/api/jobs", search="ant-77")
+    yield "… `search=` that finds 1,375", get("/api/jobs", search="ant-77")
     yield "… `search=` that finds nothing", get("/api/jobs", search="no such name")
     yield "console's first page", get("/")
     yield "console's waiting jobs", get("/", state="waiting")
     yield "console's first page, by a key of two queues", get("/", lab)
     yield "one look of its stream", lambda: admin.get("/jobs/stream", is_enough=b"event: rows")
     yield "one look at a search", lambda: admin.get("/jobs/stream?search=ant-77", is_enough=b"event: rows")
-    yield "ListJobs, a queue's 100 waiting", listed(b'{"jobQueue": "lab", "jobStatus": "RUNNABLE", "maxResults": 100}')
+    by_name = [{"name": "JOB_NAME", "values": ["ant-77*"]}]
+    waiting = {"jobQueue": "lab", "jobStatus": "RUNNABLE", "maxResults": 100}
+    token = base64.b64encode(json.dumps([1_750_000_020_000, "0"]).encode()).decode()
+    yield "ListJobs: a queue's 100 newest that wait", batch("listjobs", **waiting)
+    yield "… 100 from a token on", batch("listjobs", **waiting, nextToken=token)
+    yield "… 100 by the beginning of their names", batch("listjobs", jobQueue="lab", filters=by_name)
+    yield "DescribeJobs: 100", batch("describejobs", jobs=[identity(number) for number in range(100)])
 
 
 async def table(server: Server, secrets: Mapping[str, str], requests: int, only: str) -> list[str]:
@@ -189,19 +206,22 @@ async def table(server: Server, secrets: Mapping[str, str], requests: int, only:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=100_000)
+    parser.add_argument("--jobs", type=int, default=125_000)
     parser.add_argument("--requests", type=int, default=REQUESTS, help="of each kind")
     parser.add_argument("--only", default="", help="the rows whose name has this text")
     add_option(parser)
     options = parser.parse_args()
     watch = Watch(options.loaded_anyway)
-    with tempfile.TemporaryDirectory() as folder, mock.patch.object(jobs_page, "_recent", Recent(0.0)):
+    is_kept = (mock.patch.object(jobs_page, "_recent", Recent(0.0)), mock.patch.object(live, "_REST", 0.0))
+    with tempfile.TemporaryDirectory() as folder, is_kept[0], is_kept[1]:
         home = Path(folder)
         fill(home, options.jobs)
         keys = KeyStore(home)
         secrets = {key.name: secret_of(key) for key in (keys.create("admin"), keys.create("lab", ("lab", "night")))}
         began, used = time.monotonic(), time.process_time()
         server = Server(home, cpus=1, rate_limit=0, adopt_store=True)
+        gc.collect()
+        gc.freeze()  # as the server does when it starts
         print(f"loaded in {time.monotonic() - began:.1f} s, {time.process_time() - used:.1f} s of CPU", flush=True)
         try:
             found = asyncio.run(table(server, secrets, options.requests, options.only))
