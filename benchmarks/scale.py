@@ -143,7 +143,8 @@ class Bench:
 
     def have(self, count: int, *states: str) -> bool:
         """Whether so many jobs are in these states."""
-        return sum(number for (_, state), number in self.database.counts.of().items() if state in states) == count
+        counts = self.database.counts.by_status()
+        return sum(counts.get(state, 0) for state in states) == count
 
     def is_stopped(self, gang: str) -> bool:
         return not self.engine.cluster.gangs[gang][0].running

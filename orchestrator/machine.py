@@ -19,13 +19,24 @@ from typing import Protocol, TypeVar
 
 T = TypeVar("T")
 
+_AS_PYTHON = gc.get_threshold()
 _GARBAGE = 50_000
 """Objects, some MB, that may be garbage before it is looked for."""
 
 
 def collect_seldom() -> None:
-    """Look for cyclic garbage less often: with Python's thresholds that takes a third of the controller's time at 10,000 jobs."""
+    """Look for cyclic garbage seldom, and not in what is loaded now: else that takes a third of the controller's time at 10,000 jobs, and
+    holds up requests.
+    """
+    gc.collect()
+    gc.freeze()
     gc.set_threshold(_GARBAGE, 20, 50)
+
+
+def collect_all() -> None:
+    """End what :func:`collect_seldom` began, in a process that goes on without a controller."""
+    gc.unfreeze()
+    gc.set_threshold(*_AS_PYTHON)
 
 
 class PoolFull(Exception):

@@ -188,17 +188,18 @@ class Server:
 
     def start(self) -> None:
         """Start the controller and the server, and tell commands on this machine where it is."""
-        machine.collect_seldom()
         self.bus.open()
         self.peers.start()
         self.reconciler.start()
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
+        machine.collect_seldom()
         self._lock.publish(self.url, self._temporary, arns.here().region)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
+        machine.collect_all()
         self._lock.withdraw()
         self.app.state.closing.set()
         self._uvicorn.should_exit = True

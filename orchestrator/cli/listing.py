@@ -62,8 +62,9 @@ def _newest(client: Client, queue: str | None, all_: bool, automatic: bool) -> l
         page = client.get("/api/jobs", queue=queue, after=after, max=_AT_ONCE, progress=False)
         # the ids and names as the AWS Batch API has them, too: scripts use both
         found += [{"jobId": each["id"], "jobName": each["name"], **each} for each in page["jobs"]]
-        counting = sum(automatic or not each[_AUTOMATIC] for each in found)
-        if (after := page["next"]) is None or (not all_ and counting >= _NEWEST):
+        if (after := page["next"]) is None:
+            return found
+        if not all_ and sum(automatic or not each[_AUTOMATIC] for each in found) >= _NEWEST:
             return found
 
 

@@ -145,15 +145,16 @@ def _window(reconciler: Reconciler, choice: _Choice) -> tuple[dict[str, dict[str
 def _read_window(reconciler: Reconciler, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     found = page_of_jobs(reconciler, choice.wanted, ROWS, choice.after, choice.before)
     rows = {job["id"]: _row(job) for job in found["jobs"]}
-    counts = found["counts"]
+    counts, more = found["counts"], "+" if found["areMore"] else ""
     totals = {
-        name or "all": str(sum(counts.get(each, 0) for each in states or Status)) for name, states in GROUPS.items()
+        name or "all": f"{sum(counts.get(each, 0) for each in states or Status)}{more}"
+        for name, states in GROUPS.items()
     }
     beside = {
         "newer": _address(**choice.filter, before=found["previous"] or "") if found["previous"] else "",
         "older": _address(**choice.filter, after=found["next"] or "") if found["next"] else "",
     }
-    return rows, {**totals, **beside, "shown": f"{len(rows)} of {found['total']}" if rows else ""}
+    return rows, {**totals, **beside, "shown": f"{len(rows)} of {found['total']}{more}" if rows else ""}
 
 
 def _row(job: Mapping[str, Any]) -> dict[str, Any]:

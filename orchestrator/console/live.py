@@ -35,6 +35,8 @@ _SILENT = f"the store or the database has not answered for {_PATIENCE:.0f} s; th
 _LONGEST = 300.0
 """Seconds after which a stream ends; the browser reconnects at once, and is admitted again or refused."""
 _MOST_KEPT = 64
+_REST = 4.0
+"""Times as long as a value took to compute it is kept, where that is longer than its time."""
 _Value = TypeVar("_Value")
 
 
@@ -161,7 +163,9 @@ def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> M
 
 
 class Recent:
-    """Values that many open pages need at once: each is computed at most once in ``seconds``. Any thread may call.
+    """Values that many open pages need at once: each is computed at most once in ``seconds``, and for at most a fifth of the time.
+
+    Any thread may call.
 
     ``most``: number of values; beyond it the one goes that was asked for longest ago.
     """
@@ -169,6 +173,7 @@ class Recent:
     def __init__(self, seconds: float = INTERVAL * 0.9, most: int = _MOST_KEPT) -> None:
         self._seconds, self._most, self._lock = seconds, most, threading.Lock()
         self._kept: OrderedDict[Hashable, tuple[threading.Lock, list[tuple[float, Any]]]] = OrderedDict()
+        """By key its lock, and the value with the moment until which it is kept."""
 
     def get(self, key: Hashable, compute: Callable[[], _Value]) -> _Value:
         """The value of ``key``; where it is older, of ``compute``, which one caller runs while others wait."""
@@ -179,7 +184,10 @@ class Recent:
                 self._kept.popitem(last=False)
         with lock:
             now = time.monotonic()
-            if not kept or now - kept[0][0] > self._seconds:
-                kept[:] = [(now, compute())]
-            value: _Value = kept[0][1]
-            return value
+            if not kept or now >= kept[0][0]:
+                value = compute()
+                done = time.monotonic()
+                kept[:] = [(max(now + self._seconds, done + _REST * (done - now)), value)]
+                return value
+            known: _Value = kept[0][1]
+            return known

@@ -54,7 +54,7 @@ def state_of(job: Job, attempt: Attempt) -> State:
         terms,
         prepared=attempt.epoch != NO_EPOCH,
         launched=attempt.handle is not None,
-        started=job.status != Status.STARTING,
+        started=job.status == Status.RUNNING,
         running_since=attempt.running_since,
         verdict=verdict,
         stop_reason=job.stop_reason,

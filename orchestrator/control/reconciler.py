@@ -252,7 +252,7 @@ class Reconciler:
             self.database.keep_lock()
             self._kept = machine.monotonic()
         if self.trouble is not None:
-            with self.database.session() as session:
+            with self.writing, self.database.session() as session:  # nothing is submitted while jobs are counted
                 self.clock.rewrite(session)  # to be read is not enough: its volume may be full
                 self._loaded.forget()  # another controller may have had the database meanwhile
                 self._take_up(session)

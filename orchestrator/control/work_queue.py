@@ -41,10 +41,12 @@ class WorkQueue:
             self._waiting, self._active = {}, {}
             self.version += 1
         query = select(Job).where(Job.status.not_in(TERMINAL)).order_by(Job.created_at, Job.id)
-        for jobs in session.scalars(query).partitions(_LOADED_AT_ONCE):
+        in_parts = query.execution_options(yield_per=_LOADED_AT_ONCE)  # else all rows are in memory at once
+        for jobs in session.scalars(in_parts).partitions():
             self.note(jobs)
             self.look_again(job.id for job in jobs if job.status == Status.PENDING)
-            session.expunge_all()
+            for job in jobs:
+                session.expunge(job)
 
     def note(self, jobs: Iterable[Job]) -> None:
         """These jobs are in the database as they are here: for the one thread that changes their states."""

@@ -39,32 +39,44 @@ class JobCounts:
                 if not self._counts[kind]:
                     del self._counts[kind]
 
-    def of(self, queues: Collection[str] | None = None) -> dict[Kind, int]:
-        """The counts of these queues, or of all; kinds of which there is no job are left out."""
+    def by_status(self, queues: Collection[str] | None = None) -> dict[str, int]:
+        """The jobs of these queues, or of all, in each state; states of none are left out."""
+        found = Counter[str]()
         with self._lock:
-            return {kind: count for kind, count in self._counts.items() if queues is None or kind[0] in queues}
+            for (queue, status), count in self._counts.items():
+                if queues is None or queue in queues:
+                    found[status] += count
+        return dict(found)
 
 
 def note_counts(session: Session, changed: Iterable[object]) -> None:
     """Note, before a flush, what its new, ``changed`` and deleted objects change of the counts, for :meth:`JobCounts.add` after the commit."""
-    changes = session.info.setdefault("counts", Counter())
+    changes = _changes(session)
     for each in session.new:
         if isinstance(each, Job) and each.parent is None:
             changes[each.queue, str(each.status or Status.SUBMITTED)] += 1
     for each in changed:
-        if isinstance(each, Job):
-            before = attributes.instance_state(each).committed_state.get("status")
-            if before is not None and before != each.status and each.parent is None:
-                changes[each.queue, str(before)] -= 1
-                changes[each.queue, str(each.status)] += 1
+        if isinstance(each, Job) and (before := _stored(each)) != each.status and each.parent is None:
+            changes[each.queue, before] -= 1
+            changes[each.queue, str(each.status)] += 1
     for each in session.deleted:
         if isinstance(each, Job) and each.parent is None:
-            changes[each.queue, str(each.status)] -= 1
+            changes[each.queue, _stored(each)] -= 1
 
 
 def note_deleted(session: Session, jobs: Iterable[tuple[str | None, str, str]]) -> None:
     """The same for rows that a statement deletes: of each the parent, the queue and the state."""
-    changes = session.info.setdefault("counts", Counter())
+    changes = _changes(session)
     for parent, queue, status in jobs:
         if parent is None:
             changes[queue, str(status)] -= 1
+
+
+def _changes(session: Session) -> Counter[Kind]:
+    changes: Counter[Kind] = session.info.setdefault("counts", Counter())
+    return changes
+
+
+def _stored(job: Job) -> str:
+    """The state that its row has; the column keeps it where it is replaced (``active_history``)."""
+    return str(attributes.instance_state(job).committed_state.get("status", job.status))

@@ -1,21 +1,22 @@
-"""Pages of the list of jobs, the newest first, found by a key and not by a number: a page costs the same wherever it is."""
+"""Pages of the list of jobs, the newest first, found by a place and not by a number: a page costs the same wherever it is."""
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from itertools import product
+from typing import Any, Self
 
-from sqlalchemy import ColumnElement, Select, and_, or_, select, tuple_
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy import ColumnElement, func, or_, select, union_all
+from sqlalchemy.orm import Session, defer, selectinload
 
 from orchestrator.domain.errors import RequestError
-from orchestrator.persistence.job_counts import Kind
+from orchestrator.persistence.keyset import behind
 from orchestrator.persistence.models import Job
 
-_MOST_KINDS = 40
-"""Kinds of jobs that are looked up one by one; where more are wanted, rows are passed over."""
+_KEYS = (Job.created_at, Job.id)
+_MOST_PARTS = 100
+"""Parts of the list that are read one by one; where there are more, all jobs are looked through."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,9 @@ class Cursor:
     def read(cls, text: str) -> Self:
         """What :meth:`__str__` has written. Raises RequestError."""
         created_at, _, job = text.partition("-")
-        if not created_at.isdecimal() or len(created_at) > 15 or not job:
-            raise RequestError(f"{text!r} is not a place in the list of jobs; leave it out for the newest")
+        is_time = created_at.isascii() and created_at.isdecimal() and len(created_at) <= 15
+        if not (is_time and job and job.isascii() and job.isprintable()):
+            raise RequestError(f"{text[:100]!r} is not a place in the list of jobs; leave it out for the newest")
         return cls(int(created_at), job)
 
     def __str__(self) -> str:
@@ -55,55 +57,75 @@ class Page:
 
 def read_page(
     session: Session,
-    conditions: Sequence[ColumnElement[bool]],
-    kinds: Collection[Kind] | None,
     most: int,
+    queues: Collection[str] | None = None,
+    statuses: Collection[str] = (),
+    conditions: Sequence[ColumnElement[bool]] = (),
     *,
     after: Cursor | None = None,
     before: Cursor | None = None,
 ) -> Page:
-    """A page, with the attempts of its jobs.
+    """A page, with the attempts of its jobs, without their requests.
 
     Args:
         session: Of the database.
-        conditions: Of the jobs; arrays' children are left out.
-        kinds: Queues and states of the jobs, without those that have none; None: of all.
         most: Jobs of the page.
-        after: The page has the newest that are older than this place.
-        before: It has the oldest that are newer than this place.
+        queues: Of the jobs; None: of all.
+        statuses: Of the jobs; empty: of all.
+        conditions: Of the jobs, besides. Jobs that do not meet them are passed over one by one.
+        after: The page has the newest jobs that are older than this place.
+        before: The page has the oldest jobs that are newer than this place; only one of both may be set.
     """
     backwards = before is not None
-    place = before or after
-    start = [] if place is None else [_beyond(place, backwards)]
-    base = select(Job).where(Job.parent.is_(None), *conditions, *start).limit(most + 1)
-    if kinds is None:
-        found = _ordered(session, base, backwards)
-    elif len(kinds) > _MOST_KINDS:
-        found = _ordered(session, base.where(tuple_(Job.queue, Job.status).in_(list(kinds))), backwards)
-    else:  # each from its own part of an index, which has the jobs in order
-        each = [
-            _ordered(session, base.where(and_(Job.queue == queue, Job.status == status)), backwards)
-            for queue, status in kinds
-        ]
-        merged = heapq.merge(*each, key=_place, reverse=not backwards)
-        found = [job for job, _ in zip(merged, range(most + 1), strict=False)]
-    more, jobs = len(found) > most, found[:most]
+    query = select(*_KEYS).where(Job.parent.is_(None), *conditions)
+    if (place := before or after) is not None:
+        query = query.where(behind(_KEYS, (place.created_at, place.id), (not backwards,) * 2))
+    query = query.order_by(*_order(Job, backwards)).limit(most + 1)
+    parts = [select(query.where(*part).subquery()) for part in _parts(queues, statuses)]
+    if not parts:
+        return Page([], is_first=True, is_last=True)
+    found = union_all(*parts).subquery()
+    ids = select(found.c.id).order_by(*_order(found.c, backwards)).limit(most + 1)
+    # one statement: a job that changes its state meanwhile is neither found twice nor missed
+    whole = select(Job).where(Job.id.in_(ids)).order_by(*_order(Job, backwards))
+    read = session.scalars(whole.options(selectinload(Job.attempts), defer(Job.request))).all()
+    has_more, jobs = len(read) > most, read[:most]
     if backwards:
-        return Page(jobs[::-1], is_first=not more, is_last=False)
-    return Page(jobs, is_first=after is None, is_last=not more)
+        return Page(jobs[::-1], is_first=not has_more, is_last=False)
+    return Page(jobs, is_first=after is None, is_last=not has_more)
 
 
-def _ordered(session: Session, query: Select[Job], backwards: bool) -> Sequence[Job]:
-    keys = (Job.created_at, Job.id) if backwards else (Job.created_at.desc(), Job.id.desc())
-    return session.scalars(query.order_by(*keys).options(selectinload(Job.attempts))).all()
+def contains(session: Session, text: str) -> ColumnElement[bool]:
+    """Whether a job's name, run or owner has this text, or its id begins with it; upper and lower case are the same."""
+    columns = (Job.name, Job.run, Job.owner)
+    if session.get_bind().dialect.name == "sqlite":  # its LIKE heeds no case, and its lower() costs more than all else
+        places = [each.contains(text, autoescape=True) for each in columns]
+        return or_(*places, Job.id.startswith(text, autoescape=True))
+    places = [each.icontains(text, autoescape=True) for each in columns]
+    return or_(*places, Job.id.istartswith(text, autoescape=True))
 
 
-def _place(job: Job) -> tuple[int, str]:
-    return job.created_at, job.id
+def count(
+    session: Session, queues: Collection[str] | None, conditions: Sequence[ColumnElement[bool]], most: int
+) -> Mapping[str, int]:
+    """The jobs of these queues that meet the conditions, by state; at most so many are counted, the newest."""
+    query = select(Job.id).where(Job.parent.is_(None), *conditions)
+    if queues is not None:
+        query = query.where(Job.queue.in_(queues))
+    ids = query.order_by(*_order(Job, False)).limit(most)
+    grouped = select(Job.status, func.count()).where(Job.id.in_(ids)).group_by(Job.status)
+    return {str(status): int(number) for status, number in session.execute(grouped)}
 
 
-def _beyond(place: Cursor, backwards: bool) -> ColumnElement[bool]:
-    at, job = Job.created_at, Job.id
-    if backwards:
-        return and_(at >= place.created_at, or_(at > place.created_at, job > place.id))
-    return and_(at <= place.created_at, or_(at < place.created_at, job < place.id))
+def _parts(queues: Collection[str] | None, statuses: Collection[str]) -> Sequence[Sequence[ColumnElement[bool]]]:
+    """Conditions of the parts of the list, each of which is in order in an index; no job is in two of them."""
+    of_queue = [[]] if queues is None else [[Job.queue == queue] for queue in set(queues)]
+    of_status = [[Job.status == status] for status in set(statuses)] or [[]]
+    if len(of_queue) * len(of_status) > _MOST_PARTS:
+        return [[Job.queue.in_(queues or ()), *([Job.status.in_(statuses)] if statuses else [])]]
+    return [[*queue, *status] for queue, status in product(of_queue, of_status)]
+
+
+def _order(columns: Any, backwards: bool) -> Sequence[ColumnElement[Any]]:
+    keys = columns.created_at, columns.id
+    return keys if backwards else tuple(key.desc() for key in keys)

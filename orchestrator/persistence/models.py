@@ -5,9 +5,10 @@ Times are Unix milliseconds, as in the Batch API. A change here needs a migratio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Generic, Self, TypeVar, overload
 
-from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint
+from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
 from orchestrator import machine
@@ -123,6 +124,16 @@ class _OfArray(Generic[_T]):
         setattr(job, self._own, value)
 
 
+_CHILDREN = text("parent IS NOT NULL")
+
+
+def _listed(name: str, *columns: str, searched: Sequence[str] = ()) -> Index:
+    """An index with a part of the list of jobs, which has no children of arrays, in its order. A search in it reads no row."""
+    within = text("parent IS NULL")  # and the column itself, since SQLite looks at it in spite of that
+    of_all = (*columns, "created_at", "id", *searched, "parent")
+    return Index(name, *of_all, sqlite_where=within, postgresql_where=within)
+
+
 class Job(Base):
     """A submitted job: a multi-node job, a single-node one, an array of such, or one child of an array."""
 
@@ -130,9 +141,11 @@ class Job(Base):
     __table_args__ = (
         UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
         Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
-        Index("ix_jobs_queue_created", "queue", "created_at", "id"),
-        Index("ix_jobs_list", "parent", "created_at", "id"),
-        Index("ix_jobs_list_kind", "parent", "queue", "status", "created_at", "id"),
+        Index("ix_jobs_parent", "parent", sqlite_where=_CHILDREN, postgresql_where=_CHILDREN),
+        _listed("ix_jobs_list", searched=("queue", "name", "run", "owner")),
+        _listed("ix_jobs_list_queue", "queue"),
+        _listed("ix_jobs_list_status", "status"),
+        _listed("ix_jobs_list_kind", "queue", "status"),
     )
     id: Mapped[str] = mapped_column(primary_key=True)
     """A UUID; of an array's child ``<parent>:<index>``."""
@@ -150,7 +163,7 @@ class Job(Base):
     node_properties = _OfArray[dict[str, Any]]("own_node_properties")
     """Of the definition, with overrides and parameters applied; a ``container`` job is a gang of one node here."""
     run: Mapped[str] = mapped_column(index=True)
-    status: Mapped[str] = mapped_column(index=True, default=Status.SUBMITTED)
+    status: Mapped[str] = mapped_column(default=Status.SUBMITTED, active_history=True)
     status_reason: Mapped[str | None] = mapped_column(default=None)
     created_at: Mapped[int] = mapped_column(default=now, index=True)
     runnable_at: Mapped[int | None] = mapped_column(default=None)

@@ -10,12 +10,13 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from sqlalchemy import (
     URL,
     Connection,
     Engine,
+    Select,
     create_engine,
     event,
     inspect,
@@ -24,11 +25,11 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import ORMExecuteState, Session
 
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.job_counts import JobCounts, note_counts
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
 from orchestrator.persistence.updates import write_changes
 
@@ -384,6 +385,14 @@ def _forget(session: Session) -> None:
     session.info.pop("jobs", None)
     session.info.pop("ids", None)
     session.info.pop("counts", None)
+
+
+@event.listens_for(_Session, "do_orm_execute")
+def _look_up_nodes(state: ORMExecuteState) -> None:
+    """SQLite reads the whole table of nodes to find those of several attempts, by pairs of keys; by the jobs it uses the index."""
+    if state.is_relationship_load and state.bind_mapper is inspect(Node) and isinstance(state.parameters, dict):
+        jobs = {job for job, _ in state.parameters.get("primary_keys", ())}
+        state.statement = cast(Select[Any], state.statement).where(Node.job_id.in_(jobs))
 
 
 @event.listens_for(_Session, "before_flush")

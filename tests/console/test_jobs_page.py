@@ -128,7 +128,7 @@ def test_a_thousand_jobs_are_found_paged_and_stopped(console: Console, people: P
     person.picture("jobs-1000")
     first = rows.first.get_attribute("data-key")
     person.click("Older")
-    expect(page).to_have_url(re.compile("search=many-.*page=2"))
+    expect(page).to_have_url(re.compile("search=many-.*after="))
     expect(rows).to_have_count(50)
     assert rows.first.get_attribute("data-key") != first
     person.click("Newer")

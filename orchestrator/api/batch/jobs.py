@@ -24,10 +24,11 @@ from orchestrator.persistence.queries import ask_to_end
 
 def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeJobs for jobs, nodes (``id#N``, ``arn#N``) and array children (``id:N``); unknown ids are passed over."""
-    found = []
-    for reference in request["jobs"]:
-        job_id, node = split_reference(reference)
-        job = context.session.get(Job, job_id)
+    wanted, found = [split_reference(reference) for reference in request["jobs"]], []
+    query = select(Job).where(Job.id.in_({job_id for job_id, _ in wanted})).options(selectinload(Job.attempts))
+    jobs = {job.id: job for job in context.session.scalars(query)}
+    for job_id, node in wanted:
+        job = jobs.get(job_id)
         if job is None or not permissions.is_visible(job):
             continue
         reason = context.reason(job)

@@ -1,4 +1,4 @@
-"""Pages by position in an order, not by count: no row is repeated or skipped when rows are added or deleted between two calls."""
+"""Pages of AWS's operations: ``maxResults`` and ``nextToken``."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Select, and_, or_
+from sqlalchemy import Select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from orchestrator.api.errors import ClientError
+from orchestrator.persistence.keyset import behind
 
 
 def page_size(request: dict[str, Any], most: int) -> int:
@@ -38,11 +39,7 @@ def page(
     """
     if token := request.get("nextToken"):
         values = decode(token, [key.type.python_type for key in keys])
-        behind = []
-        for index, (key, value) in enumerate(zip(keys, values, strict=True)):
-            same = [keys[i] == values[i] for i in range(index)]
-            behind.append(and_(*same, key < value if descending[index] else key > value))
-        query = query.where(or_(*behind))
+        query = query.where(behind(keys, values, descending))
     rows = list(session.scalars(query.limit(size + 1)))
     if len(rows) <= size:
         return rows, {}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Query, Request
-from sqlalchemy import ColumnElement, case, func, or_, select
+from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.api import permissions
@@ -21,9 +21,10 @@ from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
+from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
-from orchestrator.persistence.job_pages import Cursor, read_page
+from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
@@ -35,6 +36,8 @@ from shared_store.metrics import finite, sampled
 router = APIRouter()
 
 JOBS_A_PAGE = 100
+MOST_COUNTED = 5000
+"""Jobs of a search that are counted, the newest."""
 REWARDS = 40
 """Rewards of a job that tell its curve."""
 _FRESH = 1.0
@@ -57,18 +60,9 @@ class Wanted:
     queue: str = ""
     search: str = ""
 
-    def conditions(self) -> list[ColumnElement[bool]]:
-        """Of the rows, but for the states and arrays' children; jobs that the caller may not see are left out."""
-        found: list[ColumnElement[bool]] = []
-        if (queues := permissions.visible_queues()) is not None:
-            found.append(Job.queue.in_(queues))
-        if self.queue:
-            found.append(Job.queue == self.queue)
-        if text := self.search.strip():
-            places = (Job.name, Job.run, Job.owner)
-            within = [each.icontains(text, autoescape=True) for each in places]
-            found.append(or_(*within, Job.id.istartswith(text, autoescape=True)))
-        return found
+    def conditions(self, session: Session) -> list[ColumnElement[bool]]:
+        """Of the rows, by the text."""
+        return [contains(session, text)] if (text := self.search.strip()) else []
 
     def queues(self) -> Collection[str] | None:
         """Those whose jobs are wanted and may be seen by the caller; None: all."""
@@ -76,14 +70,6 @@ class Wanted:
         if not self.queue:
             return visible
         return [self.queue] if visible is None or self.queue in visible else []
-
-    def is_any(self) -> bool:
-        """Whether all jobs are wanted."""
-        return not self.statuses and not self.search.strip() and self.queues() is None
-
-    @property
-    def in_states(self) -> list[ColumnElement[bool]]:
-        return [Job.status.in_(self.statuses)] if self.statuses else []
 
 
 @router.get("/jobs")
@@ -120,21 +106,20 @@ def page_of_jobs(
 ) -> dict[str, Any]:
     """``jobs``, ``total`` and ``counts`` (by state, of all states) of the filter, and the places of the pages beside this one.
 
-    Raises RequestError for a place that is none.
+    A search counts its newest 5,000 jobs; ``areMore``: there may be others.
+
+    Raises RequestError for a place that is none, and for two of them.
     """
+    if after and before:
+        raise RequestError("a page is after a place or before one, not both; leave one of them out")
     places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
+    queues = wanted.queues()
     with reconciler.database.session() as session:
-        if wanted.search.strip():  # only the rows tell
-            grouped = select(Job.status, func.count()).where(Job.parent.is_(None), *wanted.conditions())
-            counts = {str(status): int(count) for status, count in session.execute(grouped.group_by(Job.status))}
-            page = read_page(session, [*wanted.conditions(), *wanted.in_states], None, most, **places)
+        if conditions := wanted.conditions(session):
+            counts = count(session, queues, conditions, MOST_COUNTED)
         else:
-            kinds = reconciler.database.counts.of(wanted.queues())
-            counts = Counter[str]()
-            for (_, status), count in kinds.items():
-                counts[status] += count
-            own = [kind for kind in kinds if not wanted.statuses or kind[1] in wanted.statuses]
-            page = read_page(session, [], None if wanted.is_any() else own, most, **places)
+            counts = reconciler.database.counts.by_status(queues)
+        page = read_page(session, most, queues, wanted.statuses, conditions, **places)
         rows = [_row(reconciler, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
     progress = _progress(reconciler, trainings)
@@ -143,6 +128,7 @@ def page_of_jobs(
         "jobs": [{**row, "progress": progress.get(row["id"])} for row, _ in rows],
         "total": sum(counts.get(each, 0) for each in states),
         "counts": counts,
+        "areMore": bool(conditions) and sum(counts.values()) == MOST_COUNTED,
         "next": None if page.is_last or not page.jobs else str(Cursor.of(page.jobs[-1])),
         "previous": None if page.is_first or not page.jobs else str(Cursor.of(page.jobs[0])),
     }
@@ -151,12 +137,10 @@ def page_of_jobs(
 def ids_of(session: Session, wanted: Wanted) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
     active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
-    query = (
-        select(Job.id)
-        .where(Job.parent.is_(None), *wanted.conditions(), Job.status.in_(active))
-        .order_by(Job.created_at, Job.id)
-    )
-    return list(session.scalars(query))
+    query = select(Job.id).where(Job.parent.is_(None), *wanted.conditions(session), Job.status.in_(active))
+    if (queues := wanted.queues()) is not None:
+        query = query.where(Job.queue.in_(queues))
+    return list(session.scalars(query.order_by(Job.created_at, Job.id)))
 
 
 def kind_of(spec: Mapping[str, Any] | None) -> str:

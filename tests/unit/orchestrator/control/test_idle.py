@@ -75,7 +75,7 @@ def bench(tmp_path: Path) -> Iterator[tuple[FakeController[FakeEngine], Costs]]:
         stack.callback(event.remove, Engine, "before_cursor_execute", costs.note)
         made.submit(*(f"job-{number}" for number in range(GANGS - 1)), node_properties=properties(1))
         made.submit("pair", node_properties=properties(1, nodes=2))
-        ticks(made, lambda: made.database.counts.of() == {("default", Status.RUNNING): GANGS})
+        ticks(made, lambda: made.database.counts.by_status() == {Status.RUNNING: GANGS})
         ticks(made, lambda: min(made.reconciler.work_queue._active.values()) > time.monotonic())
         yield made, costs
 
@@ -131,7 +131,7 @@ def test_a_gang_that_ends_costs_looks_at_no_other(
 
     def passes() -> None:
         controller.engine.cluster.end("job-3/1/1", 0, 0)
-        ticks(controller, lambda: controller.database.counts.of().get(("default", Status.SUCCEEDED)) == 1)
+        ticks(controller, lambda: controller.database.counts.by_status().get(Status.SUCCEEDED) == 1)
 
     costs.watched(passes)
     assert looked == {"job-3"}
