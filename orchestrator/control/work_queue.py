@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from math import inf
+from sys import intern
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -147,4 +148,5 @@ class WorkQueue:
         shape = self._shapes.setdefault(shape, shape)
         since = job.runnable_at or job.created_at
         created = job.created_at if job.queued_since is None else job.queued_since
-        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, created, since, job.timeout)
+        owner = job.owner and intern(job.owner)
+        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, created, since, job.timeout, owner)
