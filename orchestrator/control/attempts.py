@@ -158,7 +158,7 @@ class Attempts:
 
     def pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
-        if attempt not in job.attempts:
+        if not _is_open(job, attempt):
             return _LATER
         key, state = (job.id, attempt.number), self._state(job, attempt)
         if state.phase is Phase.LAUNCHING:
@@ -197,6 +197,8 @@ class Attempts:
                     self._states[job.id] = after(state, instruction)
                     if then is not None:
                         yield from self._happened(session, job, attempt, then)
+                    if not _is_open(job, attempt):
+                        return  # nothing of it is remembered any more
                     state = self._state(job, attempt)
 
     def share(self, session: Session, jobs: Sequence[Job]) -> None:
@@ -407,6 +409,11 @@ class Attempts:
         if (policy := self._rows.policy(job.queue)) is not None:
             decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
             add_usage(session, job.queue, job.share or "", resource_seconds(attempt, moment), decay, moment)
+
+
+def _is_open(job: Job, attempt: Attempt) -> bool:
+    """Whether it was neither closed nor withdrawn."""
+    return attempt.stopped_at is None and attempt in job.attempts
 
 
 def _name(attempt: Attempt) -> str:

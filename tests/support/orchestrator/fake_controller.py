@@ -1,0 +1,86 @@
+"""A controller on a fake engine, with its database and its store."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from orchestrator.control.bus import Bus
+from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.control.peers import Peers
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.job import Status
+from orchestrator.engines.registry import EngineSet
+from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.session import Database
+from shared_store.layout import Store
+from shared_store.outcomes import Outcome, write_outcome
+from tests.support.orchestrator.rows import job
+from tests.support.waiting import wait_for
+
+E = TypeVar("E", bound=FakeEngine)
+
+
+def properties(cpus: int, nodes: int = 1, **variables: str) -> dict[str, Any]:
+    """Of a native job; ``cpus`` of each node."""
+    needs = [{"type": "VCPU", "value": str(cpus)}]
+    given = [{"name": name, "value": value} for name, value in {"MUSTER_ON_CHILD_FAILURE": "fail", **variables}.items()]
+    container = {"command": ["true"], "resourceRequirements": needs, "environment": given}
+    return {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
+
+
+class FakeController(Generic[E]):
+    """Its database has a queue ``urgent``, which goes before ``default``."""
+
+    def __init__(self, home: Path, engine: E, stack: ExitStack) -> None:
+        """``stack`` closes it."""
+        self.engine = engine
+        engines = EngineSet([engine])
+        stack.callback(engines.close)
+        (home / "store").mkdir()
+        self.store = Store(home / "store").open()
+        self.database = Database.at(home)
+        stack.callback(self.database.close)
+        with self.database.session() as session:
+            ensure_compute_environments(session, engines.names)
+            session.add(JobQueue(name="urgent", priority=9, compute_environments=["fake"]))
+        self.reconciler = Reconciler(
+            self.database, engines, self.store, Bus(home), Peers(self.store, home), interval=0.02
+        )
+        stack.callback(self.reconciler.close)
+
+    def submit(self, *names: str, **facts: Any) -> None:
+        with self.database.session() as session:
+            session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
+        self.reconciler.wake()
+
+    def job(self, name: str) -> Job:
+        with self.database.session() as session:
+            return session.get_one(Job, name)
+
+    def wait(self, name: str, *wanted: Status) -> Job:
+        found: Job = wait_for(lambda: (j := self.job(name)).status in wanted and j, 30, f"{name} is {wanted}")
+        return found
+
+    def explains(self, name: str, said: str) -> None:
+        """Wait until a job's reason, as every answer shows it, has these words."""
+
+        def reason() -> str:
+            found = self.job(name)
+            return self.reconciler.admission.reason(found).words
+
+        wait_for(lambda: said in reason(), 30, f"{name} says {said!r}")
+
+    def runs_and_ends(self, *names: str) -> None:
+        """Submit jobs, and have them end well once they run."""
+        self.submit(*names)
+        for name in names:
+            self.wait(name, Status.RUNNING)
+            for index in range(2):
+                done = Outcome(index, 1, 0, None, "done", None, 1.0, 2.0)
+                write_outcome(self.store.run(name), name, 1, done)
+                self.engine.cluster.end(f"{name}/1/1", index, 0)
+        for name in names:
+            self.wait(name, Status.SUCCEEDED)
