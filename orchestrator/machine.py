@@ -100,6 +100,7 @@ class ThreadPool:
         while (call := self._next()) is not None and not self._closing:
             self._began[me] = time.monotonic()
             call()
+            del call  # its result does not live on while the thread idles
             self._began[me] = None
             with self._lock:
                 self._open -= 1

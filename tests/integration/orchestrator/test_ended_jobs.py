@@ -16,19 +16,31 @@ from orchestrator.control.monitoring import exposition
 from orchestrator.domain.attempt import State
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
-from orchestrator.engines.api import NotYet
+from orchestrator.engines.api import Gang, Handle, NotYet, Plan
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.models import Job, JobQueue
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
 
-Bench = FakeController[FakeEngine]
+
+class FullEngine(FakeEngine):
+    """It has no room while it is said to be full."""
+
+    is_full = False
+
+    def launch(self, plan: Plan[Gang]) -> Handle:
+        if self.is_full:
+            raise NotYet("no room yet")
+        return super().launch(plan)
+
+
+Bench = FakeController[FullEngine]
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     with ExitStack() as stack:
-        made = FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/large", 64.0, (), 65536)])), stack)
+        made = FakeController(tmp_path, FullEngine(capacity=Hosts([Host("fake/large", 64.0, (), 65536)])), stack)
         made.reconciler.start()
         yield made
 
@@ -37,21 +49,23 @@ def series(bench: Bench, name: str) -> list[str]:
     return [line for line in exposition(bench.reconciler).decode().splitlines() if line.startswith(name)]
 
 
+def stop(bench: Bench, name: str) -> None:
+    with bench.database.session() as session:
+        session.get_one(Job, name).stop_reason = "enough"
+    bench.wait(name, Status.FAILED)
+
+
 def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_withdrawn(bench: Bench) -> None:
     gc.collect()
     before = {id(each) for each in gc.get_objects() if isinstance(each, State)}
     bench.runs_and_ends("a", "b")
     bench.submit("stopped")
     bench.wait("stopped", Status.RUNNING)
-    with bench.database.session() as session:
-        session.get_one(type(bench.job("stopped")), "stopped").stop_reason = "enough"
-    bench.wait("stopped", Status.FAILED)
-    bench.engine.error = NotYet("no room yet")
+    stop(bench, "stopped")
+    bench.engine.is_full = True
     bench.submit("waits")
     bench.explains("waits", "no room yet")
-    with bench.database.session() as session:
-        session.get_one(type(bench.job("waits")), "waits").stop_reason = "enough"
-    bench.wait("waits", Status.FAILED)
+    stop(bench, "waits")
     attempts: Attempts = bench.reconciler.attempts
 
     def kept() -> list[State]:
