@@ -145,6 +145,8 @@ class WorkQueue:
 
     def _entry(self, job: Job) -> Waiting:
         shape = job.gang.shape
+        if not self._waiting:
+            self._shapes.clear()
         shape = self._shapes.setdefault(shape, shape)
         since = job.runnable_at or job.created_at
         created = job.created_at if job.queued_since is None else job.queued_since
