@@ -14,11 +14,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Protocol, TypeVar
 
 T = TypeVar("T")
 
+_IDLE = 60.0
+"""Seconds after which a thread of a pool ends that has nothing to do."""
 _AS_PYTHON = gc.get_threshold()
 _GARBAGE = 50_000
 """Objects, some MB, that may be garbage before it is looked for."""
@@ -61,7 +63,7 @@ class Pool(Protocol):
 
 
 class ThreadPool:
-    """Daemon threads, started as they are needed: one that hangs does not keep the process alive."""
+    """Daemon threads, started as they are needed and ended when they idle: one that hangs does not keep the process alive."""
 
     def __init__(self, name: str, threads: int, waiting: int | None) -> None:
         """``waiting``: how many calls may wait for a thread; None: any number."""
@@ -105,19 +107,33 @@ class ThreadPool:
     def close(self, patience: float = 0.0) -> None:
         self._closing = True
         deadline = time.monotonic() + patience
-        for _ in self._began:
+        with self._lock:
+            threads = list(self._began)
+        for _ in threads:
             self._calls.put(None)
-        for thread in list(self._began):
+        for thread in threads:
             thread.join(max(0.0, deadline - time.monotonic()))
 
     def _run(self) -> None:
         me = threading.current_thread()
-        while (call := self._calls.get()) is not None and not self._closing:
+        while (call := self._next()) is not None and not self._closing:
             self._began[me] = time.monotonic()
             call()
+            del call  # its result does not live on while the thread idles
             self._began[me] = None
             with self._lock:
                 self._open -= 1
+
+    def _next(self) -> Callable[[], None] | None:
+        """The next call; None for a thread that is to end."""
+        while True:
+            try:
+                return self._calls.get(timeout=_IDLE)
+            except Empty:
+                with self._lock:
+                    if self._open < len(self._began):  # the others can carry out all calls that were submitted
+                        del self._began[threading.current_thread()]
+                        return None
 
 
 class Machine:

@@ -81,6 +81,7 @@ class Server:
         trusted_proxies: Sequence[str] = (),
         min_free: MinFree = DEFAULT,
         lost_after: float = LOST_AFTER,
+        squeue_interval: float | None = None,
         webhooks: str | None = None,
         account: str | None = None,
         region: str | None = None,
@@ -97,6 +98,7 @@ class Server:
         ``temporary``: it goes away with a command that started it; who follows a job then starts another one.
         ``adopt_store``: take what is at the store's path, although the database knows another store.
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
+        ``squeue_interval``: seconds between two calls of ``squeue``; None: as the slurm engine chooses.
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
         ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`).
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
@@ -117,7 +119,9 @@ class Server:
             self.access.console_secret = console_secret(home)
             self._socket = _listen(host, port)
             stack.callback(self._socket.close)
-            nodes = _make_engines(engines, home, cpus, gpus)  # before anything is made in the home directory
+            nodes = _make_engines(
+                engines, Setting(home, cpus, gpus, squeue_interval)
+            )  # before anything is made in the home directory
             stack.callback(nodes.close)
             if store is None:
                 stack.enter_context(_default_store(home / "store"))
@@ -244,13 +248,13 @@ def _take_lock(home: Path, temporary: bool) -> HomeLock:
         ) from None
 
 
-def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Sequence[str] | None) -> EngineSet:
+def _make_engines(names: Sequence[str], setting: Setting) -> EngineSet:
     """The engines; where one can't be made, those before it are closed. Raises ServerError."""
     with ExitStack() as stack:
         made = []
         for name in dict.fromkeys(names):
             try:
-                made.append(make_engine(name, Setting(home, cpus, gpus)))
+                made.append(make_engine(name, setting))
             except EngineError as error:
                 raise ServerError(str(error)) from None
             stack.callback(made[-1].close)

@@ -33,6 +33,8 @@ EngineOption = Annotated[
     ),
 ]
 _SHORTEST_SILENCE = 10.0
+_SHORTEST_INTERVAL, _LONGEST_INTERVAL = 1.0, 240.0
+"""Seconds between two calls of squeue: slurmctld forgets an ended job after 300 s by default (MinJobAge)."""
 CpusOption = Annotated[
     float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
 ]
@@ -120,6 +122,14 @@ def serve(
             "it runs. The controller waits for nodes that fall silent together, since it may itself be cut off."
         ),
     ] = "120s",
+    squeue_interval: Annotated[
+        str | None,
+        typer.Option(
+            help="Time between two calls of squeue by the slurm engine, such as 60s. By default 1s with at most 10 gangs in Slurm's "
+            "queue, and 30s with more.",
+            show_default=False,
+        ),
+    ] = None,
     rate_limit: Annotated[
         int,
         typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited."),
@@ -186,6 +196,7 @@ def serve(
         trusted_proxies=trust_proxy or (),
         min_free=_min_free(min_free),
         lost_after=_lost_after(lost_after),
+        squeue_interval=_squeue_interval(squeue_interval, engine or ()),
         webhooks=webhooks,
         account=account_id,
         region=region,
@@ -216,6 +227,19 @@ def _lost_after(text: str) -> float:
         raise SpecError(
             f"--lost-after {text!r}: expected at least {_SHORTEST_SILENCE:.0f}s; a busy machine is silent for some seconds"
         )
+    return seconds
+
+
+def _squeue_interval(text: str | None, engines: Sequence[str]) -> float | None:
+    seconds = seconds_of("--squeue-interval", text)
+    if seconds is None:
+        return None
+    if "slurm" not in engines:
+        raise SpecError(
+            f"--squeue-interval {text}: only the slurm engine calls squeue; add --engine slurm, or leave it out"
+        )
+    if not _SHORTEST_INTERVAL <= seconds <= _LONGEST_INTERVAL:
+        raise SpecError(f"--squeue-interval {text}: expected {_SHORTEST_INTERVAL:.0f}s to {_LONGEST_INTERVAL:.0f}s")
     return seconds
 
 

@@ -23,7 +23,7 @@ from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Job
 from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
 from orchestrator.scheduling.reasons import WaitReport
-from orchestrator.scheduling.snapshot import Leading
+from orchestrator.scheduling.snapshot import Leading, Turns
 
 _PASS_INTERVAL, _LONGEST_PASS_INTERVAL = 1.0, 16.0
 """Seconds between passes while nothing changes, at first and at most: shares decay and limits run out by themselves."""
@@ -53,6 +53,7 @@ class Admission:
         self._short = False
         self._report: WaitReport | None = None
         self._leading: Mapping[str, Leading] = {}
+        self._turns = Turns()
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
         """Of the last pass: the version of the work queue, when it began, and the seconds that it took."""
         self._pass_interval = _PASS_INTERVAL
@@ -89,11 +90,12 @@ class Admission:
                 waiting,
                 holding,
                 self._leading,
+                self._turns,
                 self._engine.names[0],
                 unknown,
             )
         decisions = decide(snapshot)
-        self._report, self._leading = decisions.report, decisions.leading
+        self._report, self._leading, self._turns = decisions.report, decisions.leading, decisions.turns
         took = machine.monotonic() - started
         self._passed = (version, started, took)
         self._monitoring.pass_took(took)

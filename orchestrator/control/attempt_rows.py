@@ -42,6 +42,7 @@ def state_of(job: Job, attempt: Attempt) -> State:
         allowed=job.attempts_allowed,
         spent=len(spent),
         conditions=job.evaluate_on_exit,
+        cancelled=sum(each.ending == Ending.CANCELLED for each in job.attempts if each is not attempt),
         last_fault=spent[-1].fault if spent else None,
     )
     verdict = None
@@ -60,6 +61,14 @@ def state_of(job: Job, attempt: Attempt) -> State:
         stop_reason=job.stop_reason,
         closed=attempt.stopped_at is not None,
     )
+
+
+def notes_of(job: Job, attempt: Attempt) -> list[str]:
+    """For the beginning of the nodes' logs: that others have cancelled the attempt before this one."""
+    before = next((each for each in job.attempts if each.number == attempt.number - 1), None)
+    if before is None or before.ending != Ending.CANCELLED:
+        return []
+    return [f"muster: attempt {before.number} was {before.status_reason}"] * len(attempt.nodes)
 
 
 class SharedRows:

@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.attempt_rows import GRACE, NO_EPOCH, SharedRows, state_of
+from orchestrator.control.attempt_rows import GRACE, NO_EPOCH, SharedRows, notes_of, state_of
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.kept_texts import KeptTexts, references_of
@@ -57,8 +57,8 @@ from orchestrator.domain.attempt_instructions import (
     Withdraw,
 )
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.job import Status
-from orchestrator.engines.api import CannotStart, EngineError, Gang, GangStatus, NotYet, Plan
+from orchestrator.domain.job import Ending, Status
+from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.log_groups import record_logs
 from orchestrator.persistence.models import Attempt, Job, now
@@ -70,6 +70,8 @@ log = logging.getLogger("muster.controller")
 
 _READERS = 16
 """Threads for the store. An open attempt has one call there at most, and of a run's closed attempts only the last one has any."""
+_CANCELLATIONS = 3
+"""How often a job is started again, by default, after others have cancelled it in its engine's own queue."""
 _LEAST, _LATER = 0.02, 60.0
 """Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
 
@@ -159,7 +161,7 @@ class Attempts:
 
     def pause(self, job: Job, attempt: Attempt) -> float:
         """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
-        if attempt not in job.attempts:
+        if not _is_open(job, attempt):
             return _LATER
         opened = self._opened(job, attempt)
         key, state = opened.key, opened.state
@@ -332,6 +334,7 @@ class Attempts:
             timeout=job.timeout,
             priority=job.priority,
             options=options,
+            notes=notes_of(job, attempt),
         )
 
     @staticmethod
@@ -364,7 +367,12 @@ class Attempts:
             return self._errands.delayed(key)
         iteration = opened.progress.iteration
         progress = "" if iteration is None else f"; last checkpoint: iteration {iteration}"
-        return Gone(self.clock.now(), self._observer.ends(job, attempt, status), progress)
+        gone = Gone(self.clock.now(), self._observer.ends(job, attempt, status), progress)
+        cancelled = next((node.words for node in status if node.cause is Cause.CANCELLED), "")
+        if not cancelled:
+            return gone
+        most = self._rows.options(attempt.environment, job.queue).get("cancellations", _CANCELLATIONS)
+        return replace(gone, cancelled=cancelled, cancellations=int(most))
 
     def _withdraw(self, job: Job, attempt: Attempt, opened: _Open, reason: str) -> Callable[[], None]:
         """Give the room back; returns what follows the commit."""
@@ -397,6 +405,9 @@ class Attempts:
         attempt.started_at = attempt.started_at or now()
         attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
         attempt.spent = close.spent
+        if close.cancelled:
+            attempt.ending, attempt.status_reason = Ending.CANCELLED, close.cancelled
+            log.warning("job %s: %s", job.id, close.reason)
         charge(attempt, opened.progress.saved if opened.progress else None, close.moment)
         opened.uncommitted.append(self.monitoring.ended(job, attempt))
         self._charge_share(session, job, attempt, close.moment)
@@ -409,6 +420,11 @@ class Attempts:
         if (policy := self._rows.policy(job.queue)) is not None:
             decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
             add_usage(session, job.queue, job.share or "", resource_seconds(attempt, moment), decay, moment)
+
+
+def _is_open(job: Job, attempt: Attempt) -> bool:
+    """Whether it was neither closed nor withdrawn."""
+    return attempt.stopped_at is None and attempt in job.attempts
 
 
 def _name(attempt: Attempt) -> str:

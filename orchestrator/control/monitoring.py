@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _WAITS = (0.1, 0.5, 1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 24 * 3600)
 _PASSES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
+_TRAININGS = 500
+"""The most trainings that have series of their own."""
 _USED = ("queue", "engine")
 _Sums = defaultdict[tuple[str, ...], float]
 
@@ -83,6 +85,15 @@ class Monitoring:
             )
             for unit in ("gpu", "cpu")
         }
+
+    def forget_queue(self, queue: str) -> None:
+        """A queue was deleted: its series end, lest they grow with every queue that ever was."""
+        of_queues = [self._waits, self._restarts, self._attempts, *self._seconds.values(), *self._lost.values()]
+        for metric in of_queues:
+            samples = [sample.labels for family in metric.collect() for sample in family.samples]
+            known = [{name: value for name, value in labels.items() if name != "le"} for labels in samples]
+            for values in {tuple(labels.values()) for labels in known if labels["queue"] == queue}:
+                metric.remove(*values)
 
     def pass_took(self, seconds: float) -> None:
         """A scheduling pass was made."""
@@ -162,7 +173,8 @@ class _Moment(Collector):
         }
         query = select(Job.queue, Job.status, func.count()).where(Job.kind != "array").group_by(Job.queue, Job.status)
         for queue, status, count in session.execute(query):
-            counts[queue, status] = float(count)
+            if (queue, status) in counts:  # its queue may be deleted
+                counts[queue, status] = float(count)
         yield _gauge("muster_jobs", "Jobs by state, as long as their history is kept.", ["queue", "status"], counts)
         since = select(Job.queue, func.min(Job.queued_since)).where(Job.status == Status.RUNNABLE, Job.kind != "array")
         waits = {
@@ -175,8 +187,8 @@ class _Moment(Collector):
 
     def _attempts(self, session: Session) -> Iterator[GaugeMetricFamily]:
         held = {"gpus": _Sums(float), "cpus": _Sums(float)}
-        rates: dict[tuple[str, ...], float] = {}
-        iterations: dict[tuple[str, ...], float] = {}
+        series: dict[str, dict[tuple[str, ...], float]] = {"steps_per_second": {}, "iteration": {}}
+        trainings = 0
         for job, attempt in open_attempts(session, self._reconciler.work_queue.active()):
             labels = (job.queue, _engine(attempt))
             given = held_by(attempt)
@@ -186,18 +198,23 @@ class _Moment(Collector):
                 main = job.gang.main
             except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
                 continue
-            told = self._reconciler.bus.progress(job.id, attempt.number, main) or {}
-            for key, into in (("steps_per_second", rates), ("iteration", iterations)):
-                if isinstance(value := told.get(key), int | float):
-                    into[*labels, job.id, job.name, job.run] = float(value)
+            progress = self._reconciler.bus.progress(job.id, attempt.number, main) or {}
+            found = {name: value for name in series if isinstance(value := progress.get(name), int | float)}
+            trainings += bool(found)
+            if trainings <= _TRAININGS:
+                for name, value in found.items():
+                    series[name][*labels, job.id, job.name, job.run] = float(value)
         for unit, amounts in held.items():
             yield _gauge(
                 f"muster_{unit}_in_use", f"{unit[:-1].upper()}s that running attempts hold.", [*_USED], amounts
             )
         of_job = [*_USED, "job", "name", "run"]
         steps = "Environment steps a second of a running training, all worlds together."
-        yield _gauge("muster_training_steps_per_second", steps, of_job, rates)
-        yield _gauge("muster_training_iteration", "Iterations that a running training has done.", of_job, iterations)
+        yield _gauge("muster_training_steps_per_second", steps, of_job, series["steps_per_second"])
+        done = "Iterations that a running training has done."
+        yield _gauge("muster_training_iteration", done, of_job, series["iteration"])
+        others = f"Running trainings that have no series of their own: at most {_TRAININGS} have."
+        yield _gauge("muster_trainings_left_out", others, [], {(): float(max(0, trainings - _TRAININGS))})
 
     def _volumes(self) -> GaugeMetricFamily:
         disk = self._reconciler.disk

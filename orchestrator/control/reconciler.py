@@ -335,25 +335,28 @@ class Reconciler:
     def _clear_away(self) -> None:
         self._backoff.tidy()
         if self._is_draining:
-            left = True
+            left, deleted = True, list[str]()
             try:
                 with self.database.session() as session:
-                    left = _delete_drained(session)
+                    left, deleted = _delete_drained(session)
             finally:
                 self._is_draining = left
+            for queue in deleted:
+                self.monitoring.forget_queue(queue)
         if self.retention is not None:
             with self.database.session() as session:
                 # by the clock that is behind: nothing is forgotten too early
                 forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
 
 
-def _delete_drained(session: Session) -> bool:
-    """Delete the queues that are to go and have no open job; returns whether others are left."""
-    left = False
+def _delete_drained(session: Session) -> tuple[bool, list[str]]:
+    """Delete the queues that are to go and have no open job; returns whether others are left, and the names of those deleted."""
+    left, deleted = False, list[str]()
     for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
         busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
         if session.scalars(busy).first() is None:
             session.delete(queue)
+            deleted.append(queue.name)
         else:
             left = True
-    return left
+    return left, deleted

@@ -26,6 +26,7 @@ from orchestrator.scheduling.snapshot import (
     Running,
     Snapshot,
     TimeLimit,
+    Turns,
     Waiting,
 )
 
@@ -42,7 +43,8 @@ def take_snapshot(
     capacities: Mapping[str, Capacity],
     waiting: Sequence[Waiting],
     holding: Sequence[tuple[Job, Attempt]],
-    leading: Mapping[str, Leading] | None = None,
+    leading: Mapping[str, Leading],
+    turns: Turns,
     first: str = "local",
     unknown: Mapping[str, str] | None = None,
 ) -> Snapshot:
@@ -55,6 +57,7 @@ def take_snapshot(
         waiting: The jobs that wait for room.
         holding: The jobs whose gang holds some, with that attempt.
         leading: The job that the last pass found at the head of each queue.
+        turns: As the last pass has left them.
         first: The controller's first engine.
         unknown: Why an engine has not told what it has, by name; asked for before ``capacities``, which count.
     """
@@ -78,7 +81,8 @@ def take_snapshot(
         waiting=waiting,
         running=[_running(job, attempt) for job, attempt in counted],
         usage=usage_at(session, clock.now(), decays, holding),
-        leading=leading or {},
+        leading=leading,
+        turns=turns,
     )
 
 

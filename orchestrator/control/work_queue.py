@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from math import inf
+from sys import intern
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -145,7 +146,10 @@ class WorkQueue:
 
     def _entry(self, job: Job) -> Waiting:
         shape = job.gang.shape
+        if not self._waiting:
+            self._shapes.clear()
         shape = self._shapes.setdefault(shape, shape)
         since = job.runnable_at or job.created_at
         created = job.created_at if job.queued_since is None else job.queued_since
-        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, created, since, job.timeout)
+        owner = job.owner and intern(job.owner)
+        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, created, since, job.timeout, owner)

@@ -116,6 +116,8 @@ class Terms:
     """How many of them the attempts before this one have spent."""
     conditions: Sequence[Mapping[str, str]] = ()
     """``evaluateOnExit`` of the job."""
+    cancelled: int = 0
+    """How many attempts before this one were cancelled by others than Muster."""
     last_fault: str | None = None
     """:attr:`Verdict.fault` of the last attempt that the job has spent before this one."""
 
@@ -332,6 +334,8 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
             return to(Status.SUCCEEDED, _DONE.format("preempted" if ending == Ending.PREEMPTED else "stopped"))
         case Ending.PREEMPTED:
             return to(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
+        case Ending.REQUEUE if gone.cancelled:
+            return _cancelled(terms, gone, spent=not is_free, may_go_on=is_free or is_left)
         case Ending.REQUEUE if is_free or is_left:
             return to(Status.RUNNABLE, f"attempt {number} left on request{progress}; starting again")
         case Ending.FAILED | Ending.LOST if is_left and _retries(terms, verdict, head):
@@ -342,6 +346,18 @@ def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
         case Ending.FAILED | Ending.LOST if native:
             return to(Status.FAILED, f"{verdict.reason} (attempt {spent} of {terms.allowed})")
     return to(Status.FAILED, verdict.reason)
+
+
+def _cancelled(terms: Terms, gone: Gone, *, spent: bool, may_go_on: bool) -> Close:
+    """Whoever cancels a gang in its engine's queue again and again does not want it there."""
+    times, most = terms.cancelled + 1, gone.cancellations
+    how = f"attempt {terms.number} was {gone.cancelled}{gone.progress}"
+    if may_go_on and times <= most:
+        return Close(
+            gone.moment, spent, Status.RUNNABLE, f"{how}; starting again ({times} of {most} times)", gone.cancelled
+        )
+    reason = f"{how}; not started again after {counted(times, 'cancellation')}: ask who did it before you resume it"
+    return Close(gone.moment, spent, Status.FAILED, reason, gone.cancelled)
 
 
 def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:

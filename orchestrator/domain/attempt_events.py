@@ -115,6 +115,10 @@ class Gone:
     """By node index; empty for a gang that was never launched."""
     progress: str
     """The last checkpoint, as a part of a reason; empty where there is none."""
+    cancelled: str = ""
+    """How others than Muster ended the gang in its engine's own queue, in words; empty where nobody did."""
+    cancellations: int = 0
+    """How often the job is started again after that."""
 
 
 Event = (

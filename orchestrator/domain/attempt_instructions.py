@@ -109,6 +109,8 @@ class Close:
     """Whether it counts against the job's attempts."""
     status: Status
     reason: str
+    cancelled: str = ""
+    """As in :class:`orchestrator.domain.attempt_events.Gone`, where that ended the attempt."""
 
 
 Instruction = (

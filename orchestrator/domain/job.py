@@ -68,6 +68,8 @@ class Ending(StrEnum):
     """Stopped in favour of another job: started again without spending an attempt, unless it was done (exit 0)."""
     REQUEUE = "requeue"
     """Checkpointed and left on request (exit 75): started again without spending an attempt."""
+    CANCELLED = "cancelled"
+    """The same as REQUEUE, since others than Muster cancelled the gang in its engine's own queue."""
     STOPPED = "stopped"
     """Requested by a user or through the API."""
     TIMEOUT = "timeout"

@@ -235,6 +235,8 @@ class Cause(StrEnum):
     """The engine took its place away for other work."""
     STOPPED = "stopped"
     """It was stopped, in the engine or through it."""
+    CANCELLED = "cancelled"
+    """The same, by others than Muster, in the queue of the engine's own scheduler; ``words`` say how: ``cancelled in …, not by Muster``."""
     CANNOT_START = "cannot start"
     """It never ran: its container could not be started."""
 
@@ -311,6 +313,8 @@ class Setting:
     """CPU cores of this machine to hand out, where the engine runs nodes on it; all by default."""
     gpus: Sequence[str] | None = None
     """Ids of its GPUs to hand out; all by default."""
+    squeue_interval: float | None = None
+    """Seconds between two calls of ``squeue``; by default the engine's own, which depends on the number of gangs."""
 
 
 class SecretValues(StrEnum):

@@ -120,7 +120,9 @@ class EngineSet:
         elif not traits.users:
             why = f"the {engine.name} engine runs jobs as the user of its nodes"
             users = [container.get("user") for container in gang.containers]
-            gang = replace(gang, notes=[unused_user(user, why) if user else "" for user in users])
+            unused = [unused_user(user, why) if user else "" for user in users]
+            before = gang.notes or [""] * len(unused)
+            gang = replace(gang, notes=["; ".join(filter(None, notes)) for notes in zip(before, unused, strict=True)])
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)

@@ -174,7 +174,7 @@ class Runner:
         if launch is None:
             refused = self._refused.get(gang)
             if refused and (self._backoff.waits(("launch", gang)) or not (again or refused.unknown)):
-                raise refused
+                raise refused.with_traceback(None)  # else it keeps the frames of every look
             try:
                 planned = plan()
             except Transient as error:

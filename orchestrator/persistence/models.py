@@ -149,7 +149,7 @@ class Job(Base):
     )
     id: Mapped[str] = mapped_column(primary_key=True)
     """A UUID; of an array's child ``<parent>:<index>``."""
-    name: Mapped[str] = mapped_column(index=True)
+    name: Mapped[str]
     queue: Mapped[str]
     owner: Mapped[str | None] = mapped_column(default=None)
     """The submitter: the name of a key, of a user, or MUSTER_TOKEN."""
@@ -255,6 +255,10 @@ class Job(Base):
             self.stopped_at = max(now(), self.started_at or 0)  # the clock may have been put back
         if reason is not None:
             self.status_reason = reason
+
+
+_TOP = Job.parent.is_(None)
+Index("ix_jobs_named", Job.name, Job.created_at, sqlite_where=_TOP, postgresql_where=_TOP)
 
 
 class RunRecord(Base):

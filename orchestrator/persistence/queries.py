@@ -75,10 +75,11 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
     if colon:
         parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
         return session.get(Job, f"{parent.id}:{index}") if parent else None
-    among = select(Job).where(Job.parent.is_(None))
-    if queues is not None:
-        among = among.where(Job.queue.in_(queues))
-    named = session.scalars(among.where(Job.name == reference).order_by(Job.created_at.desc()).limit(1)).first()
+    among = select(Job)
+    if queues is not None:  # an expression: the index of the queue's many jobs is not to be chosen
+        among = among.where((Job.queue + "").in_(queues))
+    of_name = among.where(Job.name == reference, Job.parent.is_(None))
+    named = session.scalars(of_name.order_by(Job.created_at.desc()).limit(1)).first()
     if named:
         return named
     if len(reference) < 4:
@@ -86,7 +87,7 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
     within = and_(
         Job.id >= reference, Job.id < f"{reference}g"
     )  # by the index, which LIKE does not use: ids are hexadecimal
-    starts = among.where(within, Job.id.startswith(reference, autoescape=True))
+    starts = among.where(within, Job.id.startswith(reference, autoescape=True), ~Job.id.contains(":"))
     prefixed = session.scalars(starts.order_by(Job.id).limit(_NAMED + 1)).all()
     if len(prefixed) > 1:
         shown = ", ".join(f"{each.id} ({each.name})" for each in prefixed[:_NAMED])

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain, groupby
 from math import inf
 
 from orchestrator.domain.hosts import Placement
 from orchestrator.scheduling.free_resources import Allocation, FreeResources
-from orchestrator.scheduling.order import dispatch_order, share_score
+from orchestrator.scheduling.order import dispatch_order, head_of, in_turns, share_score, turn
 from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
 from orchestrator.scheduling.quota import quota_of
 from orchestrator.scheduling.reasons import QueueOrder, WaitReport
 from orchestrator.scheduling.reservation import Holder, Reservation, end_of, holder_of, reserve, victims
-from orchestrator.scheduling.snapshot import Leading, Queue, Snapshot, Waiting
+from orchestrator.scheduling.snapshot import Head, Leading, Moment, Queue, Snapshot, Turns, Waiting
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,16 +53,34 @@ class Decisions:
     report: WaitReport
     leading: Mapping[str, Leading]
     """By queue; for the next snapshot."""
+    turns: Turns
+    """For the next snapshot."""
 
 
 def decide(snapshot: Snapshot) -> Decisions:
     """One pass over every waiting job.
 
-    Queues come by priority, jobs in their queue's order; each is offered what is free of its queue's compute environments. The first one
-    that has to wait gets a reservation on the hosts that it could use: of the place and the time at which
-    it will start, and what follows may start only where that is not delayed. Equal snapshots give equal decisions.
+    Queues come by priority, and take turns where that is equal; jobs come in their queue's order. Each is offered what is free of its
+    queue's compute environments. The first one that has to wait gets a reservation on the hosts that it could use: of the place and the
+    time at which it will start, and what follows may start only where that is not delayed. Equal snapshots give equal decisions.
     """
     return _Pass(snapshot).run()
+
+
+@dataclass
+class _Line:
+    """The waiting jobs of one queue."""
+
+    queue: Queue
+    jobs: Sequence[Waiting]
+    """In their order."""
+    cache: PassCache
+    gone: set[str] = field(default_factory=set)
+    first: bool = True
+    """Whether none of them has had to wait in this pass."""
+
+    def each(self) -> Iterator[tuple[_Line, Waiting]]:
+        return ((self, job) for job in self.jobs)
 
 
 class _Pass:
@@ -80,43 +99,75 @@ class _Pass:
         self.preempts: list[Preempt] = []
         self.cancels: list[Cancel] = []
         self.leading: dict[str, Leading] = {}
+        self.served, self.heads = dict(snapshot.turns.served), dict[str, Head]()
 
     def run(self) -> Decisions:
         jobs: defaultdict[str, list[Waiting]] = defaultdict(list)
         for job in self.snapshot.waiting:
             jobs[job.queue].append(job)
         queues = self.snapshot.queues
-        for name in sorted(jobs.keys() & queues.keys(), key=lambda name: (-queues[name].priority, name)):
-            self._serve(queues[name], jobs[name])
+        names = sorted(jobs.keys() & queues.keys(), key=lambda name: (-queues[name].priority, name))
+        for _, equal in groupby(names, key=lambda name: queues[name].priority):
+            self._serve([self._line(queues[name], jobs[name]) for name in equal])
         for name in jobs.keys() - queues.keys():
-            self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}), None)
+            self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}, Turns(), bool), None)
         report = WaitReport(self.now, self.orders, self.reservations, self.free, self.preempts, self.snapshot.drift)
-        return Decisions(tuple(self.starts), tuple(self.preempts), tuple(self.cancels), report, self.leading)
+        return Decisions(
+            tuple(self.starts),
+            tuple(self.preempts),
+            tuple(self.cancels),
+            report,
+            self.leading,
+            Turns({key: at for key, at in self.served.items() if key[0] in queues}, self.heads),
+        )
 
-    def _serve(self, queue: Queue, jobs: list[Waiting]) -> None:
-        """Offer the free resources to the jobs of one queue, in their order."""
-        ordered = dispatch_order(queue, jobs, self.snapshot.usage)
-        cache = self._cache(queue, jobs)
-        gone: set[str] = set()
-        first = True  # of those that do not start
-        for job in ordered if cache.compute_environments else ():
+    def _line(self, queue: Queue, jobs: Sequence[Waiting]) -> _Line:
+        cache, snapshot = self._cache(queue, jobs), self.snapshot
+        ordered = dispatch_order(
+            queue, jobs, snapshot.usage, snapshot.turns, lambda job: bool(cache.possible(job.shape))
+        )
+        return _Line(queue, ordered, cache)
+
+    def _serve(self, lines: Sequence[_Line]) -> None:
+        """Offer the free resources to the jobs of queues of one priority."""
+        for line, job in self._in_turns([line for line in lines if line.cache.compute_environments]):
             end = inf if job.timeout is None else end_of(self.now, self.now, job.timeout)
+            cache = line.cache
             span = cache.span(end) if cache.times else inf
-            if job.shape in cache.failed[span] and not first:
+            if job.shape in cache.failed[span] and not line.first:
                 continue
             if allocation := cache.allocation(job.shape, end):
                 self._start(cache, job, allocation, end)
-                gone.add(job.job)
+                line.gone.add(job.job)
                 continue
-            if first and self._cancelled(queue, cache, job):
-                gone.add(job.job)
+            if line.first and self._cancelled(line.queue, cache, job):
+                line.gone.add(job.job)
             else:
                 cache.failed[span].add(job.shape)
-                self._hold(queue, cache, job, ordered)
-            first = False
-        self.orders[queue.name] = QueueOrder(
-            [job for job in ordered if job.job not in gone] if gone else ordered, cache
-        )
+                self._hold(line, job)
+            line.first = False
+        for line in lines:
+            left = [job for job in line.jobs if job.job not in line.gone] if line.gone else line.jobs
+            self.orders[line.queue.name] = QueueOrder(left, line.cache)
+
+    def _in_turns(self, lines: Sequence[_Line]) -> Iterator[tuple[_Line, Waiting]]:
+        """The jobs of all lines: the heads of the last pass as they became heads, then one of each line after the other.
+
+        A head keeps its place: else what passes it would change whose turn it is, and two heads could take each other's room for ever.
+        """
+        if len(lines) < 2:
+            return ((line, job) for line in lines for job in line.jobs)
+        turns = self.snapshot.turns
+        found = [(line, head_of(line.queue, line.jobs, turns)) for line in lines]
+        heads = [(line, head) for line, head in found if head is not None]
+        heads.sort(key=lambda each: turns.heads[each[0].queue.name].since)
+        served: dict[str, Moment] = {}
+        for (name, _), at in turns.served.items():
+            served[name] = max(at, served.get(name, at))
+        line_up = sorted(lines, key=lambda line: turn(served.get(line.queue.name), min(line.jobs, key=_age)))
+        merged = in_turns([line.each() for line in line_up], lambda each: bool(each[0].cache.possible(each[1].shape)))
+        taken = {head.job for _, head in heads}
+        return chain(heads, (each for each in merged if each[1].job not in taken))
 
     def _cache(self, queue: Queue, jobs: Sequence[Waiting]) -> PassCache:
         """Queues without a quota share the cache of their compute environments."""
@@ -129,6 +180,7 @@ class _Pass:
         return self.caches[key]
 
     def _start(self, cache: PassCache, job: Waiting, allocation: Allocation, end: float) -> None:
+        self.served[job.queue, job.owner] = self.now, len(self.starts)
         self.starts.append(Start(job.job, allocation.compute_environment, allocation.placements))
         self.holders.append(
             Holder(end, self.now, job.job, job.name, allocation.compute_environment, allocation.placements)
@@ -156,18 +208,24 @@ class _Pass:
                 return True
         return False
 
-    def _hold(self, queue: Queue, cache: PassCache, job: Waiting, ordered: Sequence[Waiting]) -> None:
+    def _hold(self, line: _Line, job: Waiting) -> None:
         """The job does not start: reserve hosts that it could use and that no earlier job has reserved."""
+        queue, possible = line.queue, line.cache.open(job.shape)
+        if possible and queue.name not in self.heads:
+            before = self.snapshot.turns.heads.get(queue.name)
+            if before is None or before.job != job.job:
+                before = Head(job.job, (self.now, len(self.heads)))
+            self.heads[queue.name] = before
         ces = tuple(
             ce
-            for ce in cache.open(job.shape)
+            for ce in possible
             if not any(
-                host in reservation.hosts for reservation in cache.reservations for host in self.free.members[ce]
+                host in reservation.hosts for reservation in line.cache.reservations for host in self.free.members[ce]
             )
         )
         if not ces:
             return
-        used = share_score(queue, ordered, job, self.snapshot.usage)
+        used = share_score(queue, line.jobs, job, self.snapshot.usage)
         for victim in victims(job, used, ces, self.free, self.snapshot, self.ending):
             self.ending.add(victim.job)
             self.preempts.append(Preempt(victim.job, job.job))
@@ -176,3 +234,7 @@ class _Pass:
             self.reservations.append(reservation)
             for each in self.caches.values():
                 each.add(reservation)
+
+
+def _age(job: Waiting) -> tuple[int, str]:
+    return job.created_at, job.job

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from operator import attrgetter
+from typing import TypeVar
 
-from orchestrator.scheduling.snapshot import FairShare, Queue, Waiting
+from orchestrator.scheduling.snapshot import FairShare, Moment, Queue, Turns, Waiting
 
+_T = TypeVar("_T")
 _NOMINAL = 60.0
 """Seconds of its resources that a job's share is charged when the job is taken, so that shares take turns in one pass."""
 _DEFAULT_DECAY = 600
@@ -39,12 +42,68 @@ def score(queue: Queue, share: str, usage: Mapping[tuple[str, str], float]) -> f
 
 
 def dispatch_order(
-    queue: Queue | None, jobs: Iterable[Waiting], usage: Mapping[tuple[str, str], float]
+    queue: Queue | None,
+    jobs: Iterable[Waiting],
+    usage: Mapping[tuple[str, str], float],
+    turns: Turns,
+    can_start: Callable[[Waiting], bool],
 ) -> list[Waiting]:
-    """The queue's jobs, the first to be served first."""
-    if queue is None or queue.policy is None:
-        return sorted(jobs, key=attrgetter("created_at", "job"))
-    return _by_shares(queue, queue.policy, jobs, usage)
+    """The queue's jobs, the first to be served first.
+
+    Args:
+        queue: None for jobs of a queue that does not exist any more.
+        jobs: In any order.
+        usage: By queue and share.
+        turns: As the last pass has left them.
+        can_start: Whether a job could start if nothing else ran; one that could not takes no turn.
+    """
+    if queue is not None and queue.policy is not None:
+        return _by_shares(queue, queue.policy, jobs, usage)
+    ordered = sorted(jobs, key=attrgetter("created_at", "job"))
+    return ordered if queue is None else _by_owners(queue, ordered, turns, can_start)
+
+
+def _by_owners(queue: Queue, jobs: list[Waiting], turns: Turns, can_start: Callable[[Waiting], bool]) -> list[Waiting]:
+    """Jobs, which come by age, so that their owners take turns; the head of the last pass stays the first, lest it never gets its room."""
+    if len({job.owner for job in jobs}) < 2:
+        return jobs
+    lines: dict[str | None, list[Waiting]] = {}
+    for job in jobs:
+        lines.setdefault(job.owner, []).append(job)
+    line_up = sorted(lines, key=lambda owner: turn(turns.served.get((queue.name, owner)), lines[owner][0]))
+    ordered = list(in_turns([lines[owner] for owner in line_up], can_start))
+    if head := head_of(queue, ordered, turns):
+        ordered.remove(head)
+        ordered.insert(0, head)
+    return ordered
+
+
+def turn(served: Moment | None, oldest: Waiting) -> tuple[Moment, str]:
+    """A key to order who is served next: the least goes first.
+
+    It is the time from which they wait for their turn: their last start (``served``), or their oldest job where that is younger.
+    """
+    return max(served or (0, 0), (oldest.created_at, 0)), oldest.job
+
+
+def head_of(queue: Queue, jobs: Iterable[Waiting], turns: Turns) -> Waiting | None:
+    """The job, among these, for which the last pass had no room first; None where it has left them."""
+    head = turns.heads.get(queue.name)
+    return next((job for job in jobs if job.job == head.job), None) if head else None
+
+
+def in_turns(lines: Iterable[Iterable[_T]], counts: Callable[[_T], bool]) -> Iterator[_T]:
+    """The first of each line, then the second of each, and so on; those that do not count are passed beside the next one of their line."""
+    left = deque(map(iter, lines))
+    while len(left) > 1:
+        line = left.popleft()
+        for each in line:
+            yield each
+            if counts(each):
+                left.append(line)
+                break
+    for line in left:
+        yield from line
 
 
 def share_score(

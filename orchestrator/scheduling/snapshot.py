@@ -28,6 +28,8 @@ class Waiting:
     """When it became RUNNABLE (Unix time [ms]); for people."""
     timeout: int | None
     """Of an attempt [s]."""
+    owner: str | None = None
+    """The submitter; None without keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +110,28 @@ class Leading:
     """Since when it has been first, for that reason [ms]."""
 
 
+Moment = tuple[int, int]
+"""A time [ms], and a number that orders what happened in one pass."""
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The first job of a queue for which there was no room."""
+
+    job: str
+    since: Moment
+
+
+@dataclass(frozen=True)
+class Turns:
+    """What a pass remembers of those before it, so that owners and queues take turns."""
+
+    served: Mapping[tuple[str, str | None], Moment] = field(default_factory=dict)
+    """(queue, owner) → when a job of theirs was started last."""
+    heads: Mapping[str, Head] = field(default_factory=dict)
+    """By queue."""
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """The whole input of a pass."""
@@ -125,5 +149,7 @@ class Snapshot:
     """(queue, share) → resource-seconds, decayed to now; a job without a share counts under the share ``""``."""
     leading: Mapping[str, Leading] = field(default_factory=dict)
     """By queue, of the last pass."""
+    turns: Turns = field(default_factory=Turns)
+    """As the last pass has left them."""
     drift: int = 0
     """Difference of Unix time to the pass's clock [ms]."""

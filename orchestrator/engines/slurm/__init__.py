@@ -22,7 +22,7 @@ TRAITS = Traits(elastic=True)
 def _make(setting: Setting) -> Engine:
     from orchestrator.engines.slurm.engine import SlurmEngine
 
-    return SlurmEngine()
+    return SlurmEngine(setting.squeue_interval)
 
 
 ENGINE = EngineType(
@@ -31,6 +31,7 @@ ENGINE = EngineType(
         *SBATCH,
         Option("gpu", "a type of GPU, as a100"),
         Option("nice", "sbatch's --nice of a job without priority", int),
+        Option("cancellations", "how often a job is submitted again after its Slurm job was cancelled by others", int),
     ),
     TRAITS,
 )

@@ -14,17 +14,17 @@ Slurm's arrays do not have.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import threading
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import Any
 
+from orchestrator import machine
 from orchestrator.domain.hosts import Host, Queued
 from orchestrator.engines.api import (
     Cause,
@@ -49,7 +49,7 @@ from orchestrator.engines.slurm.commands import (
     list_jobs,
 )
 from orchestrator.engines.slurm.script import Submission, shown, submission_for
-from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
+from orchestrator.engines.slurm.states import CANCELLED, OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
@@ -67,8 +67,12 @@ _AGAIN = 2.0
 _KILLING = 60.0
 """Seconds beyond the grace time after which a job that is still there is reported; Slurm's KillWait is 30 s by default."""
 _SILENCE = "slurmctld has not answered yet; see `scontrol ping`"
-_HOSTS_AGE, _JOBS_AGE = 10.0, 1.0
-"""Seconds for which a view of all hosts, and of this user's jobs, holds."""
+_HOSTS_AGE = 10.0
+"""Seconds for which a view of all hosts holds."""
+_OFTEN, _SELDOM, _FEW = 1.0, 30.0, 10
+"""Seconds between two calls of squeue while at most so many gangs are in its queue, and while there are more."""
+_DOUBT = 5.0
+"""The most seconds until another call after one that failed."""
 _ANSWER, _OVERDUE = 2.0, 8.0
 """Seconds that a look at a job waits for squeue, and after which slurmctld does not answer. A look at a job that was never seen waits for
 all of them: a loaded machine answers late."""
@@ -81,6 +85,8 @@ _STARVED = "Out Of Memory"
 _SIGNALS = {"Killed": 137, "Terminated": 143, "Segmentation fault": 139, "Aborted": 134, _STARVED: 137}
 _SCRIPT = re.compile(r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", re.MULTILINE)
 """Lines of the script itself when it can't start the nodes."""
+_GANG = re.compile(r"[^/]+/\d+/\d+")
+"""The comment of a gang's job: the gang's name."""
 _MEETING = re.compile(r"^muster: meeting (\{.*\})$", re.MULTILINE)
 
 
@@ -90,15 +96,23 @@ class SlurmEngine:
     name = "slurm"
     traits = TRAITS
 
-    def __init__(self) -> None:
-        """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""
+    def __init__(self, squeue_interval: float | None = None) -> None:
+        """``squeue_interval``: seconds; by default by the number of gangs.
+
+        Raises EngineError where Slurm is not installed here, or slurmctld does not answer.
+        """
+        self._interval_set = squeue_interval
         self._hosts = CachedView[Sequence[Host]]((), list_hosts, name="scontrol", silence=_SILENCE, overdue=_OVERDUE)
         self._hosts.read()
         self.address = address_of_this_machine()
         self._jobs = CachedView[Mapping[str, SlurmJob]](
             {}, list_jobs, name="squeue", silence=_SILENCE, overdue=_OVERDUE
         )
+        self._counted = (-inf, 0)
+        """When the view was taken in which gangs were counted, and how many they were."""
         self._submitted: dict[str, float] = {}
+        self._cancelled: dict[str, None] = {}
+        """Numbers of the jobs that this engine has cancelled, while Slurm knows them."""
         self._submitting = threading.Lock()
         self._pending: dict[str, Future[str]] = {}
         """Submissions that are not answered, by gang."""
@@ -147,24 +161,29 @@ class SlurmEngine:
             said = f"Slurm: {error}"
             return [NodeStatus(NodePhase.UNREACHABLE, words=said, stale=said)] * count
         trouble = f"Slurm: {why}" if (why := self._jobs.trouble) else ""
-        if job is not None and job.state in QUEUED:
+        queued = job is not None and job.state in QUEUED
+        # the view may be old: what the job has written shows that Slurm has started it
+        output = "" if queued and self._interval() <= _OFTEN else _output(facts)
+        if job is not None and queued and not _MEETING.search(output):
             return [_queued(job, trouble)] * count
         ends = all_recorded(handle)
-        output = _said(facts)
         nodes = [_node(facts, job, output, index, ends.get(index)) for index in range(count)]
         found = _MEETING.search(output)
         names = json.loads(found[1])["nodes"] if found else []
         hosts = [f"slurm/{names[_task(facts, index)]}" if names else "" for index in range(count)]
+        if job is not None and job.state == "CANCELLED" and job.number not in self._cancelled:
+            words = f"{CANCELLED} (job {job.number})"
+            nodes = [each if each.running else replace(each, cause=Cause.CANCELLED, words=words) for each in nodes]
         return [
-            dataclasses.replace(node, host=host, stale=trouble if node.running else "")
+            replace(node, host=host, stale=trouble if node.running else "")
             for node, host in zip(nodes, hosts, strict=True)
         ]
 
     def stop(self, handle: Handle, grace: float) -> None:
-        ending = _Ending(handle.facts["slurm"], grace)
+        ending = _Ending(handle.facts["slurm"], grace, self._cancel)
 
         def step() -> str:
-            job = self._job(handle, _LOOK)
+            job = self._job(handle, _LOOK if self._interval() <= _OFTEN else _AGAIN)
             if job is None or job.state in OVER:
                 self._submitted.pop(ending.number, None)
                 return ""
@@ -174,6 +193,27 @@ class SlurmEngine:
 
     def close(self) -> None:
         """Slurm's jobs go on."""
+
+    def _interval(self) -> float:
+        """Seconds for which a view of this user's jobs holds."""
+        if self._interval_set is not None:
+            return self._interval_set
+        if (taken := self._jobs.taken) != self._counted[0]:
+            jobs = self._jobs.value.values()
+            self._counted = (
+                taken,
+                sum(job.state not in OVER and _GANG.fullmatch(job.comment) is not None for job in jobs),
+            )
+        return _OFTEN if self._counted[1] <= _FEW else _SELDOM
+
+    def _cancel(self, number: str) -> None:
+        """Cancel a job, and remember that it was not somebody else who did."""
+        known = self._jobs.value
+        for each in list(self._cancelled):
+            if each not in known:
+                self._cancelled.pop(each, None)
+        self._cancelled[number] = None
+        _scancel(number)
 
     # -- jobs ---------------------------------------------------------------------------------------------------------
 
@@ -185,7 +225,7 @@ class SlurmEngine:
             try:
                 with self._submitting:  # one look and one submission at a time
                     number = self._find(gang, facts) or self._submit(request)
-                    self._submitted[number] = time.monotonic()
+                    self._submitted[number] = machine.monotonic()
                 pending.set_result(number)
             except BaseException as error:
                 pending.set_exception(error)
@@ -218,10 +258,17 @@ class SlurmEngine:
                 f"Slurm refuses the job{where}: {error}; `muster submit --dry-run` shows what it is asked for"
             ) from error
 
-    def _job(self, handle: Handle, age: float = _JOBS_AGE) -> SlurmJob | None:
-        """None where Slurm has forgotten it. Raises Unreachable: no view since it was submitted."""
+    def _job(self, handle: Handle, age: float | None = None) -> SlurmJob | None:
+        """None where Slurm has forgotten it. Raises Unreachable: no view since it was submitted.
+
+        ``age``: for how many seconds a view holds; by default for the interval, or less where none is known to hold.
+        """
         number = handle.facts["slurm"]
         submitted = self._submitted.get(number, 0.0)
+        if age is None:
+            age = min(self._interval(), _DOUBT) if self._jobs.trouble else self._interval()
+        if self._jobs.taken <= submitted:
+            age = min(age, _OFTEN)
         job = self._jobs.get(age, _ANSWER if self._jobs.taken > submitted else _OVERDUE).get(number)
         if job is None and self._jobs.taken <= submitted:
             raise Unreachable(self._jobs.trouble or _SILENCE)
@@ -231,26 +278,27 @@ class SlurmEngine:
 class _Ending:
     """The end of one job: asked by a signal, then killed."""
 
-    def __init__(self, number: str, grace: float) -> None:
-        self.number, self._grace, self._killed = number, grace, 0.0
+    def __init__(self, number: str, grace: float, cancel: Callable[[str], None]) -> None:
+        """``cancel``: cancels a job."""
+        self.number, self._grace, self._cancel, self._killed = number, grace, cancel, 0.0
         self._due = inf if grace > 0 else 0.0
         """When it is killed (monotonic [s]); infinity until it was asked."""
 
     def next(self, job: SlurmJob) -> str:
         """Cancel the job, where that is due; returns its state in words. Raises Unreachable."""
-        now, number = time.monotonic(), self.number
+        now, number = machine.monotonic(), self.number
         if job.state in QUEUED:
-            _cancel(number)
+            self._cancel(number)
         elif self._due == inf:
             # to the script alone, which tells the nodes: it knows whether they have been started yet
-            _cancel("--batch", "--signal=USR1", number)
-            self._due = time.monotonic() + self._grace  # from now on: slurmctld may have been away
+            _scancel("--batch", "--signal=USR1", number)
+            self._due = machine.monotonic() + self._grace  # from now on: slurmctld may have been away
         elif now >= self._due and not self._killed:
             # the step at once; to end the job, Slurm asks once more and waits for KillWait
-            _cancel("--signal=KILL", f"{number}.0")
+            _scancel("--signal=KILL", f"{number}.0")
             self._killed = now
         elif now >= self._due and now - self._killed > _AGAIN:
-            _cancel(number)
+            self._cancel(number)
             self._killed = now
         state = f"job {number} is {job.state}{f' on {job.hosts}' if job.hosts else ''}"
         if not self._killed:
@@ -258,7 +306,7 @@ class _Ending:
         return f"{state} although it was killed (`scontrol show job {number}`, and ps on that host, say what is left of it)"
 
 
-def _cancel(*arguments: str) -> None:
+def _scancel(*arguments: str) -> None:
     try:
         call("scancel", *arguments)
     except Unreachable:
@@ -267,7 +315,7 @@ def _cancel(*arguments: str) -> None:
         pass  # it ended meanwhile
 
 
-def _said(facts: Mapping[str, Any]) -> str:
+def _output(facts: Mapping[str, Any]) -> str:
     """The job's output so far. Raises OSError where it can't be read now."""
     try:
         return Path(facts["output"]).read_text(errors="replace")

@@ -66,6 +66,8 @@ def waiting(job: SlurmJob) -> str:
     return f"Slurm: {words or 'waits'} ({named}job {job.number})"
 
 
+CANCELLED = "cancelled in Slurm (scancel), not by Muster"
+
 _ENDS = {
     "COMPLETED": (Cause.EXIT, 0, "Slurm says COMPLETED"),
     "PREEMPTED": (Cause.PREEMPTED, 75, "preempted by Slurm, and did not leave in time"),
@@ -74,7 +76,7 @@ _ENDS = {
     "OUT_OF_MEMORY": (Cause.OUT_OF_MEMORY, 137, OUT_OF_MEMORY),
     "NODE_FAIL": (Cause.HOST_LOST, 137, "Slurm lost a node of {hosts}"),
     "BOOT_FAIL": (Cause.HOST_LOST, 137, "Slurm could not boot a node"),
-    "CANCELLED": (Cause.STOPPED, 137, "it was cancelled in Slurm, not by Muster"),
+    "CANCELLED": (Cause.CANCELLED, 137, CANCELLED),
 }
 """By the state in which a job ended: the cause of its nodes' ends, their exit code (75: to be started again for nothing), and words."""
 

@@ -194,7 +194,7 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
     wait_for(lambda: waits("more time than the partition allows", long), 20, "its reason")
     bench.cluster.run("scancel", closed.facts["slurm"])
     [node] = bench.ended(closed)
-    assert node.words.startswith("it was cancelled in Slurm, not by Muster (job "), node
+    assert node.words.startswith("cancelled in Slurm (scancel), not by Muster (job "), node
     bench.engine.stop(small, 5.0)
     assert bench.state(small) == "CANCELLED" and not status_of(bench.engine, small)[0].running
     bench.engine.stop(big, 0.0)

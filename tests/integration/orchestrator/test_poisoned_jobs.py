@@ -39,7 +39,7 @@ from orchestrator.engines.api import (
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.session import DatabaseError
-from tests.support.orchestrator.controller import FakeController, properties
+from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.orchestrator.rows import job
 from tests.support.waiting import wait_for
 

@@ -50,11 +50,12 @@ def job(
     age: int = 0,
     runnable: int = 0,
     timeout: int | None = None,
+    owner: str | None = None,
 ) -> Waiting:
     """A job; a number as its shape: one node with so many CPUs. ``age`` and ``runnable`` in seconds."""
     whole = shape if isinstance(shape, Shape) else gang(node(shape))
     created, since = NOW - 1000 * age, NOW - 1000 * runnable
-    return Waiting(f"{name}-0123456789", name, queue, whole, priority, share, created, since, timeout)
+    return Waiting(f"{name}-0123456789", name, queue, whole, priority, share, created, since, timeout, owner)
 
 
 def line(*jobs: Waiting) -> list[Waiting]:

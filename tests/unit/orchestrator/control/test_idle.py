@@ -19,7 +19,7 @@ from orchestrator.control.run_store import RunStore
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.testing.fake import FakeEngine
-from tests.support.orchestrator.controller import FakeController, properties
+from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
 
 T = TypeVar("T")

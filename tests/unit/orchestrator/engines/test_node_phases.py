@@ -108,7 +108,7 @@ def test_a_job_in_slurm_s_queue_is_queued_until_its_nodes_are_made_ready(state: 
         (job("PREEMPTED"), MEETING, (ENDED, Cause.PREEMPTED, 75)),
         (job("NODE_FAIL"), MEETING, (ENDED, Cause.HOST_LOST, 137)),
         (job("BOOT_FAIL"), MEETING, (ENDED, Cause.HOST_LOST, 137)),
-        (job("CANCELLED"), MEETING, (ENDED, Cause.STOPPED, 137)),
+        (job("CANCELLED"), MEETING, (ENDED, Cause.CANCELLED, 137)),
         (job("TIMEOUT"), MEETING, (ENDED, Cause.STOPPED, 137)),
         (job("OUT_OF_MEMORY"), MEETING, (ENDED, Cause.OUT_OF_MEMORY, 137)),
         (None, MEETING, (ENDED, None, None)),

@@ -53,7 +53,7 @@ def test_the_time_at_the_head_is_that_of_the_first_job_and_counts_by_the_millise
 def test_each_queue_has_a_quota_of_its_own() -> None:
     queues = [queue("p", policy=HALF), queue("q", policy=HALF)]
     waiting = [job(f"{name}{i}", queue=name, share="s", age=9 - i) for name in "pq" for i in range(3)]
-    assert Pass([host()], waiting, queues=queues).started == "p0:a p1:a q0:a q1:a"
+    assert Pass([host()], waiting, queues=queues).started == "p0:a q0:a p1:a q1:a"
 
 
 def test_a_gang_is_preempted_once_for_two_heads() -> None:

@@ -88,10 +88,10 @@ def test_first_in_first_out_whatever_the_priority_and_the_order_of_the_snapshot(
     assert Pass([host()], waiting, [running("x", on("a", 4))]).waits() == "old tie-a tie-b young"
 
 
-def test_queues_come_by_priority_then_by_name() -> None:
+def test_queues_come_by_priority_then_by_their_oldest_job() -> None:
     queues = [queue("low", 1), queue("high-b", 5), queue("high-a", 5)]
     waiting = [job("l", queue="low", age=9), job("b", queue="high-b", age=5), job("a", queue="high-a")]
-    assert Pass([host()], waiting, queues=queues).started == "a:a b:a l:a"
+    assert Pass([host()], waiting, queues=queues).started == "b:a a:a l:a"
 
 
 def test_the_share_with_the_least_weighted_use_is_served_first() -> None:

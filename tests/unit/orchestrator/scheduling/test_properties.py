@@ -16,7 +16,16 @@ from orchestrator.domain.hosts import Host
 from orchestrator.scheduling.decide import Decisions, decide
 from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.placement import less, place
-from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare, Queue, Running, Snapshot, TimeLimit, Waiting
+from orchestrator.scheduling.snapshot import (
+    ComputeEnvironment,
+    FairShare,
+    Queue,
+    Running,
+    Snapshot,
+    TimeLimit,
+    Turns,
+    Waiting,
+)
 from tests.support.orchestrator.scheduling import NOW, environment, gang, host, node, queue, seats
 
 nodes = st.builds(node, st.sampled_from([0.5, 1, 2, 3]), st.integers(0, 2), st.sampled_from([100, 500, 2000]))
@@ -204,6 +213,7 @@ QUEUES = {
     "high": Queue("high", 5, ("ab",), None, ()),
     "fair": Queue("fair", 3, ("bc", "ab"), FairShare(100, 40, {"s": 0.5}), ()),
     "low": Queue("low", 1, ("all", "bc"), None, (TimeLimit("CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY", 600),)),
+    "also low": Queue("also low", 1, ("bc", "ab"), None, ()),
 }
 COMPUTE_ENVIRONMENTS = {
     each.name: each
@@ -227,6 +237,7 @@ class Cluster(RuleBasedStateMachine):
         self.jobs: dict[str, tuple[Waiting, bool]] = {}
         """Every job ever, and whether it may be preempted."""
         self.usage: dict[tuple[str, str], float] = {}
+        self.turns = Turns()
         self.decisions: Decisions | None = None
 
     @rule(
@@ -234,17 +245,26 @@ class Cluster(RuleBasedStateMachine):
         shape=shapes(),
         priority=st.integers(0, 2),
         share=st.sampled_from("stu"),
+        owner=st.sampled_from([None, "o", "p"]),
         timeout=st.one_of(st.none(), st.integers(60, 500)),
         preemptible=st.booleans(),
         count=st.integers(1, 3),
     )
     def submit(
-        self, queue: str, shape: Shape, priority: int, share: str, timeout: int | None, preemptible: bool, count: int
+        self,
+        queue: str,
+        shape: Shape,
+        priority: int,
+        share: str,
+        owner: str | None,
+        timeout: int | None,
+        preemptible: bool,
+        count: int,
     ) -> None:
         for _ in range(count):
             name = f"j{len(self.jobs)}"
             shared = share if queue == "fair" else None
-            job = Waiting(name, name, queue, shape, priority, shared, self.now, self.now, timeout)
+            job = Waiting(name, name, queue, shape, priority, shared, self.now, self.now, timeout, owner)
             self.jobs[name] = (job, preemptible)
             self.waiting[name] = job
         self.run_pass()
@@ -320,11 +340,14 @@ class Cluster(RuleBasedStateMachine):
         """Decide, check that the order of the snapshot does not matter, and carry the decisions out."""
         waiting, running = list(self.waiting.values()), list(self.running.values())
         hosts = [self.hosts[name] for name in sorted(self.hosts)]
-        snapshot = Snapshot(self.now, hosts, self.compute_environments, QUEUES, waiting, running, self.usage)
+        snapshot = Snapshot(
+            self.now, hosts, self.compute_environments, QUEUES, waiting, running, self.usage, turns=self.turns
+        )
         turned = dataclasses.replace(snapshot, waiting=waiting[::-1], running=running[::-1])
         self.decisions = decide(snapshot)
         assert equal_decisions(self.decisions, decide(turned), QUEUES)
         check_pass(snapshot, self.decisions)
+        self.turns = self.decisions.turns
         for start in self.decisions.starts:
             job, preemptible = self.jobs[start.job]
             self.running[start.job] = begun(job, start.compute_environment, start.placements, self.now, preemptible)
