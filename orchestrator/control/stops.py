@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -40,6 +41,8 @@ class Stops:
         self._denied = Backoff(log, _AGAIN, _RARELY)
         """Why the engine could not stop an attempt's gang when it was last asked."""
         self._under_way: dict[Key, _Stop] = {}
+        self._busy = Counter[str]()
+        """Stops that are under way, by engine."""
         self._stopped: dict[Key, GangStatus] = {}
         self._pools: dict[str, Pool] = {}
         """By engine."""
@@ -62,7 +65,7 @@ class Stops:
         if key not in self._under_way and not self._denied.waits(key):
             self._begin(key, handle, grace)
         if key in self._under_way and self._under_way[key].result.done():
-            stop = self._under_way.pop(key).result
+            stop = self._take(key).result
             if (error := stop.exception()) is None:
                 self._stopped[key] = stop.result()
                 return self._stopped[key]
@@ -93,7 +96,8 @@ class Stops:
 
     def forget(self, key: Key) -> None:
         """The attempt is closed."""
-        self._under_way.pop(key, None)
+        if key in self._under_way:
+            self._take(key)
         self._stopped.pop(key, None)
         self._denied.worked(key)
 
@@ -101,10 +105,16 @@ class Stops:
         engine = read_handle(handle).engine
         if engine not in self._pools:
             self._pools[engine] = machine.pool(f"stop {engine}", _THREADS)
-        waits = sum(stop.engine == engine for stop in self._under_way.values()) >= _THREADS
+        waits = self._busy[engine] >= _THREADS
+        self._busy[engine] += 1
         result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, waits))
         self._under_way[key] = _Stop(engine, waits, result)
         result.add_done_callback(lambda _: self._changed(key[0]))
+
+    def _take(self, key: Key) -> _Stop:
+        stop = self._under_way.pop(key)
+        self._busy[stop.engine] -= 1
+        return stop
 
     def _stop(self, job: str, handle: str, grace: float, waited: bool) -> GangStatus:
         if waited:
