@@ -1,9 +1,10 @@
-"""What the controller costs with thousands of gangs, on an engine that starts nothing.
+"""What the controller costs with thousands of gangs, on an engine that starts nothing; and with real processes.
 
     python -m benchmarks.scale running [--gangs 5000]    # idle, and how soon a stop takes effect
     python -m benchmarks.scale gang [--nodes 5000]       # one large gang: idle, and a restart after a node's end
     python -m benchmarks.scale durable [--gangs 3000]    # gangs of one node, started and ended: store and database on this disk
     python -m benchmarks.scale memory [--gangs 10000]    # the same with the store in memory
+    python -m benchmarks.scale real [--gangs 200]        # processes on this machine: what a supervisor costs
 
 Processor time is that of the whole process, so of the submission and the fake engine, too. A loaded machine is refused: :mod:`benchmarks.load`.
 """
@@ -11,6 +12,7 @@ Processor time is that of the whole process, so of the submission and the fake e
 from __future__ import annotations
 
 import argparse
+import contextlib
 import resource
 import tempfile
 import time
@@ -19,9 +21,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from benchmarks.load import Watch, add_option
+from benchmarks.load import Watch, add_option, own_seconds
 from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
@@ -30,7 +32,8 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import Progress, RunFacts, RunStore
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import TERMINAL, Status
-from orchestrator.engines.api import Gang, Handle, Plan, Traits
+from orchestrator.engines.api import Engine, Gang, Handle, Plan, Traits
+from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.persistence.models import Job
@@ -39,6 +42,8 @@ from orchestrator.persistence.session import Database
 from shared_store.epoch import Claim
 from shared_store.layout import Store
 from shared_store.outcomes import Outcome, write_outcome
+
+E = TypeVar("E", bound=Engine)
 
 SUBMITTED_AT_ONCE = 500
 IDLE = 20.0
@@ -98,19 +103,21 @@ class ShortEngine(FakeEngine):
 
 
 @dataclass
-class Bench:
+class Bench(Generic[E]):
     """A controller, and what it works with."""
 
     reconciler: Reconciler
     database: Database
-    engine: FakeEngine
+    engine: E
     watch: Watch
 
-    def submit(self, count: int, nodes: int = 1, attempts: int = 1, first: int = 0) -> None:
+    def submit(
+        self, count: int, nodes: int = 1, attempts: int = 1, first: int = 0, command: Sequence[str] = ("true",)
+    ) -> None:
         """Insert jobs as a request does."""
         shared = [{"name": "MUSTER_ON_CHILD_FAILURE", "value": "restart"}]
         container = {
-            "command": ["true"],
+            "command": list(command),
             "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "64"}],
             "environment": shared,
         }
@@ -146,13 +153,6 @@ class Bench:
         counts = self.database.counts.by_status()
         return sum(counts.get(state, 0) for state in states) == count
 
-    def is_stopped(self, gang: str) -> bool:
-        return not self.engine.cluster.gangs[gang][0].running
-
-    def is_newest_other(self, gang: str) -> bool:
-        """Whether another gang was launched since this one."""
-        return next(reversed(self.engine.cluster.gangs)) != gang
-
     def wait(self, condition: Callable[[], bool], what: str, seconds: float = 600.0, pause: float = 0.1) -> None:
         deadline = time.monotonic() + seconds
         while not condition():
@@ -174,7 +174,7 @@ def self_now() -> int:
 
 
 @contextmanager
-def controller(engine: FakeEngine, store_type: type[RunStore], watch: Watch) -> Iterator[Bench]:
+def controller(engine: E, store_type: type[RunStore], watch: Watch) -> Iterator[Bench[E]]:
     """A controller that runs, on a database in a folder of its own."""
     machine.collect_seldom()  # as the server does
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
@@ -187,10 +187,23 @@ def controller(engine: FakeEngine, store_type: type[RunStore], watch: Watch) -> 
         with database.session() as session:
             ensure_compute_environments(session, engines.names)
         peers = Peers(store, home)
-        reconciler = Reconciler(database, engines, store, Bus(home), peers, runs=store_type(store, peers))
+        bus = Bus(home)
+        if isinstance(engine, LocalEngine):
+            bus.open()
+            stack.callback(bus.close)
+        reconciler = Reconciler(database, engines, store, bus, peers, runs=store_type(store, peers))
         stack.callback(reconciler.close)
         reconciler.start()
         yield Bench(reconciler, database, engine, watch)
+
+
+def is_stopped(engine: FakeEngine, gang: str) -> bool:
+    return not engine.cluster.gangs[gang][0].running
+
+
+def is_newest_other(engine: FakeEngine, gang: str) -> bool:
+    """Whether another gang was launched since this one."""
+    return next(reversed(engine.cluster.gangs)) != gang
 
 
 def large(gangs: int) -> Hosts:
@@ -214,7 +227,7 @@ def running(count: int, watch: Watch) -> None:
             with bench.database.session() as session:
                 ask_to_end(session, Job.id == name, "stopped by the benchmark")
             gang = f"{name}/1/1"
-            bench.wait(partial(bench.is_stopped, gang), "stopped", pause=0.002)
+            bench.wait(partial(is_stopped, bench.engine, gang), "stopped", pause=0.002)
             taken = time.monotonic() - began
             bench.wait(partial(bench.have, 1 + number, *TERMINAL), "ended", pause=0.02)
             print(f"a stop reaches the engine after {taken:.3f} s; CPU {time.process_time() - used:.3f} s", flush=True)
@@ -231,7 +244,7 @@ def gang(nodes: int, watch: Watch) -> None:
             began, used = time.monotonic(), time.process_time()
             name = next(reversed(bench.engine.cluster.gangs))
             bench.engine.cluster.end(name, nodes // 2, 137)
-            bench.wait(partial(bench.is_newest_other, name), "launched anew", pause=0.01)
+            bench.wait(partial(is_newest_other, bench.engine, name), "launched anew", pause=0.01)
             print(
                 f"restart {attempt}: {time.monotonic() - began:.2f} s, CPU {time.process_time() - used:.2f} s",
                 flush=True,
@@ -254,9 +267,56 @@ def short(count: int, watch: Watch, *, durable: bool) -> None:
         assert bench.have(count + count // 10, Status.SUCCEEDED)
 
 
+def real(count: int, watch: Watch) -> None:
+    """Nodes that sleep, as processes of this machine in gangs of ten."""
+    with tempfile.TemporaryDirectory() as folder:
+        engine = LocalEngine(Path(folder), cpus=float(count))
+        with controller(engine, RunStore, watch) as bench:
+            began = time.monotonic()
+            bench.submit(count // 10, nodes=10, command=["sleep", "3600"])
+            bench.wait(partial(bench.have, count // 10, Status.RUNNING), "all run")
+            print(f"{count} nodes run after {time.monotonic() - began:.1f} s", flush=True)
+            time.sleep(10.0)
+            began, used, all_used = time.monotonic(), time.process_time(), own_seconds()
+            time.sleep(IDLE)
+            passed, own = time.monotonic() - began, time.process_time() - used
+            nodes = own_seconds() - all_used - own
+            print(f"idle: controller {100 * own / passed:.2f} % of a core, all nodes {100 * nodes / passed:.1f} %")
+            for kind, sizes in proportional_memory().items():
+                print(f"{len(sizes)} × {kind}: {sum(sizes) / len(sizes) / 1024:.1f} MiB each (proportional)")
+            began = time.monotonic()
+            with bench.database.session() as session:
+                ask_to_end(session, Job.status == Status.RUNNING, "stopped by the benchmark")
+            bench.wait(partial(bench.have, count // 10, *TERMINAL), "all have ended")
+            print(f"all {count} nodes are stopped after {time.monotonic() - began:.1f} s")
+
+
+def proportional_memory() -> dict[str, list[int]]:
+    """Proportional set sizes [KiB] of the processes below this one, by kind."""
+    found: dict[str, list[int]] = {}
+    for process in below("self"):
+        with contextlib.suppress(OSError):
+            words = (Path("/proc") / process / "cmdline").read_bytes().split(b"\0")
+            kind = next(
+                (name for name in ("supervisor", "shim") if any(name.encode() in word for word in words)), "other"
+            )
+            lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
+            found.setdefault(kind, []).append(next(int(line.split()[1]) for line in lines if line.startswith("Pss:")))
+    return found
+
+
+def below(process: str) -> Iterator[str]:
+    """Ids of the processes that a process, or one below it, has started."""
+    with contextlib.suppress(OSError):
+        for thread in Path(f"/proc/{process}/task").iterdir():
+            for child in (thread / "children").read_text().split():
+                yield child
+                yield from below(child)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("running", "gang", "durable", "memory"))
+    parser.add_argument("part", choices=("running", "gang", "durable", "memory", "real"))
     parser.add_argument("--gangs", type=int, help="number of gangs")
     parser.add_argument("--nodes", type=int, default=5000, help="of the one gang")
     add_option(parser)
@@ -267,6 +327,8 @@ def main() -> None:
             running(options.gangs or 5000, watch)
         case "gang":
             gang(options.nodes, watch)
+        case "real":
+            real(options.gangs or 200, watch)
         case part:
             short(options.gangs or (3000 if part == "durable" else 10000), watch, durable=part == "durable")
 
