@@ -234,7 +234,9 @@ def _squeue_interval(text: str | None, engines: Sequence[str]) -> float | None:
     seconds = seconds_of("--squeue-interval", text)
     if seconds is None:
         return None
-    if "slurm" not in engines:
+    from orchestrator.engines.installed import traits_of
+
+    if not any(traits_of(name).squeue for name in engines):
         raise SpecError(
             f"--squeue-interval {text}: only the slurm engine calls squeue; add --engine slurm, or leave it out"
         )

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -190,7 +189,6 @@ class Handle:
         return json.dumps({"engine": self.engine, "gang": self.gang, "nodes": self.nodes, "facts": self.facts})
 
 
-@lru_cache(maxsize=4096)  # every pass of the controller asks for those of all gangs that run
 def read_handle(text: str) -> Handle:
     """The handle that the database keeps as ``text``, also one of Muster 0.1. Raises ValueError for anything else."""
     try:
@@ -345,6 +343,8 @@ class Traits:
     """Gangs that it can start at once. Of more than one, :meth:`Engine.launch` is called on so many threads."""
     gpu_ids: bool = False
     """The ids of its hosts' GPUs are those of the devices; else they are numbers until a node's status has its ``gpus``."""
+    squeue: bool = False
+    """It calls ``squeue``, so that :attr:`Setting.squeue_interval` means something."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from orchestrator.engines.api import (
     EngineError,
     Gang,
     GangStatus,
+    Handle,
     NodePhase,
     NodeStatus,
     NotYet,
@@ -51,6 +52,8 @@ class EngineSet:
         self.changed: Callable[[str], None] = lambda _: None
         """Called (on an engine's thread) with the name of a gang that has changed; empty: what an engine has, did."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
+        self._handles: dict[str, Handle] = {}
+        """Of the gangs that are observed, by their text."""
         self._runners = {engine.name: Runner(engine, lambda gang: self.changed(gang)) for engine in engines}
         deadline = machine.monotonic() + START
         for runner in self._runners.values():
@@ -173,7 +176,7 @@ class EngineSet:
 
         Of a gang whose engine is not served, or can't look now, nothing new is known: it counts as running.
         """
-        found = read_handle(handle)
+        found = self._handle(handle)
         try:
             return self._runner(found.engine).observe(found)
         except NotServed as error:
@@ -186,7 +189,7 @@ class EngineSet:
 
     def asked(self, handle: str) -> float | None:
         """Seconds since the engine was asked for the status that :meth:`observe` returns; None where it does not answer now."""
-        found = read_handle(handle)
+        found = self._handle(handle)
         return self._runner(found.engine).asked(found) if found.engine in self._runners else None
 
     def stop(self, handle: str, grace: float) -> GangStatus:
@@ -196,8 +199,16 @@ class EngineSet:
 
     def forget(self, host: str, gang: str, handle: str | None) -> None:
         """The gang, one of whose nodes was placed on ``host``, is over; ``handle``: None where it was never launched."""
+        if handle is not None:
+            self._handles.pop(handle, None)
         if runner := self._runners.get(engine_of(host)):
             runner.forget(gang, read_handle(handle) if handle else None)
+
+    def _handle(self, text: str) -> Handle:
+        """Read once: every look at a gang asks for it."""
+        if (found := self._handles.get(text)) is None:
+            found = self._handles[text] = read_handle(text)
+        return found
 
     def _traits(self, name: str) -> Traits:
         """Those of an engine, also of one that is not served."""
