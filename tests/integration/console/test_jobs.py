@@ -67,7 +67,9 @@ def test_jobs_are_found_by_state_queue_and_part_of_a_name(visitor: Visitor, many
 
 
 @pytest.mark.parametrize("path", ["/", "/jobs/stream"])
-@pytest.mark.parametrize("query", ["state=failed&state=waiting", "queue=lab&after=1-a&queue=default", "after=1-a&after=1-a"])
+@pytest.mark.parametrize(
+    "query", ["state=failed&state=waiting", "queue=lab&after=1-a&queue=default", "after=1-a&after=1-a"]
+)
 def test_a_filter_that_an_address_gives_twice_is_refused_by_name(console: Console, path: str, query: str) -> None:
     answer = console.visitor().http.get(f"{path}?{query}", headers={"Accept": "application/json"})
     assert answer.status_code == 400

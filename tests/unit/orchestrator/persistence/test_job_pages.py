@@ -235,7 +235,7 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
         case 5:
             session.flush()
             rows = session.execute(select(Job.parent, Job.queue, Job.status).where(Job.id == one.id)).all()
-            note_deleted(session, [tuple(row) for row in rows])
+            note_deleted(session, [(parent, queue, status) for parent, queue, status in rows])
             session.expunge(one)
             session.execute(delete(Job).where(Job.id == one.id))
 
