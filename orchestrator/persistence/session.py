@@ -390,9 +390,9 @@ def _forget(session: Session) -> None:
 @event.listens_for(_Session, "do_orm_execute")
 def _look_up_nodes(state: ORMExecuteState) -> None:
     """SQLite reads the whole table of nodes to find those of several attempts, by pairs of keys; by the jobs it uses the index."""
-    if not state.is_relationship_load or state.bind_mapper is not inspect(Node) or not isinstance(state.parameters, dict):
-        return
-    if pairs := state.parameters.get("primary_keys"):  # else those of one attempt are loaded, by its key
+    is_of_nodes = state.is_relationship_load and state.bind_mapper is inspect(Node)
+    pairs = state.parameters.get("primary_keys") if is_of_nodes and isinstance(state.parameters, dict) else None
+    if pairs:  # else those of one attempt are loaded, by its key
         jobs = {job for job, _ in pairs}
         state.statement = cast(Select[Any], state.statement).where(Node.job_id.in_(jobs))
 
