@@ -15,7 +15,7 @@ from fastapi import Request
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.access import Access
-from orchestrator.console import job
+from orchestrator.console import job, live
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 from shared_store.layout import Run, Store
 from shared_store.metrics import MetricsWriter, sampled
@@ -75,6 +75,25 @@ def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
 def test_a_browser_says_what_it_has_in_a_header_or_in_the_address() -> None:
     assert last_id(request_of({"last": "3"})) == "3" and last_id(request_of()) == ""
     assert last_id(request_of({"last": "3"}, **{"last-event-id": "5"})) == "5"
+
+
+def test_a_value_that_takes_long_is_computed_for_a_fifth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, recent = [100.0], Recent(0.5)
+    monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+
+    def takes(seconds: float, value: int) -> int:
+        clock[0] += seconds
+        return value
+
+    assert recent.get("key", lambda: takes(0.1, 1)) == 1  # until 100.5
+    clock[0] = 100.4
+    assert recent.get("key", lambda: takes(1.0, 2)) == 1
+    clock[0] = 100.5
+    assert recent.get("key", lambda: takes(1.0, 2)) == 2  # until 101.5 + 4.0
+    clock[0] = 105.4
+    assert recent.get("key", lambda: takes(1.0, 3)) == 2
+    clock[0] = 105.5
+    assert recent.get("key", lambda: takes(0.0, 3)) == 3
 
 
 def test_a_value_that_many_want_at_once_is_computed_once() -> None:

@@ -176,7 +176,10 @@ def test_the_nodes_of_several_attempts_are_found_by_an_index(database: Database)
         assert len(seen) == 3, "of the jobs, of all attempts, and of all nodes"
         sql, values = seen[2]
         (step, *_) = [row[3] for row in session.connection().exec_driver_sql(f"EXPLAIN QUERY PLAN {sql}", values)]
-    assert step.startswith("SEARCH nodes USING INDEX")
+        assert step.startswith("SEARCH nodes USING INDEX")
+        attempt = session.get_one(Attempt, ("j3", 2))
+        session.expire(attempt, ["nodes"])
+        assert [node.host for node in attempt.nodes] == ["3.2"], "also where those of one attempt alone are read again"
 
 
 # -- counts ------------------------------------------------------------------------------------------------------------
@@ -235,7 +238,7 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
         case 5:
             session.flush()
             rows = session.execute(select(Job.parent, Job.queue, Job.status).where(Job.id == one.id)).all()
-            note_deleted(session, [tuple(row) for row in rows])
+            note_deleted(session, [(parent, queue, status) for parent, queue, status in rows])
             session.expunge(one)
             session.execute(delete(Job).where(Job.id == one.id))
 
