@@ -133,6 +133,7 @@ class Job(Base):
         Index("ix_jobs_queue_created", "queue", "created_at", "id"),
         Index("ix_jobs_list", "parent", "created_at", "id"),
         Index("ix_jobs_list_kind", "parent", "queue", "status", "created_at", "id"),
+        Index("ix_jobs_ended", "stopped_at", "from_yaml", "queue", "id"),
     )
     id: Mapped[str] = mapped_column(primary_key=True)
     """A UUID; of an array's child ``<parent>:<index>``."""
@@ -140,8 +141,10 @@ class Job(Base):
     queue: Mapped[str]
     owner: Mapped[str | None] = mapped_column(default=None)
     """The submitter: the name of a key, of a user, or MUSTER_TOKEN."""
-    definition: Mapped[str]
+    definition: Mapped[str] = mapped_column(index=True)
     """ARN with revision."""
+    from_yaml: Mapped[bool] = mapped_column(default=False)
+    """Whether it has a spec, from job YAML; else it came through the Batch API alone."""
     kind: Mapped[str] = mapped_column(default="multinode")
     """``multinode``, ``container`` (one node) or ``array`` (the parent of its children, with no process of its own)."""
     request: Mapped[dict[str, Any]]
@@ -158,7 +161,7 @@ class Job(Base):
     queued_since: Mapped[int | None] = mapped_column(default=None)
     """When it was created, in steady time [ms] (:mod:`orchestrator.control.clock`): by this jobs are ordered."""
     started_at: Mapped[int | None] = mapped_column(default=None)
-    stopped_at: Mapped[int | None] = mapped_column(default=None, index=True)
+    stopped_at: Mapped[int | None] = mapped_column(default=None)
     attempts_allowed: Mapped[int] = mapped_column(default=1)
     own_evaluate_on_exit: Mapped[list[dict[str, Any]] | None] = mapped_column(
         "evaluate_on_exit", _JSON_OR_NULL, default=list
@@ -311,6 +314,16 @@ class Dependency(Base):
     """Id of the job on which it depends; kept when that job is deleted."""
     kind: Mapped[str | None] = mapped_column(default=None)
     """``N_TO_N`` or ``SEQUENTIAL`` as it was asked for; None: plain."""
+
+
+class RunUse(Base):
+    """A job reads another run than its own, or has begun with its weights."""
+
+    __tablename__ = "run_uses"
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    run: Mapped[str] = mapped_column(primary_key=True, index=True)
+    lasts: Mapped[bool] = mapped_column(default=False)
+    """Whether its own run descends from that run, so that the use does not end with the job."""
 
 
 class Attempt(Base):

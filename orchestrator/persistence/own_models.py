@@ -30,6 +30,15 @@ class KnownStore(Base):
     """As its ``store.json`` has it."""
 
 
+class RetentionStart(Base):
+    """The one row of a database that was older than retention (:mod:`orchestrator.domain.retention`)."""
+
+    __tablename__ = "retention"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    since: Mapped[int]
+    """When it was upgraded."""
+
+
 class KeptText(Base):
     """A long text of jobs, which lies in the store (:mod:`orchestrator.control.kept_texts`)."""
 
