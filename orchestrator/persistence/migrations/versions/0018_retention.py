@@ -25,7 +25,7 @@ def upgrade() -> None:
     op.add_column("jobs", sa.Column("from_yaml", sa.Boolean(), nullable=False, server_default=sa.false()))
     text = sa.cast(_JOBS.c.node_properties, sa.String)
     op.execute(_JOBS.update().where(text.like("%MUSTER_SPEC%")).values(from_yaml=sa.true()))
-    parents = sa.select(_JOBS.c.id).where(_JOBS.c.from_yaml == sa.true()).scalar_subquery()
+    parents = sa.select(_JOBS.c.id).where(_JOBS.c.from_yaml == sa.true())
     op.execute(_JOBS.update().where(_JOBS.c.parent.in_(parents)).values(from_yaml=sa.true()))
     op.drop_index("ix_jobs_stopped_at", "jobs")
     op.create_index("ix_jobs_ended", "jobs", ["stopped_at", "from_yaml", "queue", "id"])
