@@ -44,7 +44,12 @@ def list_runs(
         page = found
         while page is found or len(page) == _A_PAGE:
             after = found[-1]["run"] if found else ""
-            query: dict[str, Any] = {"after": after, "search": search, "max": _A_PAGE, "archived": str(archived).lower()}
+            query: dict[str, Any] = {
+                "after": after,
+                "search": search,
+                "max": _A_PAGE,
+                "archived": str(archived).lower(),
+            }
             page = client.get("/api/runs", **query)
             found = [*found, *page]
     if as_json:
