@@ -190,6 +190,7 @@ class Server:
         self.bus.open()
         self.peers.start()
         self.reconciler.start()
+        self.reconciler.retention.start(self.reconciler.calls.later)
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()

@@ -15,25 +15,30 @@ from shared_store.files import refuse_links, sync_directory
 from shared_store.layout import Store
 
 
-def throw_away(store: Store, path: Path) -> Path | None:
-    """Move a directory of the store into the trash, durably; returns where it is now, None where it was not there.
+def throw_away(store: Store, *paths: Path) -> list[Path]:
+    """Move directories of the store into the trash, durably; returns where those are now that were there.
 
     Raises:
         DamagedFile: A directory on the way is a link, which leads out of the store.
-        OSError: The volume can't be written, or is gone.
+        OSError: The volume can't be written, or is gone. Of the directories, some may be in the trash.
     """
-    inside = path.relative_to(store.path)
-    refuse_links(path, len(inside.parts))
     trash = store.path / "trash"
+    for path in paths:
+        refuse_links(path, len(path.relative_to(store.path).parts))
     refuse_links(trash, 1)
     trash.mkdir(exist_ok=True)
-    thrown = trash / f"{uuid.uuid4().hex}.{path.name[:100]}"
+    thrown, changed = [], {trash}
     try:
-        os.rename(path, thrown)
-    except FileNotFoundError:
-        return None
-    for each in (path.parent, trash):
-        sync_directory(each)
+        for path in paths:
+            there = trash / f"{uuid.uuid4().hex}.{path.name[:100]}"
+            with suppress(FileNotFoundError):
+                os.rename(path, there)
+                thrown.append(there)
+                changed.add(path.parent)
+    finally:
+        for each in changed:
+            with suppress(FileNotFoundError):  # thrown away, too
+                sync_directory(each)
     return thrown
 
 

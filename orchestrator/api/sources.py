@@ -17,7 +17,8 @@ from orchestrator.api.permissions import Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
-from orchestrator.persistence.models import RunRecord, RunUse
+from orchestrator.persistence.models import RunRecord
+from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.contents import is_archived

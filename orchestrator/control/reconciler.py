@@ -157,7 +157,6 @@ class Reconciler:
 
     def start(self) -> None:
         self.disk.start()
-        self.retention.start(self.calls.later)
         self._thread = machine.thread("controller", self._loop)
 
     def wake(self) -> None:

@@ -365,7 +365,7 @@ class Retention:
     def _carry_out(self, looks: Sequence[Look]) -> None:
         """Move into the trash what goes, delete the rows, and empty the trash. Raises Unavailable, OSError."""
         self._check()
-        thrown = [trash.throw_away(self._store, path) for look in looks for path in look.directories]
+        thrown = trash.throw_away(self._store, *(path for look in looks for path in look.directories))
         self._check()
         jobs = [job for look in looks for job in look.decision.jobs]
         gone = [look.run for look in looks if look.decision.run or look.is_missing]
@@ -374,8 +374,7 @@ class Retention:
                 rows.forget_jobs(session, jobs)
                 rows.forget_owners(session, gone)
         for path in thrown:
-            if path is not None:
-                trash.remove(path)
+            trash.remove(path)
 
     # -- what is in the store -------------------------------------------------------------------------------------------
 
@@ -445,12 +444,12 @@ class Retention:
                 raise RunNeeded(f"run {name} is kept: {'; '.join(reasons)}")
             path = self._store.run(name).path
             size, files = (0, 0) if facts is None else trash.size_of(path)
-            thrown = None if facts is None else trash.throw_away(self._store, path)
+            thrown = trash.throw_away(self._store, path)
             with self._writing, self._database.session() as session:
                 if (record := session.get(RunRecord, name)) is not None:
                     session.delete(record)
-        if thrown is not None:
-            trash.remove(thrown)
+        for each in thrown:
+            trash.remove(each)
         return {"run": name, "bytes": size, "files": files}
 
     @contextmanager

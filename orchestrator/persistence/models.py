@@ -316,16 +316,6 @@ class Dependency(Base):
     """``N_TO_N`` or ``SEQUENTIAL`` as it was asked for; None: plain."""
 
 
-class RunUse(Base):
-    """A job reads another run than its own, or has begun with its weights."""
-
-    __tablename__ = "run_uses"
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
-    run: Mapped[str] = mapped_column(primary_key=True, index=True)
-    lasts: Mapped[bool] = mapped_column(default=False)
-    """Whether its own run descends from that run, so that the use does not end with the job."""
-
-
 class Attempt(Base):
     """One launch of a job's gang."""
 

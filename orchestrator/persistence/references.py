@@ -18,9 +18,9 @@ from orchestrator.persistence.models import (
     JobDefinition,
     Node,
     RunRecord,
-    RunUse,
     WebhookDelivery,
 )
+from orchestrator.persistence.own_models import RunUse
 
 _SUBMITTED = "MUSTER_DIRECTORY"
 """Variable that only definitions have which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""

@@ -28,10 +28,9 @@ from orchestrator.persistence.models import (
     JobQueue,
     Node,
     RunRecord,
-    RunUse,
     now,
 )
-from orchestrator.persistence.own_models import RetentionStart
+from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.queries import find_job
 from orchestrator.persistence.schema import NEWEST
 from orchestrator.persistence.session import Database, DatabaseError

@@ -90,11 +90,12 @@ def test_an_archived_run_says_by_whom_and_damage_counts_as_archived(store: Store
 def test_a_directory_is_moved_whole_and_what_a_killed_controller_left_is_swept(store: Store) -> None:
     run = logged(store, "r")
     assert trash.size_of(run.path)[1] == 3
-    thrown = trash.throw_away(store, run.path)
-    assert thrown is not None and not run.path.exists() and (thrown / "run.json").is_file()
-    assert trash.throw_away(store, run.path) is None
+    other = logged(store, "other")
+    [thrown, _] = trash.throw_away(store, run.path, store.run("none").path, other.path)
+    assert not run.path.exists() and not other.path.exists() and (thrown / "run.json").is_file()
+    assert trash.throw_away(store, run.path) == []
     logged(store, "r2")
-    assert trash.empty(store) == 1 and os.listdir(store.path / "trash") == []
+    assert trash.empty(store) == 2 and os.listdir(store.path / "trash") == []
     assert store.run("r2").path.is_dir() and trash.empty(store) == 0
     trash.throw_away(store, store.run("r2").path)
     (store.path / "trash" / "stray").write_text("x")

@@ -1,10 +1,11 @@
 """Retention: when it began, which jobs have a spec, and which runs they read."""
 
 import json
-import time
 
 import sqlalchemy as sa
 from alembic import op
+
+from orchestrator.persistence.models import now
 
 revision = "0018"
 down_revision = "0017"
@@ -21,7 +22,7 @@ def upgrade() -> None:
         sa.Column("since", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("id"),
     )
-    op.bulk_insert(retention, [{"id": 1, "since": int(time.time() * 1000)}])
+    op.bulk_insert(retention, [{"id": 1, "since": now()}])
     op.add_column("jobs", sa.Column("from_yaml", sa.Boolean(), nullable=False, server_default=sa.false()))
     text = sa.cast(_JOBS.c.node_properties, sa.String)
     op.execute(_JOBS.update().where(text.like("%MUSTER_SPEC%")).values(from_yaml=sa.true()))

@@ -27,10 +27,9 @@ from orchestrator.persistence.models import (
     JobQueue,
     Node,
     RunRecord,
-    RunUse,
     now,
 )
-from orchestrator.persistence.own_models import RetentionStart
+from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
 from shared_store import contents, trash
 from shared_store.files import write_json
@@ -368,9 +367,9 @@ def test_a_job_that_begins_to_wait_for_one_that_is_being_taken_keeps_its_row(
     world.ended("old")
     throw = trash.throw_away
 
-    def late(store: Store, path: Path) -> Path | None:
+    def late(store: Store, *paths: Path) -> list[Path]:
         world.add(job("waits", status="PENDING"), Dependency(job_id="waits", on_id="old"))
-        return throw(store, path)
+        return throw(store, *paths)
 
     monkeypatch.setattr(trash, "throw_away", late)
     world.retention().take_all()
