@@ -37,12 +37,12 @@ from shared_store.references import references as stored_references
 
 log = logging.getLogger("muster.retention")
 
-A_STEP = 50
-"""Jobs of a step: their rows are deleted in one transaction, for which submissions wait."""
+A_STEP, A_TRANSACTION = 50, 25
+"""Jobs of a step, and of a transaction that deletes their rows: for that the loop and submissions wait."""
 _INTERVAL, _FIRST = 600.0, 60.0
 """Seconds between two passes, and until the first one."""
 _REST = 2.0
-"""After a step, a pass rests for so many times the time that it took."""
+"""After a step, a pass rests for so many times the processor time that it took."""
 _FRESH = 600.0
 """Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
 _LOGGED = 24 * 3600.0
@@ -216,13 +216,13 @@ class Retention:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
         totals, place = Totals(), Place()
         while not self._is_closing.is_set():
-            began = machine.monotonic()
+            began = machine.processor_time()
             looks, following = self.step(place, take=True)
             totals.add(looks)
             if following is None:
                 break
             place = following
-            self._is_closing.wait(_REST * (machine.monotonic() - began))
+            self._is_closing.wait(_REST * (machine.processor_time() - began))
         if totals.jobs or totals.runs:
             log.info(
                 "retention took %s; %d runs are kept that are old enough, see `muster gc --dry-run`",
@@ -367,12 +367,14 @@ class Retention:
         self._check()
         thrown = trash.throw_away(self._store, *(path for look in looks for path in look.directories))
         self._check()
-        jobs = [job for look in looks for job in look.decision.jobs]
+        # an array behind its children
+        jobs = sorted((job for look in looks for job in look.decision.jobs), key=lambda job: ":" not in job)
         gone = [look.run for look in looks if look.decision.run or look.is_missing]
-        if jobs:
+        for start in range(0, len(jobs), A_TRANSACTION):
             with self._writing, self._database.session() as session:
-                rows.forget_jobs(session, jobs)
-                rows.forget_owners(session, gone)
+                rows.forget_jobs(session, jobs[start : start + A_TRANSACTION])
+        with self._writing, self._database.session() as session:
+            rows.forget_owners(session, gone)
         for path in thrown:
             trash.remove(path)
 
