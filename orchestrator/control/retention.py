@@ -10,8 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,8 @@ _INTERVAL, _FIRST = 600.0, 60.0
 """Seconds between two passes, and until the first one."""
 _REST = 2.0
 """After a step, a pass rests for so many times the processor time that it took."""
+_REMOVERS = 8
+"""Threads that remove what was thrown away."""
 _FRESH = 600.0
 """Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
 _LOGGED = 24 * 3600.0
@@ -174,6 +178,7 @@ class Retention:
         self._beginning, self._writing, self._check, self._steady = beginning, writing, check, steady
         self._is_on = default != inf
         self._default = int(default * 1000) if default is not None and self._is_on else None
+        self._removing = machine.pool("emptying the trash", _REMOVERS)
         self._stored = _Stored()
         self._scanning = threading.Lock()
         self._next, self._next_report = machine.monotonic() + _FIRST, machine.monotonic()
@@ -189,6 +194,7 @@ class Retention:
     def close(self) -> None:
         """End a pass at its next step."""
         self._is_closing.set()
+        self._removing.close()
 
     def when_due(self, later: Callable[[Callable[[], object]], None]) -> None:
         """Have ``later`` carry out a pass once in a while; returns at once."""
@@ -375,8 +381,11 @@ class Retention:
                 rows.forget_jobs(session, jobs[start : start + A_TRANSACTION])
         with self._writing, self._database.session() as session:
             rows.forget_owners(session, gone)
-        for path in thrown:
-            trash.remove(path)
+        self._remove(thrown)
+
+    def _remove(self, thrown: Sequence[Path]) -> None:
+        """Remove what was thrown away, several at once: each waits for the file system's journal."""
+        wait([self._removing.submit(partial(trash.remove, path)) for path in thrown])
 
     # -- what is in the store -------------------------------------------------------------------------------------------
 
@@ -450,8 +459,7 @@ class Retention:
             with self._writing, self._database.session() as session:
                 if (record := session.get(RunRecord, name)) is not None:
                     session.delete(record)
-        for each in thrown:
-            trash.remove(each)
+        self._remove(thrown)
         return {"run": name, "bytes": size, "files": files}
 
     @contextmanager
