@@ -126,20 +126,23 @@ def rounds(bench: Bench, home: Path, jobs: int, count: int, takes: bool = True) 
         bench.submit(each, first=number * each)
         bench.wait(lambda: bench.count(*_OPEN) == 0, "all have ended", 3600.0, pause=0.2)
         seconds = time.monotonic() - began
+        if takes:
+            trash = home / "store" / "trash"
+            bench.wait(
+                lambda: not bench.count(*TERMINAL) and not list(trash.glob("*")), "all are taken", 3600.0, pause=0.2
+            )
+        left = time.monotonic() - began - seconds
         forget_ended(bench)
         found.append(size(bench, home))
         slowest = quantiles(loop, n=100)[98] if len(loop) > 1 else 0.0
         print(
-            f"{(number + 1) * each:7,} through: {found[-1]}; {each / seconds:4.0f} jobs/s, {time.process_time() - used:5.1f} s of CPU, "
+            f"{(number + 1) * each:7,} through: {found[-1]}; {each / seconds:4.0f} jobs/s, the last taken {left:4.1f} s later, {time.process_time() - used:5.1f} s of CPU, "
             f"pass of the loop p99 {1000 * slowest:.0f} ms",
             flush=True,
         )
     ending.set()
     if takes:
         taking.join()
-        bench.reconciler.retention.take_all()
-        found.append(size(bench, home))
-        print(f"   at the end: {found[-1]}", flush=True)
     return found
 
 

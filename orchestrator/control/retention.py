@@ -39,7 +39,7 @@ from shared_store.references import references as stored_references
 
 log = logging.getLogger("muster.retention")
 
-A_STEP, A_TRANSACTION = 50, 25
+A_STEP, A_TRANSACTION = 100, 50
 """Jobs of a step, and of a transaction that deletes their rows: for that the loop and submissions wait."""
 _INTERVAL, _FIRST = 600.0, 60.0
 """Seconds between two passes, and until the first one."""
@@ -379,8 +379,8 @@ class Retention:
         for start in range(0, len(jobs), A_TRANSACTION):
             with self._writing, self._database.session() as session:
                 rows.forget_jobs(session, jobs[start : start + A_TRANSACTION])
-        with self._writing, self._database.session() as session:
-            rows.forget_owners(session, gone)
+                if start + A_TRANSACTION >= len(jobs):
+                    rows.forget_owners(session, gone)
         self._remove(thrown)
 
     def _remove(self, thrown: Sequence[Path]) -> None:

@@ -11,6 +11,8 @@ from typing import Any
 import httpx
 import pytest
 
+from benchmarks import retention as benchmark
+from benchmarks.load import Watch
 from orchestrator.client import Client
 from orchestrator.control.retention import RunNeeded
 from orchestrator.domain.errors import ApiError
@@ -152,6 +154,14 @@ def test_a_run_is_archived_and_deleted_by_its_owner_and_keys_with_all_queues_alo
         assert runs_of(server) == []
         for each in clients.values():
             each.close()
+
+
+def test_store_and_database_stay_as_large_as_they_are_while_jobs_go_through(tmp_path: Path) -> None:
+    with benchmark.controller(tmp_path, Watch(loaded_anyway=True)) as bench:
+        sizes = benchmark.rounds(bench, tmp_path, jobs=160, count=4)
+    assert [(each.jobs, each.rows) for each in sizes] == [(0, 0)] * 4
+    assert len({each.files for each in sizes}) == 1, sizes
+    assert sizes[-1].database == sizes[1].database, sizes
 
 
 # -- no request loses the run that it is about -----------------------------------------------------------------------------
