@@ -118,6 +118,7 @@ def rounds(bench: Bench, home: Path, jobs: int, count: int, takes: bool = True) 
             bench.reconciler.retention.take_all()
 
     taking = threading.Thread(target=passes, daemon=True)
+    trash = home / "store" / "trash"
     if takes:
         taking.start()
     for number in range(count):
@@ -127,7 +128,6 @@ def rounds(bench: Bench, home: Path, jobs: int, count: int, takes: bool = True) 
         bench.wait(lambda: bench.count(*_OPEN) == 0, "all have ended", 3600.0, pause=0.2)
         seconds = time.monotonic() - began
         if takes:
-            trash = home / "store" / "trash"
             bench.wait(
                 lambda: not bench.count(*TERMINAL) and not list(trash.glob("*")), "all are taken", 3600.0, pause=0.2
             )

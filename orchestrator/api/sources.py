@@ -50,10 +50,9 @@ def sources_of(gang: GangSpec) -> list[Source]:
 
 def uses_of(job: str, gang: GangSpec) -> list[RunUse]:
     """Rows of the runs that a job needs beside its own. Raises ClientError."""
-    lasts = {source.run: source.key == _TEACHER for source in sources_of(gang)}
-    if parent := gang.nodes[gang.main].environment.get("MUSTER_PARENT", "").partition("@")[0]:
-        lasts[parent] = True
-    return [RunUse(job_id=job, run=run, lasts=each) for run, each in lasts.items() if NAME.fullmatch(run)]
+    parent = gang.nodes[gang.main].environment.get("MUSTER_PARENT", "").partition("@")[0]
+    needed = {parent, *(source.run for source in sources_of(gang))}
+    return [RunUse(job_id=job, run=run) for run in sorted(needed) if NAME.fullmatch(run)]
 
 
 class TeacherNeeded(ClientError):

@@ -31,13 +31,11 @@ class KnownStore(Base):
 
 
 class RunUse(Base):
-    """A job reads another run than its own, or has begun with its weights."""
+    """A job needs another run than its own until it has ended: it reads it, or begins with its weights."""
 
     __tablename__ = "run_uses"
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
     run: Mapped[str] = mapped_column(primary_key=True, index=True)
-    lasts: Mapped[bool] = mapped_column(default=False)
-    """Whether its own run descends from that run, so that the use does not end with the job."""
 
 
 class RetentionStart(Base):

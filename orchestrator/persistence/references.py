@@ -39,9 +39,9 @@ def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules) -> dict[
 def references(session: Session, runs: Collection[str], rules: Rules, moment: int) -> Iterator[Reference]:
     """What needs these runs, or jobs of them, at a moment (Unix time [ms])."""
     is_open = Job.status.not_in(TERMINAL)
-    uses = select(RunUse.run, Job.id, RunUse.lasts).join(Job, Job.id == RunUse.job_id)
-    for used, job, lasts in session.execute(uses.where(RunUse.run.in_(runs), or_(is_open, RunUse.lasts))):
-        yield Reference("run", used, f"job {job} {'began with its weights' if lasts else 'reads it'}")
+    uses = select(RunUse.run, Job.id).join(Job, Job.id == RunUse.job_id)
+    for used, job in session.execute(uses.where(RunUse.run.in_(runs), is_open)):
+        yield Reference("run", used, f"job {job} needs it")
     evaluated = select(AutomaticEvaluation.run, AutomaticEvaluation.job).where(AutomaticEvaluation.open)
     for evaluation in session.execute(evaluated.where(AutomaticEvaluation.run.in_(runs))):
         yield Reference("run", evaluation.run, f"job {evaluation.job} evaluates it")

@@ -35,7 +35,6 @@ def upgrade() -> None:
         "run_uses",
         sa.Column("job_id", sa.String(), nullable=False),
         sa.Column("run", sa.String(), nullable=False),
-        sa.Column("lasts", sa.Boolean(), nullable=False),
         sa.ForeignKeyConstraint(["job_id"], ["jobs.id"], ondelete="CASCADE"),
         sa.PrimaryKeyConstraint("job_id", "run"),
     )
@@ -57,19 +56,19 @@ def downgrade() -> None:
 
 
 def _uses(properties: str) -> list[dict[str, object]]:
-    """The runs that a job reads; of what ended jobs have read, the store tells what is still needed. Damage names none."""
-    found: dict[str, bool] = {}
+    """The runs that a job reads, or begins with the weights of. Damage names none."""
+    found: set[str] = set()
     try:
         for each in json.loads(properties)["nodeRangeProperties"]:
             pairs = {pair["name"]: pair.get("value", "") for pair in each["container"].get("environment") or []}
             spec = json.loads(pairs.get("MUSTER_SPEC") or "{}")
             for kind in _READING:
                 if isinstance(spec.get(kind), dict) and isinstance(spec[kind].get("run"), str):
-                    found.setdefault(spec[kind]["run"], False)
+                    found.add(spec[kind]["run"])
             teacher = ((spec.get("train") or {}).get("rsl_rl") or {}).get("teacher_checkpoint")
-            for lasting in (teacher, pairs.get("MUSTER_PARENT")):
-                if lasting:
-                    found[str(lasting).partition("@")[0]] = True
+            for weights in (teacher, pairs.get("MUSTER_PARENT")):
+                if weights:
+                    found.add(str(weights).partition("@")[0])
     except (ValueError, KeyError, TypeError, AttributeError):
         pass
-    return [{"run": run, "lasts": lasts} for run, lasts in found.items()]
+    return [{"run": run} for run in found]

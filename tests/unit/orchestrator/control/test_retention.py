@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import threading
 from collections.abc import Callable, Iterator
 from math import inf
@@ -18,6 +19,7 @@ from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Place, Retention, RunNeeded, Whose
 from orchestrator.control.run_users import RunInUse, RunUsers
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS
+from orchestrator.persistence import references
 from orchestrator.persistence.models import (
     Attempt,
     Base,
@@ -32,7 +34,7 @@ from orchestrator.persistence.models import (
 from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
 from shared_store import contents, trash
-from shared_store.files import write_json
+from shared_store.files import sync_directory, write_json
 from shared_store.layout import Store
 from tests.support.orchestrator.rows import job
 
@@ -160,13 +162,7 @@ def test_results_keep_the_run_and_its_logs_go_with_the_job(world: World) -> None
     ("make", "reason"),
     [
         (lambda w: w.add(job("next", run="old", status="PENDING")), "job next has not ended"),
-        (lambda w: w.add(job("reads", status="RUNNABLE"), RunUse(job_id="reads", run="old")), "job reads reads it"),
-        (
-            lambda w: w.add(
-                job("clone", status="FAILED", stopped_at=now()), RunUse(job_id="clone", run="old", lasts=True)
-            ),
-            "job clone began with its weights",
-        ),
+        (lambda w: w.add(job("reads", status="RUNNABLE"), RunUse(job_id="reads", run="old")), "job reads needs it"),
         (
             lambda w: w.add(job("later", status="PENDING"), Dependency(job_id="later", on_id="old")),
             "job later waits for it",
@@ -268,10 +264,10 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
         return call
 
     with monkeypatch.context() as patched:
-        patched.setattr(trash.os, "rename", dying(os.rename))
-        patched.setattr(trash, "sync_directory", dying(trash.sync_directory))
-        patched.setattr(trash.shutil, "rmtree", dying(trash.shutil.rmtree))
-        patched.setattr(module.rows, "forget_jobs", dying(module.rows.forget_jobs))
+        patched.setattr("shared_store.trash.os.rename", dying(os.rename))
+        patched.setattr("shared_store.trash.sync_directory", dying(sync_directory))
+        patched.setattr("shared_store.trash.shutil.rmtree", dying(shutil.rmtree))
+        patched.setattr("orchestrator.persistence.references.forget_jobs", dying(references.forget_jobs))
         try:
             world.retention().take_all()
         except Killed:

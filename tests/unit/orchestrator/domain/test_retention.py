@@ -132,9 +132,13 @@ class World:
         self.strange = {run for run in self.runs if draw.random() < 0.1}
 
     def rules(self) -> Rules:
-        age = lambda: self.draw.choice([None, self.draw.randint(0, 120) * A_DAY])  # noqa: E731
-        queues = {queue: age() for queue in "abc" if self.draw.random() < 0.5}
-        return Rules(age(), queues, self.draw.choice([0, self.draw.randint(0, 1000) * A_DAY]), self.draw.random() < 0.5)
+        queues = {queue: self._age() for queue in "abc" if self.draw.random() < 0.5}
+        return Rules(
+            self._age(), queues, self.draw.choice([0, self.draw.randint(0, 1000) * A_DAY]), self.draw.random() < 0.5
+        )
+
+    def _age(self) -> int | None:
+        return self.draw.choice([None, self.draw.randint(0, 120) * A_DAY])
 
     def jobs_of(self, run: str, rules: Rules) -> list[JobFacts]:
         return [
