@@ -21,7 +21,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from benchmarks.load import Watch, add_option, own_seconds
 from orchestrator import machine
@@ -53,16 +53,15 @@ IDLE = 20.0
 class MemoryStore(RunStore):
     """A store that keeps a run's name and epoch alone; every node that has ended has left 0."""
 
-    def __init__(self, store: Store, peers: Peers) -> None:
-        super().__init__(store, peers)
-        self._epochs: dict[str, int] = {}
+    epochs: ClassVar[dict[str, int]] = {}
+    """By run."""
 
     def examine(self, name: str) -> RunFacts:
-        epoch = self._epochs.get(name, 0)
+        epoch = self.epochs.get(name, 0)
         return RunFacts(name, missing=not epoch, content={} if epoch else None, epoch=epoch)
 
     def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim, texts: Any = ()) -> int:
-        self._epochs[name] = after + 1
+        self.epochs[name] = after + 1
         return after + 1
 
     def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
@@ -177,6 +176,7 @@ def self_now() -> int:
 def controller(engine: E, store_type: type[RunStore], watch: Watch) -> Iterator[Bench[E]]:
     """A controller that runs, on a database in a folder of its own."""
     machine.collect_seldom()  # as the server does
+    MemoryStore.epochs.clear()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         home = Path(folder)
         (home / "store").mkdir()

@@ -112,6 +112,10 @@ class Client:
         """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
         return self._answer("POST", path, body, seconds=seconds).json()
 
+    def delete(self, path: str, *, seconds: float = 30) -> Any:
+        """DELETE of a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
+        return self._answer("DELETE", path, seconds=seconds).json()
+
     def run_text(self, run: str, sha256: str) -> str | None:
         """A long text of a run's jobs; None where the run has it not. Raises ApiError, Unreachable."""
         try:

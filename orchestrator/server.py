@@ -91,8 +91,8 @@ class Server:
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, or path of an SQLite file, where it is not that of the home directory. ``min_free``: what must be free on
-        the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of jobs is kept;
-        None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
+        the volumes of the store and the database for something new to start. ``retention``: seconds for which ended jobs are kept, as
+        :class:`orchestrator.control.retention.Retention` says. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
         first, or to the one whose jobs in it are not over.
         ``account``, ``region``: of all ARNs (:mod:`orchestrator.control.account`); None: as before.
         ``temporary``: it goes away with a command that started it; who follows a job then starts another one.
@@ -195,6 +195,7 @@ class Server:
         self.bus.open()
         self.peers.start()
         self.reconciler.start()
+        self.reconciler.retention.start(self.reconciler.calls.later)
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()

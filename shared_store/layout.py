@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -267,14 +268,16 @@ class Store:
     def leagues(self) -> Path:
         return self.path / "leagues"
 
-    def runs(self, after: str = "", most: int | None = None) -> list[Run]:
-        """The existing runs, by name: those after ``after``, at most ``most``."""
+    def runs(
+        self, after: str = "", most: int | None = None, among: Callable[[Run], bool] = lambda run: True
+    ) -> list[Run]:
+        """The existing runs, by name: those after ``after``, at most ``most``, of which ``among`` is true."""
         try:
             entries = sorted(entry.name for entry in os.scandir(self.path / "runs") if entry.name > after)
         except FileNotFoundError:
             return []
         named = (self.run(name) for name in entries if NAME.fullmatch(name))
-        return list(islice((run for run in named if os.path.lexists(run.path / "run.json")), most))
+        return list(islice((run for run in named if os.path.lexists(run.path / "run.json") and among(run)), most))
 
 
 def names_in(directory: Path) -> list[str]:

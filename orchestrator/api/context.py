@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -178,6 +179,23 @@ def find_run(reconciler: Reconciler, name: str) -> Run:
     return run
 
 
+@contextmanager
+def using(reconciler: Reconciler, *runs: str) -> Iterator[None]:
+    """A block in which nobody deletes these runs, and after which something in the store may need them. Raises RunInUse."""
+    with ExitStack() as stack:
+        stack.callback(reconciler.retention.look_again)
+        for run in runs:
+            stack.enter_context(reconciler.run_users.using(run))
+        yield
+
+
+def archived(run: str) -> ClientError:
+    """The refusal to add something to an archived run."""
+    return ClientError(
+        f"run {run} is archived, and nothing is added to it; take it out first: muster runs archive {run} --undo", 409
+    )
+
+
 def _run(reconciler: Reconciler, name: str) -> Run:
     try:
         return reconciler.store.run(name)
@@ -237,13 +255,29 @@ def owner_of_run(reconciler: Reconciler, run: Run) -> RunRecord | None:
         return owner_of(session, found)
 
 
-def visible_runs(reconciler: Reconciler, after: str = "", most: int | None = None, search: str = "") -> list[Run]:
-    """The runs of the store that the caller may see, by name: those behind ``after``, at most so many, with ``search`` in their names."""
-    if visible_queues() is None and not search:
-        return reconciler.store.runs(after, most)
-    found = (run for run in reconciler.store.runs(after) if search.lower() in run.name.lower())
-    if visible_queues() is None:
-        return list(islice(found, most))
+def visible_runs(
+    reconciler: Reconciler,
+    after: str = "",
+    most: int | None = None,
+    search: str = "",
+    among: Callable[[Run], bool] = lambda run: True,
+) -> list[Run]:
+    """The runs of the store that the caller may see, by name.
+
+    Args:
+        reconciler: The controller.
+        after: Those behind this name.
+        most: At most so many.
+        search: Those with this text in their names.
+        among: Those of which this is true; it may read the store.
+    """
+    restricted = visible_queues() is not None
+    wanted = search.lower()
+    found = reconciler.store.runs(
+        after, None if restricted else most, lambda run: wanted in run.name.lower() and among(run)
+    )
+    if not restricted:
+        return found
     with reconciler.database.session() as session:
         recorded = {record.name: record for record in session.scalars(select(RunRecord))}
     owned = ((run, recorded.get(run.name) or owner_of_run(reconciler, run)) for run in found)

@@ -9,6 +9,7 @@ object                            key with all queues          key with some que
 ================================  ===========================  ============================================================
 job, run of one of its queues     reads, writes                reads, writes
 job, run of another queue         reads, writes                nothing; it is left out of lists
+run of one of its queues          archives, deletes            archives and deletes its own
 run of no known queue             reads, writes                nothing
 job definition of its own         reads, writes, submits       reads, writes, submits
 another's, tagged for its queue   reads, writes, submits       reads, submits
@@ -131,6 +132,10 @@ class Operation(StrEnum):
     RESUME_RUN = "POST /api/runs/{name}/resume"
     CLONE_RUN = "POST /api/runs/{name}/clone"
     REGISTER_MODEL = "POST /api/runs/{name}/models"
+    ARCHIVE_RUN = "POST /api/runs/{name}/archive"
+    DELETE_RUN = "DELETE /api/runs/{name}"
+    READ_GARBAGE = "GET /api/gc"
+    TAKE_GARBAGE = "POST /api/gc"
     LIST_MODELS = "GET /api/models"
     READ_MODEL = "GET /api/models/{name}"
     LIST_LEAGUES = "GET /api/leagues"
@@ -158,6 +163,8 @@ class Operation(StrEnum):
         return self.value.startswith(("GET ", "Describe", "List", "Get", "Filter", "StartLiveTail"))
 
 
+_OF_THE_OWNER = frozenset({Operation.ARCHIVE_RUN, Operation.DELETE_RUN})
+"""What a key with some queues may do to its own runs alone."""
 BY_LOWER_NAME = {operation.lower(): operation for operation in Operation}
 
 
@@ -195,6 +202,10 @@ def check(operation: Operation, *objects: Object) -> None:
     for each in objects:
         if not _allowed(identity, operation, each):
             queues = ", ".join(sorted(identity.queues or ())) or "none"
+            if operation in _OF_THE_OWNER and _allowed(identity, Operation.READ_RUN, each):
+                raise Refusal(
+                    "AccessDeniedException", f"{identity.name}: {operation} is refused, since {_made_by(each)}"
+                )
             raise Refusal(
                 "AccessDeniedException",
                 f"{identity.name} may use job queue {queues} only: {operation} is refused, since {_whose(each)}",
@@ -250,6 +261,8 @@ def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
     if queues is None:
         return True
     match thing:
+        case RunRecord() if operation in _OF_THE_OWNER:
+            return thing.queue in queues and thing.owner == identity.name
         case Job() | RunRecord() | JobsOf():
             return thing.queue in queues
         case LeagueOf() | LogGroup():
@@ -260,6 +273,11 @@ def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
             return thing.owner == identity.name or (tagged and (operation.reads or operation is Operation.SUBMIT_JOB))
         case _:
             return operation.reads
+
+
+def _made_by(thing: Object) -> str:
+    owner = getattr(thing, "owner", None) or "an unknown key"
+    return f"run {getattr(thing, 'name', '')} was made by {owner}; its owner may, and a key with all queues"
 
 
 def _whose(thing: Object) -> str:

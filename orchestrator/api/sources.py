@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from orchestrator.api import permissions
-from orchestrator.api.context import Context, permitted_run, release
+from orchestrator.api.context import Context, archived, permitted_run, release
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
@@ -18,8 +18,10 @@ from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
+from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.contents import is_archived
 from shared_store.layout import NAME, Run
 from shared_store.parent import TeacherCopy, named_parent
 from shared_store.wording import shown
@@ -46,6 +48,13 @@ def sources_of(gang: GangSpec) -> list[Source]:
     return sorted({source for node in nodes.values() for source in _sources(node)})
 
 
+def uses_of(job: str, gang: GangSpec) -> list[RunUse]:
+    """Rows of the runs that a job needs beside its own. Raises ClientError."""
+    parent = gang.nodes[gang.main].environment.get("MUSTER_PARENT", "").partition("@")[0]
+    needed = {parent, *(source.run for source in sources_of(gang))}
+    return [RunUse(job_id=job, run=run) for run in sorted(needed) if NAME.fullmatch(run)]
+
+
 class TeacherNeeded(ClientError):
     """The job's run has to hold a copy of these weights: :func:`with_teacher` makes it and submits again."""
 
@@ -70,10 +79,14 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
         is_teacher = source.key == _TEACHER
         if is_teacher and context.read(("held", source), partial(_is_held, context, gang, source)):
             continue
+        context.reconciler.run_users.check(source.run)
         if not is_waiting:
             try:
                 found = partial(permitted_run, context.reconciler, source.run, Operation.SUBMIT_JOB)
-                context.read(("find", source.run), found)
+                version = context.reconciler.run_users.version(source.run)
+                run = context.read(("find", source.run, version), found)
+                if not is_teacher and context.read(("archived", source.run, version), partial(is_archived, run)):
+                    raise archived(source.run)
             except ClientError as error:
                 raise ClientError(f"{source.key}: {error}" if is_teacher else str(error), error.status) from None
         if permissions.visible_queues() is not None:

@@ -36,6 +36,7 @@ ENTRIES = (
     Entry("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
     Entry("stop", "jobs", _JOBS, "Stop a job: it checkpoints and exits; `muster resume` continues from there."),
     Entry("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
+    Entry("runs", "stored_runs", _RUNS, "List, archive and delete the runs of the store."),
     Entry("resume", "runs", _RUNS, "Resume a run from its newest checkpoint, at the next iteration."),
     Entry("clone", "clones", _RUNS, "Start a new run from only the weights of a checkpoint."),
     Entry(
@@ -87,6 +88,7 @@ ENTRIES = (
         _SHARED,
         "List job queues, or one queue's waiting jobs in the order in which they will start.",
     ),
+    Entry("gc", "gc", _SHARED, "Delete old jobs, their logs and their runs, where nothing needs them any more."),
     Entry("keys", "keys", _SHARED, "Manage the access keys of this home directory's server."),
     Entry("webhooks", "webhooks", _SHARED, "List and test the controller's webhooks, which report the end of jobs."),
     Entry(

@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable
+from orchestrator.domain.retention import age_of
 from orchestrator.home import ControllerRuns, is_temporary, local_url, muster_home
 from orchestrator.spec import file as specfile
 from orchestrator.spec.values import seconds_of
@@ -105,7 +107,11 @@ def serve(
     ] = None,
     retention: Annotated[
         str | None,
-        typer.Option(help="Time to keep the history of finished jobs, such as 90d; unlimited by default."),
+        typer.Option(
+            help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By "
+            "default jobs of the Batch API are kept for 90d, others without end; the tag muster:retention of a queue goes first.",
+            show_default=False,
+        ),
     ] = None,
     min_free: Annotated[
         str,
@@ -191,7 +197,7 @@ def serve(
         rate_limit=rate_limit,
         submit_rate_limit=submit_rate_limit,
         database=database,
-        retention=seconds_of("--retention", retention),
+        retention=_retention(retention),
         secrets=secrets,
         trusted_proxies=trust_proxy or (),
         min_free=_min_free(min_free),
@@ -323,3 +329,14 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
             yield client
     finally:
         server.close()
+
+
+def _retention(text: str | None) -> float | None:
+    """Seconds; infinity for ``off``."""
+    if text is None:
+        return None
+    try:
+        age = age_of(text)
+    except ValueError as error:
+        raise SpecError(f"--retention: {error}") from None
+    return inf if age is None else age / 1000

@@ -25,16 +25,17 @@ from orchestrator.control.kept_texts import KeptTexts
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
+from orchestrator.control.retention import Retention
 from orchestrator.control.run_store import RunStore
+from orchestrator.control.run_users import RunUsers
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.control.store_identity import StoreAbsent, StoreIdentity
-from orchestrator.control.usage import forget_before
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.group_commit import GroupCommit
-from orchestrator.persistence.models import Attempt, Job, JobQueue, now
+from orchestrator.persistence.models import Attempt, Job, JobQueue
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 from shared_store.layout import Store
@@ -49,7 +50,7 @@ _WITHOUT_DATABASE = 1.0
 _SOON = 1.0
 """Seconds until the next look at a gang after one that failed."""
 _SWEEP_INTERVAL = 2.0
-"""Seconds between two looks for queues that are gone and history that may be forgotten."""
+"""Seconds between two looks for queues that are gone and other things that nothing needs."""
 
 log = logging.getLogger("muster.controller")
 
@@ -72,12 +73,13 @@ class Reconciler:
         runs: RunStore | None = None,
         disk: Disk | None = None,
     ) -> None:
-        """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
+        """``interval``: seconds between two looks at the engine; ``retention``: seconds for which ended jobs are kept, as
+        :class:`.retention.Retention` says;
         ``identity``: of the store; without it whatever is at its path is the store.
         ``min_free``: free space that the volumes of the store and the database need for something new to start.
         """
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
-        self.interval, self.retention = interval, retention
+        self.interval = interval
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
         self._identity = identity
@@ -108,6 +110,18 @@ class Reconciler:
         self.beginning: dict[str, WeightsCopy] = {}
         """Runs that get files before the database has their jobs, by name; nobody else may write them. Entered under :attr:`writing`."""
         self.submissions = GroupCommit(database, self.writing)
+        self.run_users = RunUsers()
+        self.retention = Retention(
+            database,
+            store,
+            peers,
+            self.run_users,
+            self.beginning,
+            self.writing,
+            self.check_store,
+            self.clock.now,
+            retention,
+        )
         bus.changed = engine.changed = self._gang_changed
         database.committed = self._committed
         database.changed = self._look_again
@@ -164,6 +178,7 @@ class Reconciler:
     def close(self) -> None:
         """Leave the loop; running gangs continue, and the next controller on this database finds them."""
         self._ending.set()
+        self.retention.close()
         self.disk.close()
         self._wake.set()
         if self._thread is not None:
@@ -320,7 +335,7 @@ class Reconciler:
         ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
     def _sweep(self) -> None:
-        """Remove deleted queues that are empty, and history beyond the retention time."""
+        """Remove deleted queues that are empty; have removed what nothing needs any more."""
         if machine.monotonic() - self._swept < _SWEEP_INTERVAL:
             return
         if not self.writing.acquire(blocking=False):
@@ -329,6 +344,7 @@ class Reconciler:
             self._swept = machine.monotonic()
             self._clear_away()
             self.texts.sweep_when_due(self.calls.later)
+            self.retention.when_due(self.calls.later)
         finally:
             self.writing.release()
 
@@ -343,10 +359,6 @@ class Reconciler:
                 self._is_draining = left
             for queue in deleted:
                 self.monitoring.forget_queue(queue)
-        if self.retention is not None:
-            with self.database.session() as session:
-                # by the clock that is behind: nothing is forgotten too early
-                forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
 
 
 def _delete_drained(session: Session) -> tuple[bool, list[str]]:

@@ -5,22 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
-from sqlalchemy import delete, or_, select
-from sqlalchemy.orm import Session, aliased
+from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.domain.job import TERMINAL, Ending
+from orchestrator.domain.job import Ending
 from orchestrator.domain.resources import Resources
-from orchestrator.persistence.job_counts import note_deleted
-from orchestrator.persistence.models import (
-    Attempt,
-    AutomaticEvaluation,
-    Dependency,
-    Job,
-    Node,
-    ShareUsage,
-    WebhookDelivery,
-)
+from orchestrator.persistence.models import Attempt, Job, ShareUsage
 from orchestrator.scheduling.order import decayed
 
 
@@ -109,35 +100,3 @@ def usage_at(
             key = (job.queue, job.share or "")
             found[key] = found.get(key, 0.0) + resource_seconds(attempt, moment)
     return found
-
-
-def forget_before(session: Session, moment: int, most: int = 500) -> int:
-    """Delete the history of jobs that were over before ``moment`` [ms], at most so many; returns how many were.
-
-    A job is kept while another one waits for it, and an array with its children until the last of them is over.
-    """
-    open_jobs = select(Job.id).where(Job.status.not_in(TERMINAL))
-    needed = select(Dependency.on_id).where(Dependency.job_id.in_(open_jobs))
-    alone = or_(Job.parent.is_(None), Job.parent.not_in(open_jobs))
-    child = aliased(Job)
-    # after its children, which have their definition from it
-    last = or_(Job.kind != "array", ~select(child.id).where(child.parent == Job.id).exists())
-    query = select(Job.id, Job.parent, Job.queue, Job.status).where(
-        Job.stopped_at < moment, Job.id.not_in(needed), alone, last
-    )
-    query = query.order_by(Job.stopped_at).limit(most)
-    found = session.execute(query).all()
-    ids = [job_id for job_id, *_ in found]
-    note_deleted(session, [(parent, queue, status) for _, parent, queue, status in found])
-    session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(ids), WebhookDelivery.next_at.is_(None)))
-    session.execute(
-        delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(ids), AutomaticEvaluation.open.is_(False))
-    )
-    for table, column in (
-        (Node, Node.job_id),
-        (Attempt, Attempt.job_id),
-        (Dependency, Dependency.job_id),
-        (Job, Job.id),
-    ):
-        session.execute(delete(table).where(column.in_(ids)))
-    return len(ids)

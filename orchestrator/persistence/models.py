@@ -146,6 +146,7 @@ class Job(Base):
         _listed("ix_jobs_list_queue", "queue"),
         _listed("ix_jobs_list_status", "status"),
         _listed("ix_jobs_list_kind", "queue", "status"),
+        Index("ix_jobs_ended", "stopped_at", "from_yaml", "queue", "id"),
     )
     id: Mapped[str] = mapped_column(primary_key=True)
     """A UUID; of an array's child ``<parent>:<index>``."""
@@ -153,8 +154,10 @@ class Job(Base):
     queue: Mapped[str]
     owner: Mapped[str | None] = mapped_column(default=None)
     """The submitter: the name of a key, of a user, or MUSTER_TOKEN."""
-    definition: Mapped[str]
+    definition: Mapped[str] = mapped_column(index=True)
     """ARN with revision."""
+    from_yaml: Mapped[bool] = mapped_column(default=False)
+    """Whether it has a spec, from job YAML; else it came through the Batch API alone."""
     kind: Mapped[str] = mapped_column(default="multinode")
     """``multinode``, ``container`` (one node) or ``array`` (the parent of its children, with no process of its own)."""
     request: Mapped[dict[str, Any]]
@@ -171,7 +174,7 @@ class Job(Base):
     queued_since: Mapped[int | None] = mapped_column(default=None)
     """When it was created, in steady time [ms] (:mod:`orchestrator.control.clock`): by this jobs are ordered."""
     started_at: Mapped[int | None] = mapped_column(default=None)
-    stopped_at: Mapped[int | None] = mapped_column(default=None, index=True)
+    stopped_at: Mapped[int | None] = mapped_column(default=None)
     attempts_allowed: Mapped[int] = mapped_column(default=1)
     own_evaluate_on_exit: Mapped[list[dict[str, Any]] | None] = mapped_column(
         "evaluate_on_exit", _JSON_OR_NULL, default=list

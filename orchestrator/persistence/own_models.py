@@ -1,4 +1,4 @@
-"""The tables of what a controller is and keeps: its clock, store, account, texts and log groups. Jobs are in :mod:`.models`."""
+"""The tables of what a controller is and keeps: its clock, store, account, texts, uses of runs, log groups. Jobs are in :mod:`.models`."""
 
 from __future__ import annotations
 
@@ -28,6 +28,23 @@ class KnownStore(Base):
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     identity: Mapped[str]
     """As its ``store.json`` has it."""
+
+
+class RunUse(Base):
+    """A job needs another run than its own until it has ended: it reads it, or begins with its weights."""
+
+    __tablename__ = "run_uses"
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    run: Mapped[str] = mapped_column(primary_key=True, index=True)
+
+
+class RetentionStart(Base):
+    """The one row of a database that was older than retention (:mod:`orchestrator.domain.retention`)."""
+
+    __tablename__ = "retention"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    since: Mapped[int]
+    """When it was upgraded."""
 
 
 class KeptText(Base):

@@ -15,11 +15,11 @@ from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.members import check_consumables
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, archived
 from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import check_texts
 from orchestrator.api.permissions import JobsOf, Operation
-from orchestrator.api.sources import check_sources, hold_teacher
+from orchestrator.api.sources import check_sources, hold_teacher, uses_of
 from orchestrator.control.compute_environments import environments_of, queue_engines
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import SpecError
@@ -32,6 +32,7 @@ from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQ
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import note_changed
 from orchestrator.spec.evaluations import place_of, wanted_of
+from shared_store.contents import is_archived
 from shared_store.layout import NAME
 
 _MOST_DEPENDENCIES = 20
@@ -69,6 +70,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         if teacher:
             hold_teacher(context, job.run, teacher)
     context.session.add(job)
+    context.session.add_all(uses_of(job.id, gang))
     log_groups.add_missing(context.session, gang.log_groups, job.owner)
     return answer(job)
 
@@ -157,6 +159,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
         kind="array" if is_array else document["type"],
         request=request,
         node_properties=properties,
+        from_yaml=gang.spec is not None,
         run=run,
         attempts_allowed=int(retry.get("attempts", 1)),
         evaluate_on_exit=retry.get("evaluateOnExit") or [],
@@ -229,6 +232,7 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     restricted = named and permissions.visible_queues() is not None
     if restricted and (owner := owner_of(context.session, context.found(run))):
         permissions.check(Operation.SUBMIT_JOB, owner)
+    context.reconciler.run_users.check(run)
     if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
         raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
@@ -239,9 +243,16 @@ def _check_run(context: Context, run: str, named: bool) -> None:
             f"run {run} is being written by job {reasons.named(holder.name, holder.id)}; stop it first: muster stop {reasons.short_id(holder.id)}"
         )
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
-        there = context.run(run)
-        if named and (writer := context.read(("writer", run), lambda: context.reconciler.peers.writer(there))):
+        there, version = context.run(run), context.reconciler.run_users.version(run)
+        if not named:
+            return
+        writer, is_kept = context.read(
+            ("writer", run, version), lambda: (context.reconciler.peers.writer(there), is_archived(there))
+        )
+        if writer:
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
+        if is_kept:
+            raise archived(run)
 
 
 def _release(job: Job) -> None:
@@ -279,7 +290,18 @@ def _insert_children(session: Session, parent: Job, indices: range, state: Mappi
     if not indices:
         return
     index = _numbers(indices)
-    copied = ("name", "queue", "owner", "definition", "attempts_allowed", "timeout", "share", "priority", "array_size")
+    copied = (
+        "name",
+        "queue",
+        "owner",
+        "definition",
+        "from_yaml",
+        "attempts_allowed",
+        "timeout",
+        "share",
+        "priority",
+        "array_size",
+    )
     same = {
         **{name: getattr(parent, name) for name in copied},
         **{

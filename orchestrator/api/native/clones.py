@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context, Known, release, with_store
+from orchestrator.api.context import Context, Known, release, using, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import keep_again
 from orchestrator.api.native.continuing import Changes, answered, check, submit
@@ -54,7 +54,10 @@ def clone(
         ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
-    return with_teacher(reconciler, lambda teacher: _clone(reconciler, source, name, changes, idempotency_key, teacher))
+    with using(reconciler, source.name):
+        return with_teacher(
+            reconciler, lambda teacher: _clone(reconciler, source, name, changes, idempotency_key, teacher)
+        )
 
 
 def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from orchestrator.api import permissions
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, Known, reconciler_of, with_store
+from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, Known, reconciler_of, using, with_store
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.callers import user_name
 from orchestrator.api.http.store_route import StoreRoute
@@ -234,22 +234,29 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     permissions.check(Operation.ENTER_LEAGUE, owner_of_model(model))
     reconciler.check_writable(adds=True)
     checkpoint = _checked(reconciler, league, model)
-    job = _race_of(reconciler, league, body.job)
-    summary = _summary(reconciler, league, model, checkpoint, job)
-    entry = {
-        "racer": _racer(body),
-        "owner": _caller(),
-        "model": {"name": model.name, "version": model.version, "digest": _digest(model), "task": summary.get("task")},
-        "evaluation": {"run": model.facts()["run"], "name": summary["name"], "job": job, "time": summary["time"]},
-        "versions": summary.get("versions"),
-        "race": summary["race"],
-    }
-    try:
-        return stored.enter(entry)
-    except LeagueError as error:
-        raise _refused(error) from None
-    except OSError as error:
-        raise ClientError(f"league {name}: the entry can't be written ({error.strerror or error})", 503) from None
+    job, run = _race_of(reconciler, league, body.job)
+    cited = model.facts()["run"]
+    with using(reconciler, cited, run):
+        summary = _summary(reconciler, league, model, checkpoint, job)
+        entry = {
+            "racer": _racer(body),
+            "owner": _caller(),
+            "model": {
+                "name": model.name,
+                "version": model.version,
+                "digest": _digest(model),
+                "task": summary.get("task"),
+            },
+            "evaluation": {"run": cited, "name": summary["name"], "job": job, "time": summary["time"]},
+            "versions": summary.get("versions"),
+            "race": summary["race"],
+        }
+        try:
+            return stored.enter(entry)
+        except LeagueError as error:
+            raise _refused(error) from None
+        except OSError as error:
+            raise ClientError(f"league {name}: the entry can't be written ({error.strerror or error})", 503) from None
 
 
 @router.post("/leagues/{name}/entries/{number}/disqualify")
@@ -383,8 +390,8 @@ def _checked(reconciler: Reconciler, league: League, model: Model) -> Checkpoint
     return found
 
 
-def _race_of(reconciler: Reconciler, league: League, reference: str) -> str:
-    """Id of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
+def _race_of(reconciler: Reconciler, league: League, reference: str) -> tuple[str, str]:
+    """Id and run of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
     with reconciler.database.session() as session:
         queues = permissions.visible_queues()
         job = find_job(session, reference, queues)
@@ -397,7 +404,7 @@ def _race_of(reconciler: Reconciler, league: League, reference: str) -> str:
             )
         if closed := league.closed(job.created_at / 1000):
             raise ClientError(f"{closed}, and job {named(job.name, job.id)} was not submitted in between", CONFLICT)
-        return job.id
+        return job.id, job.run
 
 
 def _summary(reconciler: Reconciler, league: League, model: Model, checkpoint: Checkpoint, job: str) -> dict[str, Any]:

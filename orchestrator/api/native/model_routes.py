@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import owner_of_run, permitted_run, reconciler_of
+from orchestrator.api.context import owner_of_run, permitted_run, reconciler_of, using
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.permissions import Operation
@@ -76,13 +76,14 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     record = owner_of_run(reconciler, run)
     queue, owner = (record.queue, record.owner) if record else ("", None)
     try:
-        there = models.versions(reconciler.store, body.name)
-        if there:
-            permissions.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
-        facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
-        model = models.register(
-            reconciler.store, body.name, run, checkpoint, facts, reconciler.peers.id, again=body.again
-        )
+        with using(reconciler, run.name):
+            there = models.versions(reconciler.store, body.name)
+            if there:
+                permissions.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
+            facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
+            model = models.register(
+                reconciler.store, body.name, run, checkpoint, facts, reconciler.peers.id, again=body.again
+            )
     except AlreadyRegistered as error:
         raise ClientError(str(error), CONFLICT) from None
     except ModelError as error:

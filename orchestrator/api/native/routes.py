@@ -30,6 +30,7 @@ from orchestrator.api.native import (
     model_routes,
     plan_routes,
     queue_overview,
+    retention_routes,
     run_routes,
     runs,
     text_routes,
@@ -60,6 +61,7 @@ router = APIRouter(prefix="/api")
 router.include_router(job_list.router)
 router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
+router.include_router(retention_routes.router)
 router.include_router(text_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)

@@ -59,12 +59,14 @@ def list_runs(
     after: str = Query(default="", max_length=128, description="name of the last run of the page before"),
     most: int = Query(default=RUNS_A_PAGE, ge=1, le=RUNS_A_PAGE, alias="max"),
     search: str = Query(default="", max_length=128, description="part of a name"),
+    archived: bool = Query(default=False, description="those that are archived, in place of the others"),
 ) -> Any:
     """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
     reconciler = reconciler_of(request)
-    found = runs.list_runs(reconciler, after, most, search)
+    found = runs.list_runs(reconciler, after, most, search, archived)
     if len(found) == most:
-        query = urlencode({"max": most, "after": found[-1]["run"], **({"search": search} if search else {})})
+        asked = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
+        query = urlencode({"max": most, "after": found[-1]["run"], **asked})
         response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
     return permissions.shown(found)
 

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context, Known, visible_runs, with_store
+from orchestrator.api.context import Context, Known, archived, using, visible_runs, with_store
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import keep_again
@@ -32,6 +32,7 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
+from shared_store.contents import is_archived
 from shared_store.evaluations import by_checkpoint
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
@@ -41,13 +42,15 @@ from shared_store.settings import first_difference, fixed_settings, innermost, s
 from shared_store.wording import counted, shown
 
 
-def list_runs(reconciler: Reconciler, after: str, most: int, search: str = "") -> list[dict[str, Any]]:
-    """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see.
+def list_runs(
+    reconciler: Reconciler, after: str, most: int, search: str = "", archived: bool = False
+) -> list[dict[str, Any]]:
+    """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see: those that are archived, or not.
 
     One that can't be read has a ``problem`` instead of its facts.
     """
     stored: list[StoredRun | dict[str, Any]] = []
-    for run in visible_runs(reconciler, after, most, search.strip()):
+    for run in visible_runs(reconciler, after, most, search.strip(), lambda run: is_archived(run) == archived):
         try:
             stored.append(stored_run(run))
         except (DamagedFile, OSError) as error:
@@ -96,6 +99,7 @@ def stored_run(run: Run) -> StoredRun:
         "evaluation": evaluated.get(newest),
         "best": _best(checkpoints, evaluated),
         "parent": description.get("parent"),
+        "archived": is_archived(run),
     }
     return StoredRun(found, results)
 
@@ -167,13 +171,18 @@ def resume(reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: 
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
-    return with_teacher(reconciler, lambda teacher: _resume(reconciler, run, changes, idempotency_key, teacher))
+    with using(reconciler, run.name):
+        return with_teacher(reconciler, lambda teacher: _resume(reconciler, run, changes, idempotency_key, teacher))
 
 
 def _resume(
     reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: str | None, teacher: TeacherCopy | None
 ) -> dict[str, Any]:
     found, checkpoints = facts_of(run), list_checkpoints(run)
+    if found.is_missing():
+        raise ClientError(f"run {run.name} was deleted a moment ago", 404)
+    if is_archived(run):
+        raise archived(run.name)
     with reconciler.database.session() as session:
         if earlier := _answered(Context(session, reconciler, idempotency_key), found, checkpoints):
             return earlier

@@ -52,7 +52,10 @@ TABLE = {
             *(OF.DELETE_LOG_GROUP, OF.PUT_RETENTION_POLICY, OF.DELETE_RETENTION_POLICY, OF.CREATE_LOG_STREAM),
             OF.DELETE_LOG_STREAM,
         ),
-        NAMED_WRITE: (OF.CHECKPOINT_JOB, OF.RESUME_RUN, OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.ENTER_LEAGUE),
+        NAMED_WRITE: (
+            *(OF.CHECKPOINT_JOB, OF.RESUME_RUN, OF.CLONE_RUN, OF.REGISTER_MODEL, OF.RACE, OF.ENTER_LEAGUE),
+            *(OF.ARCHIVE_RUN, OF.DELETE_RUN),
+        ),
         DEFINITION_READ: (OF.DESCRIBE_JOB_DEFINITIONS,),
         OWN_LIST: (
             *(OF.DESCRIBE_JOBS, OF.FILTER_LOG_EVENTS, OF.DESCRIBE_LOG_STREAMS, OF.START_LIVE_TAIL, OF.READ_QUEUES),
@@ -74,9 +77,10 @@ TABLE = {
             *(OF.DESCRIBE_JOB_QUEUES, OF.DESCRIBE_COMPUTE_ENVIRONMENTS, OF.DESCRIBE_SCHEDULING_POLICIES),
             *(OF.LIST_SCHEDULING_POLICIES, OF.DESCRIBE_LOG_GROUPS, OF.READ_HEALTH, OF.READ_DOCUMENTATION),
             *(OF.READ_CAPACITY, OF.LIST_LEAGUES, OF.READ_LEAGUE, OF.READ_LEAGUE_TABLE, OF.READ_ENTRY, OF.LIST_TRACKS),
+            OF.READ_GARBAGE,
         ),
         ALL_READ: (OF.READ_MONITORING, OF.READ_KEYS, OF.READ_WEBHOOKS),
-        OWN_MADE: (OF.CREATE_LEAGUE, OF.CREATE_LOG_GROUP, OF.KEEP_TEXT),
+        OWN_MADE: (OF.CREATE_LEAGUE, OF.CREATE_LOG_GROUP, OF.KEEP_TEXT, OF.TAKE_GARBAGE),
     }.items()
     for operation in operations
 }
@@ -184,6 +188,8 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of.ENTER_LEAGUE: {"model": world.run, "job": world.job},
         of.DISQUALIFY: {"reason": "x"},
         of.TEST_WEBHOOK: {},
+        of.ARCHIVE_RUN: {"archived": False},
+        of.TAKE_GARBAGE: {},
     }
     others |= {each: aws(each, **request) for each, request in requests.items()}
     return {each: others.get(each) or of_ours(each, bodies.get(each)) for each in Operation}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,20 +17,20 @@ from sqlalchemy import create_engine, select, text
 from sqlalchemy.exc import IntegrityError
 
 from orchestrator.control.account import DEFAULT, recognise
-from orchestrator.control.usage import add_usage, charge, forget_before, resource_seconds, usage_at
+from orchestrator.control.usage import add_usage, charge, resource_seconds, usage_at
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.errors import ApiError, RequestError, ServerError, UsageError
 from orchestrator.persistence.models import (
     Attempt,
     Base,
     ComputeEnvironment,
-    Dependency,
     Job,
     JobQueue,
     Node,
     RunRecord,
     now,
 )
+from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.queries import find_job
 from orchestrator.persistence.schema import NEWEST
 from orchestrator.persistence.session import Database, DatabaseError
@@ -99,6 +100,43 @@ def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, ope
         assert recognise(session, None, None) == DEFAULT, "its clients know these ARNs"
         with pytest.raises(UsageError, match="000000000000 in us-east-1 since its first start"):
             recognise(session, "123456789012", None)
+
+
+def test_an_older_database_begins_with_retention_at_its_upgrade(url: str, opened: Callable[[], Database]) -> None:
+    migrate(url, "upgrade", "0017")
+    spec = {"train": {"rsl_rl": {"teacher_checkpoint": "teacher@3"}}, "evaluate": {"run": "read"}}
+    pairs = [{"name": "MUSTER_SPEC", "value": json.dumps(spec)}, {"name": "MUSTER_PARENT", "value": "parent@9"}]
+    properties = json.dumps({"nodeRangeProperties": [{"container": {"environment": pairs}}]})
+    facts = {
+        **OLD,
+        "run": "r",
+        "created_at": 5,
+        "attempts_allowed": 1,
+        "kind": "multinode",
+        "priority": 0,
+        "cancelled": False,
+    }
+    for name, status, own in (
+        ("open", "RUNNABLE", properties),
+        ("over", "FAILED", properties),
+        ("batch", "FAILED", "{}"),
+    ):
+        insert(url, "jobs", [{**facts, "id": name, "status": status, "node_properties": own}])
+    insert(url, "jobs", [{**facts, "id": "damaged", "status": "RUNNABLE", "node_properties": '{"MUSTER_SPEC": 1}'}])
+    before = now()
+    with opened().session() as session:
+        start = session.get_one(RetentionStart, 1)
+        assert before - 1 <= start.since <= now()
+        native = dict(session.execute(select(Job.id, Job.from_yaml)).tuples().all())
+        assert native == {"open": True, "over": True, "batch": False, "damaged": True}
+        uses = {(each.job_id, each.run) for each in session.scalars(select(RunUse))}
+        assert uses == {("open", "read"), ("open", "teacher"), ("open", "parent")}
+    migrate(url, "downgrade", "0017")
+
+
+def test_a_new_database_has_nothing_to_count_from(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        assert session.get(RetentionStart, 1) is None
 
 
 def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, opened: Callable[[], Database]) -> None:
@@ -257,31 +295,6 @@ def test_a_stop_during_a_write_of_the_controller_is_processed() -> None:
     work_queue.look_again(["a"])  # a request has just ended the job
     work_queue.note([stale])  # the controller commits what it had read before
     assert list(work_queue.take_due()) == ["a"]
-
-
-def test_an_array_keeps_its_children_until_the_last_is_over(opened: Callable[[], Database]) -> None:
-    with opened().session() as session:
-        session.add_all([job("p", status="PENDING", kind="array"), job("p:1", status="RUNNING", parent="p")])
-        session.add(job("p:0", status="FAILED", stopped_at=1, parent="p"))
-        session.commit()
-        assert forget_before(session, 2000) == 0
-        for each in session.scalars(select(Job)):
-            each.status, each.stopped_at = "FAILED", 2
-        session.commit()
-        assert [forget_before(session, 2000) for _ in range(3)] == [2, 1, 0], "the array after its children"
-
-
-def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Database]) -> None:
-    over = {"status": "SUCCEEDED", "stopped_at": 1000}
-    with opened().session() as session:
-        session.add_all([job("old", **over), job("needed", **over), job("waits", status="PENDING")])
-        session.add(job("young", status="SUCCEEDED", stopped_at=now()))
-        session.add(Attempt(job_id="old", number=1, epoch=1, nodes=[Node(index=0, host="h")]))
-        session.add(Dependency(job_id="waits", on_id="needed"))
-        session.commit()
-        assert forget_before(session, 2000) == 1
-        assert sorted(session.scalars(select(Job.id))) == ["needed", "waits", "young"]
-        assert session.scalars(select(Attempt.job_id)).all() == session.scalars(select(Node.job_id)).all() == []
 
 
 def test_an_attempt_is_charged_for_its_use_and_losses(opened: Callable[[], Database]) -> None:

@@ -19,7 +19,7 @@ FOUND_AT = {
     "B3": (1, "the loop waits for a call"),
     "B4": (21, "the loop waits for a call"),
     "B9": (0, "is to be launched, although it is preempted"),
-    "fault": (0, "is launched after ValueError in train.py, line 3 ended attempts"),
+    "fault": (1, "is launched after ValueError in train.py, line 3 ended attempts"),
     "look": (0, "runs, and its job is STARTING"),
     "missing": (1, "and its controller has not met"),
     "stop": (18, "and its engine is away"),

@@ -1,0 +1,171 @@
+"""Whether a controller's store and database stay as large as they are, however many jobs go through.
+
+    python -m benchmarks.retention [--jobs 100000] [--rounds 10] [--off]
+
+Gangs of one node run on an engine that starts nothing (:mod:`benchmarks.scale`): each leaves a run with an outcome and a log, durably on
+this disk. Meanwhile one pass of retention follows another, in the steps and with the rests that they always have. After each round a line
+shows what there is; with ``--off``, without retention. A loaded machine is refused: :mod:`benchmarks.load`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import quantiles
+
+from sqlalchemy import func, select
+
+from benchmarks.load import Watch, add_option
+from benchmarks.scale import Bench, ShortEngine, large
+from orchestrator.control.bus import Bus
+from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.control.peers import Peers
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.job import TERMINAL, Status
+from orchestrator.engines.api import Gang, Handle, Plan
+from orchestrator.engines.registry import EngineSet
+from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.models import Attempt, Job, Node, RunRecord
+from orchestrator.persistence.session import Database
+from shared_store.layout import Store
+
+_TABLES = (Job, Attempt, Node, RunRecord)
+_OPEN = [status for status in Status if status not in TERMINAL]
+_LOG = b"a line of a log\n" * 64
+
+
+class LoggingEngine(ShortEngine):
+    """Its gangs leave a log, too."""
+
+    writes = True
+
+    def launch(self, plan: Plan[Gang]) -> Handle:
+        gang = plan.gang
+        log = Store(gang.store).run(gang.run).log(gang.job, gang.attempt, 0)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.write_bytes(_LOG)
+        return super().launch(plan)
+
+
+@dataclass(frozen=True)
+class Size:
+    """What there is."""
+
+    jobs: int
+    rows: int
+    """Of all tables that a job adds to."""
+    files: int
+    """In the store."""
+    database: int
+    """Bytes of the database, with its write-ahead log."""
+    memory: int
+    """Bytes of this process."""
+
+    def __str__(self) -> str:
+        database, memory = self.database / 2**20, self.memory / 2**20
+        return f"{self.jobs:7,} jobs {self.rows:7,} rows {self.files:7,} files {database:7.1f} MiB database {memory:5.0f} MiB memory"
+
+
+@contextmanager
+def controller(home: Path, watch: Watch) -> Iterator[Bench[FakeEngine]]:
+    """A controller that runs, and takes jobs as soon as they have ended."""
+    with ExitStack() as stack:
+        (home / "store").mkdir()
+        engine = LoggingEngine(capacity=large(2000))
+        store, engines = Store(home / "store").open(), EngineSet([engine])
+        stack.callback(engines.close)
+        database = Database.at(home)
+        stack.callback(database.close)
+        with database.session() as session:
+            ensure_compute_environments(session, engines.names)
+        reconciler = Reconciler(database, engines, store, Bus(home), Peers(store, home), retention=0.0)
+        stack.callback(reconciler.close)
+        reconciler.start()
+        yield Bench(reconciler, database, engine, watch)
+
+
+def size(bench: Bench[FakeEngine], home: Path) -> Size:
+    with bench.database.session() as session:
+        counts = [session.scalar(select(func.count()).select_from(table)) or 0 for table in _TABLES]
+    database = sum(path.stat().st_size for path in home.glob("muster.db*"))
+    files = sum(len(names) for _, _, names in os.walk(home / "store"))
+    memory = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    return Size(counts[0], sum(counts), files, database, memory)
+
+
+def rounds(bench: Bench[FakeEngine], home: Path, jobs: int, count: int, takes: bool = True) -> list[Size]:
+    """Jobs through the controller, in so many rounds; what there is after each, and after the last pass."""
+    found: list[Size] = []
+    loop: list[float] = []
+    monitoring = bench.reconciler.monitoring
+    took = monitoring.loop_took
+
+    def note(seconds: float) -> None:
+        loop.append(seconds)
+        took(seconds)
+
+    monitoring.loop_took = note  # type: ignore[method-assign]
+    each, ending = jobs // count, threading.Event()
+
+    def passes() -> None:
+        while not ending.wait(1.0):
+            bench.reconciler.retention.take_all()
+
+    taking = threading.Thread(target=passes, daemon=True)
+    trash = home / "store" / "trash"
+    if takes:
+        taking.start()
+    for number in range(count):
+        began, used = time.monotonic(), time.process_time()
+        loop.clear()
+        bench.submit(each, first=number * each)
+        bench.wait(lambda: bench.have(0, *_OPEN), "all have ended", 3600.0, pause=0.2)
+        seconds = time.monotonic() - began
+        if takes:
+            bench.wait(
+                lambda: bench.have(0, *TERMINAL) and not list(trash.glob("*")), "all are taken", 3600.0, pause=0.2
+            )
+        left = time.monotonic() - began - seconds
+        forget_ended(bench)
+        found.append(size(bench, home))
+        slowest = quantiles(loop, n=100)[98] if len(loop) > 1 else 0.0
+        print(
+            f"{(number + 1) * each:7,} through: {found[-1]}; {each / seconds:4.0f} jobs/s, the last taken {left:4.1f} s later, {time.process_time() - used:5.1f} s of CPU, "
+            f"pass of the loop p99 {1000 * slowest:.0f} ms",
+            flush=True,
+        )
+    ending.set()
+    if takes:
+        taking.join()
+    return found
+
+
+def forget_ended(bench: Bench[FakeEngine]) -> None:
+    """The fake cluster keeps every gang that it had."""
+    with suppress(RuntimeError):
+        bench.engine.cluster.gangs.clear()
+        bench.engine.cluster.launched.clear()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jobs", type=int, default=100_000, help="number of jobs")
+    parser.add_argument("--rounds", type=int, default=10, help="number of rounds")
+    parser.add_argument("--off", action="store_true", help="take nothing")
+    add_option(parser)
+    options = parser.parse_args()
+    watch = Watch(options.loaded_anyway)
+    with tempfile.TemporaryDirectory() as folder, controller(Path(folder), watch) as bench:
+        rounds(bench, Path(folder), options.jobs, options.rounds, not options.off)
+
+
+if __name__ == "__main__":
+    main()

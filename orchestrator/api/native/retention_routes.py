@@ -1,0 +1,113 @@
+"""The native API of retention: what the rules would take and take, and the runs that a person archives or deletes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, Field
+
+from orchestrator.api import permissions
+from orchestrator.api.context import permitted_run, reconciler_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http.store_route import StoreRoute
+from orchestrator.api.permissions import Operation
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.retention import Place, RunNeeded, Whose
+from orchestrator.domain.retention import age_of
+from shared_store import contents
+
+router = APIRouter(route_class=StoreRoute)
+
+_A_PART = 2.0
+"""Seconds of an answer: the rest of a pass comes with the next ones."""
+
+
+class TakeRequest(BaseModel):
+    """Where to continue, and an age in place of the rules' default."""
+
+    after: str = Field(default="", max_length=200, description="`next` of the answer before; empty at first")
+    older_than: str = Field(
+        default="",
+        max_length=40,
+        description="age of the jobs of queues without a rule, such as 30d; empty: as the rules say",
+    )
+
+
+@router.get("/gc")
+def read_garbage(
+    request: Request,
+    after: str = Query(default="", max_length=200, description="`next` of the answer before; empty at first"),
+    older_than: str = Query(
+        default="", max_length=40, description="age of the jobs of queues without a rule, such as 30d"
+    ),
+) -> dict[str, Any]:
+    """What the rules of retention would take of the caller's jobs and runs, a part at a time, and what of it is kept and why.
+
+    ``next`` is None after the last part.
+    """
+    return _part(reconciler_of(request), after, older_than, take=False)
+
+
+@router.post("/gc")
+def take_garbage(request: Request, body: TakeRequest) -> dict[str, Any]:
+    """Take it: rows of jobs, their logs and outcomes, and runs that hold nothing else."""
+    permissions.check(Operation.TAKE_GARBAGE)
+    reconciler = reconciler_of(request)
+    reconciler.check_writable(adds=False)
+    return _part(reconciler, body.after, body.older_than, take=True)
+
+
+class ArchiveRequest(BaseModel):
+    """Whether a run is to be archived."""
+
+    archived: bool = True
+
+
+@router.post("/runs/{name}/archive")
+def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, Any]:
+    """Archive a run, so that nothing is added to it, it is left out of lists, and it is neither taken nor deleted; or take it out again."""
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.ARCHIVE_RUN)
+    with reconciler.retention.alone(run.name):
+        facts, _ = reconciler.retention.needs(run.name)
+        if facts is None:
+            raise ClientError(f"run {run.name} was deleted a moment ago", 404)
+        if body.archived and (job := reconciler.retention.open_job(run.name)):
+            raise RunNeeded(
+                f"run {run.name} is not archived, since job {job} has not ended; stop it first: muster stop {job}"
+            )
+        if body.archived:
+            contents.archive(run, permissions.current_identity.get().name)
+        else:
+            contents.unarchive(run)
+    return {"run": run.name, "archived": body.archived}
+
+
+@router.delete("/runs/{name}")
+def delete_run(request: Request, name: str) -> dict[str, Any]:
+    """Delete a run with all that it holds, where nothing needs it. Answers its size."""
+    reconciler = reconciler_of(request)
+    run = permitted_run(reconciler, name, Operation.DELETE_RUN)
+    reconciler.check_writable(adds=False)
+    return reconciler.retention.delete(run.name)
+
+
+def _part(reconciler: Reconciler, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
+    """The next part of a pass. Raises ClientError for a malformed member."""
+    identity = permissions.current_identity.get()
+    try:
+        place = Place.of(after) if after else Place()
+        older = age_of(older_than) if older_than else None
+    except ValueError as error:
+        raise ClientError(str(error)) from None
+    whose = Whose(identity.name, identity.queues)
+    found: list[dict[str, Any]] = []
+    deadline = time.monotonic() + _A_PART
+    while True:
+        looks, following = reconciler.retention.step(place, take=take, whose=whose, older=older)
+        found += looks
+        if following is None or time.monotonic() > deadline:
+            return {"runs": found, "next": None if following is None else str(following)}
+        place = following

@@ -1,0 +1,81 @@
+"""``muster gc``: what retention would take, and takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.client import Client
+from shared_store.wording import counted
+
+_PATIENCE = 610.0
+"""Seconds for a part of a pass: the controller's own limit, and some."""
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Examples:  muster gc --dry-run   then   muster gc --older-than 30d")(gc)
+
+
+def gc(
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Take nothing: print what would go, how much, and why the rest is kept.")
+    ] = False,
+    older_than: Annotated[
+        str | None,
+        typer.Option(
+            help="Take what ended longer ago, such as 30d, in queues without a rule. By default: as `muster serve --retention` says.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Delete old jobs, their logs and their runs, where nothing needs them any more.
+
+    A job goes by the rule of its queue (tag muster:retention, such as 30d), else by `muster serve --retention`; of queues without a rule
+    only jobs of the Batch API go, 90 days after their end. Never taken: runs with checkpoints or any other results, parents of clones,
+    teachers, runs of models and of entries of leagues, runs that an unfinished job uses, and archived runs (`muster runs archive`). Your
+    key takes what is yours; a key with all queues takes everything.
+    """
+    with Client.connect() as client:
+        found = [each for part in _parts(client, dry_run, older_than or "") for each in part]
+    gone, kept = [each for each in found if each["jobs"]], [each for each in found if each["kept"]]
+    if as_json:
+        echo_json({"taken": not dry_run, "runs": found}, indent=1)
+        return
+    if dry_run and gone:
+        print_cut(_table(gone))
+    for each in kept:
+        echo(f"kept: run {each['run']}: {'; '.join(each['kept'])}")
+    jobs, runs = sum(len(each["jobs"]) for each in gone), sum(each["whole"] for each in gone)
+    size = sum(each["bytes"] for each in gone)
+    files = counted(sum(each["files"] for each in gone), "file")
+    what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {files}, {size / 2**20:.1f} MiB"
+    echo(f"would take {what}" if dry_run else f"took {what}")
+
+
+def _parts(client: Client, dry_run: bool, older_than: str) -> Iterator[list[dict[str, Any]]]:
+    place: str | None = ""
+    while place is not None:
+        asked = {"after": place, "older_than": older_than}
+        part = (
+            client.get("/api/gc", **asked, seconds=_PATIENCE)
+            if dry_run
+            else client.post("/api/gc", asked, seconds=_PATIENCE)
+        )
+        yield part["runs"]
+        place = part["next"]
+
+
+def _table(found: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in ("RUN", "JOBS", "WHAT GOES", "FILES", "SIZE"):
+        table.add_column(column, no_wrap=True)
+    for each in found:
+        what = "the run" if each["whole"] else "logs" if each["files"] else "history"
+        table.add_row(each["run"], str(len(each["jobs"])), what, str(each["files"]), f"{each['bytes'] / 2**20:.2f} MiB")
+    return table

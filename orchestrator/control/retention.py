@@ -1,0 +1,487 @@
+"""Retention: takes old jobs, their logs and their runs, in small steps, where nothing needs them (:mod:`orchestrator.domain.retention`).
+
+A run goes in three steps, none of which holds a lock while it waits for the store: under :attr:`Reconciler.writing` it is taken, so that no
+request uses it any more; it is looked at again, and moved into the store's trash; then the rows of its jobs are deleted. Whatever dies in
+between leaves the run, or rows of jobs whose run is gone: the next pass deletes these.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import and_, or_, select
+from sqlalchemy.orm import Session
+
+from orchestrator import machine
+from orchestrator.control.peers import Peers
+from orchestrator.control.run_users import RunUsers
+from orchestrator.domain import retention
+from orchestrator.domain.errors import RequestError, Unavailable
+from orchestrator.domain.job import TERMINAL
+from orchestrator.domain.retention import Decision, JobFacts, References, Rules, RunFacts, decide, still_needed
+from orchestrator.persistence import references as rows
+from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
+from orchestrator.persistence.own_models import RetentionStart
+from orchestrator.persistence.session import Database
+from shared_store import contents, trash
+from shared_store.files import DamagedFile
+from shared_store.layout import NAME, Run, Store
+from shared_store.references import references as stored_references
+
+log = logging.getLogger("muster.retention")
+
+A_STEP, A_TRANSACTION = 100, 50
+"""Jobs of a step, and of a transaction that deletes their rows: for that the loop and submissions wait."""
+_INTERVAL, _FIRST = 600.0, 60.0
+"""Seconds between two passes, and until the first one."""
+_REST = 2.0
+"""After a step, a pass rests for so many times the processor time that it took."""
+_REMOVERS = 8
+"""Threads that remove what was thrown away."""
+_FRESH = 600.0
+"""Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
+_LOGGED = 24 * 3600.0
+"""Seconds between two reports of what would go."""
+
+
+class RunNeeded(RequestError):
+    """A run is not deleted; one line that says why."""
+
+    status = 409
+
+
+@dataclass(frozen=True)
+class Whose:
+    """Who asks: nothing but what is theirs goes."""
+
+    name: str
+    queues: frozenset[str] | None = None
+    """None: everything is theirs."""
+
+    def owns(self, owner: str | None, queue: str) -> bool:
+        """Whether a job or a run is theirs."""
+        return self.queues is None or (owner == self.name and queue in self.queues)
+
+
+CONTROLLER = Whose("this controller")
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a step does, or would do, with a run and its jobs."""
+
+    run: str
+    decision: Decision
+    directories: tuple[Path, ...] = ()
+    """That go."""
+    is_missing: bool = False
+    """Whether the store has no such run."""
+
+    def described(self) -> dict[str, Any]:
+        """For the API; sizes in bytes."""
+        sizes = [trash.size_of(path) for path in self.directories]
+        return {
+            "run": self.run,
+            "whole": self.decision.run,
+            "jobs": list(self.decision.jobs),
+            "bytes": sum(size for size, _ in sizes),
+            "files": sum(count for _, count in sizes),
+            "kept": list(self.decision.reasons),
+        }
+
+
+@dataclass
+class Totals:
+    """What a pass has taken."""
+
+    jobs: int = 0
+    runs: int = 0
+    kept: int = 0
+    bytes: int = 0
+
+    def add(self, looks: Sequence[Mapping[str, Any]]) -> None:
+        self.jobs += sum(len(each["jobs"]) for each in looks)
+        self.runs += sum(each["whole"] for each in looks)
+        self.bytes += sum(each["bytes"] for each in looks)
+        self.kept += sum(bool(each["kept"]) for each in looks)
+
+    def __str__(self) -> str:
+        return f"{self.jobs} jobs and {self.runs} runs ({self.bytes / 2**20:.1f} MiB)"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a pass is: everything that ended before was looked at."""
+
+    stopped_at: int = -1
+    job: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.stopped_at}.{self.job}"
+
+    @classmethod
+    def of(cls, text: str) -> Place:
+        """Raises ValueError."""
+        moment, dot, job = text.partition(".")
+        if not dot or not moment.isdecimal() or len(moment) > 16:
+            raise ValueError(f"{text[:100]!r} is no place of a pass")
+        return cls(int(moment), job)
+
+
+@dataclass
+class _Stored:
+    """What in the store needs runs, as it was found."""
+
+    references: References = field(default_factory=References)
+    found_at: float | None = None
+    """Monotonic [s]; None before it was looked for."""
+
+
+class Retention:
+    """Of the jobs of one database and their runs. Any thread may call; all but :meth:`when_due` may wait for the store."""
+
+    def __init__(
+        self,
+        database: Database,
+        store: Store,
+        peers: Peers,
+        users: RunUsers,
+        beginning: Mapping[str, object],
+        writing: threading.Lock,
+        check: Callable[[], None],
+        steady: Callable[[], int],
+        default: float | None = None,
+    ) -> None:
+        """
+        Args:
+            database: Of the jobs.
+            store: Of their runs.
+            peers: The other controllers of the store.
+            users: Who uses a run now.
+            beginning: Runs that requests begin now; changes while ``writing`` is held.
+            writing: Held while something is submitted.
+            check: Raises Unavailable where the store is not there: what is missing may be missing for that.
+            steady: Steady time [ms]; of two clocks, the one that is behind decides.
+            default: Seconds for which jobs of queues without a rule are kept; None: as :class:`Rules` says. Infinity: without end,
+                and nothing goes by itself.
+        """
+        self._database, self._store, self._peers, self._users = database, store, peers, users
+        self._beginning, self._writing, self._check, self._steady = beginning, writing, check, steady
+        self._is_on = default != inf
+        self._default = int(default * 1000) if default is not None and self._is_on else None
+        self._removing = machine.pool("emptying the trash", _REMOVERS)
+        self._stored = _Stored()
+        self._scanning = threading.Lock()
+        self._next, self._next_report = machine.monotonic() + _FIRST, machine.monotonic()
+        self._is_under_way = False
+        self._is_closing = threading.Event()
+
+    # -- passes ---------------------------------------------------------------------------------------------------------
+
+    def start(self, later: Callable[[Callable[[], object]], None]) -> None:
+        """Have ``later`` remove what a killed controller has left in the trash."""
+        later(self._empty_trash)
+
+    def close(self) -> None:
+        """End a pass at its next step."""
+        self._is_closing.set()
+        self._removing.close()
+
+    def when_due(self, later: Callable[[Callable[[], object]], None]) -> None:
+        """Have ``later`` carry out a pass once in a while; returns at once."""
+        if self._is_on and not self._is_under_way and machine.monotonic() > self._next:
+            self._is_under_way = True
+            later(self._pass)
+
+    def _pass(self) -> None:
+        try:
+            with self._database.session() as session:
+                rules = self.rules(session)
+            if rules.is_trial(self._moment()):
+                self._report()
+            else:
+                self.take_all()
+        except (OSError, Unavailable) as error:
+            log.warning("old jobs and runs can't be taken now (%s); trying again later", " ".join(str(error).split()))
+        except Exception:
+            log.exception("old jobs and runs can't be taken now; trying again later")
+        finally:
+            self._next = machine.monotonic() + _INTERVAL
+            self._is_under_way = False
+
+    def take_all(self) -> Totals:
+        """Take everything that may go, step by step. Raises Unavailable, OSError."""
+        totals, place = Totals(), Place()
+        while not self._is_closing.is_set():
+            began = machine.processor_time()
+            looks, following = self.step(place, take=True)
+            totals.add(looks)
+            if following is None:
+                break
+            place = following
+            self._is_closing.wait(_REST * (machine.processor_time() - began))
+        if totals.jobs or totals.runs:
+            log.info(
+                "retention took %s; %d runs are kept that are old enough, see `muster gc --dry-run`",
+                totals,
+                totals.kept,
+            )
+        return totals
+
+    def _report(self) -> None:
+        """In the first days after an upgrade: log what would go, if the rules counted already."""
+        if machine.monotonic() < self._next_report:
+            return
+        self._next_report = machine.monotonic() + _LOGGED
+        totals, place = Totals(), Place()
+        while not self._is_closing.is_set():
+            looks, following = self.step(place, take=False, as_if_new=True)
+            totals.add(looks)
+            if following is None:
+                break
+            place = following
+        log.warning(
+            "retention has taken nothing yet: in the first %d days after the upgrade it only counts, and %s are old enough. "
+            "`muster gc --dry-run` lists them, `muster runs archive RUN` keeps a run, `muster serve --retention off` keeps everything",
+            retention.TRIAL_DAYS,
+            totals,
+        )
+
+    def _empty_trash(self) -> None:
+        try:
+            self._check()
+            trash.empty(self._store)
+        except (OSError, Unavailable) as error:
+            log.warning("the store's trash can't be emptied now (%s)", error)
+
+    # -- one step -------------------------------------------------------------------------------------------------------
+
+    def rules(self, session: Session) -> Rules:
+        """The rules as they are now."""
+        start = session.get(RetentionStart, 1)
+        tagged = [(queue.name, queue.tags.get(retention.TAG)) for queue in session.scalars(select(JobQueue))]
+        queues = {name: _age_of(tag) for name, tag in tagged if tag is not None}
+        return Rules(self._default, queues, start.since if start else 0, batch=self._is_on)
+
+    def step(
+        self,
+        after: Place,
+        *,
+        take: bool,
+        whose: Whose = CONTROLLER,
+        older: int | None = None,
+        most: int = A_STEP,
+        as_if_new: bool = False,
+    ) -> tuple[list[dict[str, Any]], Place | None]:
+        """Look at the next jobs that are old enough, and take what may go.
+
+        Args:
+            after: Where the step before ended.
+            take: Take it; else only look.
+            whose: Who asks.
+            older: Milliseconds for which jobs of queues without a rule are kept, in place of what the rules say.
+            most: Number of jobs.
+            as_if_new: As in a database that was never upgraded.
+
+        Returns:
+            What went, or would go, and what is kept; where the next step begins, None after the last one.
+
+        Raises:
+            Unavailable, OSError: The store or the database can't be used.
+        """
+        moment = self._moment()
+        with self._database.session() as session:
+            rules = self.rules(session)
+            rules = replace(rules, since=0) if as_if_new else rules
+            rules = rules if older is None else replace(rules, default=older)
+            query = select(Job.id, Job.run, Job.stopped_at).where(rows.due(rules, moment))
+            behind = or_(
+                Job.stopped_at > after.stopped_at, and_(Job.stopped_at == after.stopped_at, Job.id < after.job)
+            )
+            query = query.where(behind, Job.stopped_at >= after.stopped_at)
+            if whose.queues is not None:
+                query = query.where(Job.owner == whose.name, Job.queue.in_(whose.queues))
+            # of equal times an array behind its children
+            found = session.execute(query.order_by(Job.stopped_at, Job.id.desc()).limit(most)).all()
+        looks = self._looks({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, whose)
+        wanted = [look.run for look in looks if look.decision.jobs]
+        described = {look.run: look.described() for look in looks if not take or look.decision.reasons}
+        if take and wanted:
+            taken = self._take(wanted)
+            try:
+                again = self._looks(taken, rules, moment, whose)
+                described |= {look.run: look.described() for look in again}
+                self._carry_out(again)
+            finally:
+                for run in taken:
+                    self._users.let_go(run)
+        shown = [each for each in described.values() if each["jobs"] or each["kept"]]
+        return shown, Place(found[-1].stopped_at, found[-1].id) if len(found) == most else None
+
+    def _take(self, runs: Sequence[str]) -> list[str]:
+        """Those of the runs that nobody uses; from now on nobody does."""
+        with self._writing:
+            return [run for run in runs if run not in self._beginning and self._users.take(run)]
+
+    def _looks(self, runs: Collection[str], rules: Rules, moment: int, whose: Whose) -> list[Look]:
+        """What may go of these runs and their jobs. Raises Unavailable, OSError."""
+        if not runs:
+            return []
+        stored = self._stored_references(_FRESH)
+        facts = self.facts(runs)
+        with self._database.session() as session:  # after the store: what was submitted meanwhile counts
+            jobs = self._jobs(session, runs, rules, whose)
+            needed = References.of(rows.references(session, runs, rules, moment)) | stored
+        return [self._look(run, facts[run], jobs[run], needed, moment) for run in sorted(runs)]
+
+    def _jobs(self, session: Session, runs: Collection[str], rules: Rules, whose: Whose) -> dict[str, list[JobFacts]]:
+        """The jobs of the runs; those of others, and all of a run that is another's, never go."""
+        jobs = rows.jobs_of_runs(session, runs, rules)
+        if whose.queues is None:
+            return jobs
+        owners = session.execute(select(Job.id, Job.owner, Job.queue).where(Job.run.in_(runs)))
+        own = {job for job, owner, queue in owners if whose.owns(owner, queue)}
+        records = session.scalars(select(RunRecord).where(RunRecord.name.in_(runs)))
+        others = {record.name for record in records if not whose.owns(record.owner, record.queue)}
+        return {
+            run: [each if each.id in own and run not in others else replace(each, due_at=None) for each in of_run]
+            for run, of_run in jobs.items()
+        }
+
+    def _look(
+        self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References, moment: int
+    ) -> Look:
+        decision = decide(facts, jobs, needed, moment)
+        if facts is None:
+            return Look(name, decision, is_missing=True)
+        run = self._store.run(name)
+        if decision.run:
+            return Look(name, decision, (run.path,))
+        return Look(name, decision, tuple(path for job in decision.jobs for path in contents.job_directories(run, job)))
+
+    def _carry_out(self, looks: Sequence[Look]) -> None:
+        """Move into the trash what goes, delete the rows, and empty the trash. Raises Unavailable, OSError."""
+        self._check()
+        thrown = trash.throw_away(self._store, *(path for look in looks for path in look.directories))
+        self._check()
+        # an array behind its children
+        jobs = sorted((job for look in looks for job in look.decision.jobs), key=lambda job: ":" not in job)
+        gone = [look.run for look in looks if look.decision.run or look.is_missing]
+        for start in range(0, len(jobs), A_TRANSACTION):
+            with self._writing, self._database.session() as session:
+                rows.forget_jobs(session, jobs[start : start + A_TRANSACTION])
+                if start + A_TRANSACTION >= len(jobs):
+                    rows.forget_owners(session, gone)
+        self._remove(thrown)
+
+    def _remove(self, thrown: Sequence[Path]) -> None:
+        """Remove what was thrown away, several at once: each waits for the file system's journal."""
+        wait([self._removing.submit(partial(trash.remove, path)) for path in thrown])
+
+    # -- what is in the store -------------------------------------------------------------------------------------------
+
+    def facts(self, runs: Collection[str]) -> dict[str, RunFacts | None]:
+        """Each run as the store has it now; None where there is none. Raises Unavailable, OSError."""
+        self._check()
+        found = {name: self._facts(self._store.run(name)) for name in runs}
+        self._check()
+        return found
+
+    def _facts(self, run: Run) -> RunFacts | None:
+        try:
+            inside = contents.contents(run)
+            archived = contents.archived(run)
+            writer = self._peers.writer(run)
+        except FileNotFoundError:
+            return None
+        except (DamagedFile, ValueError) as error:
+            return RunFacts(run.name, damage=str(error))
+        return RunFacts(run.name, inside.results, inside.logged, _by_whom(archived), writer)
+
+    def _stored_references(self, fresh: float) -> References:
+        """What in the store needs runs, as it was at most so many seconds ago. Raises Unavailable, OSError."""
+        with self._scanning:
+            stored = self._stored
+            if stored.found_at is None or machine.monotonic() - stored.found_at > fresh:
+                began = machine.monotonic()
+                self._check()
+                needed, unreadable = stored_references(self._store)
+                self._check()
+                references = References.of((retention.Reference(*each) for each in needed), unreadable)
+                self._stored = _Stored(references, began)
+            return self._stored.references
+
+    def look_again(self) -> None:
+        """Something in the store needs other runs than before."""
+        with self._scanning:
+            self._stored = _Stored()
+
+    # -- one run, as a person asks --------------------------------------------------------------------------------------
+
+    def needs(self, name: str) -> tuple[RunFacts | None, list[str]]:
+        """A run as the store has it, and why it may not be deleted. Raises Unavailable, OSError."""
+        stored, facts, moment = self._stored_references(0.0), self.facts([name])[name], self._moment()
+        with self._database.session() as session:
+            rules = self.rules(session)
+            jobs = rows.jobs_of_runs(session, [name], rules)[name]
+            needed = References.of(rows.references(session, [name], rules, moment)) | stored
+        return facts, [] if facts is None else still_needed(facts, jobs, needed)
+
+    def open_job(self, name: str) -> str | None:
+        """A job of the run that has not ended."""
+        with self._database.session() as session:
+            query = select(Job.id).where(Job.run == name, Job.status.not_in(TERMINAL))
+            return session.scalars(query.limit(1)).first()
+
+    def delete(self, name: str) -> dict[str, Any]:
+        """Delete a run with all that it holds; its jobs stay in the history. Returns its size, in ``bytes`` and ``files``.
+
+        Raises:
+            RunNeeded: Something needs it, or a request uses it.
+            Unavailable, OSError: The store or the database can't be used.
+        """
+        with self.alone(name):
+            facts, reasons = self.needs(name)
+            if reasons:
+                raise RunNeeded(f"run {name} is kept: {'; '.join(reasons)}")
+            path = self._store.run(name).path
+            size, files = (0, 0) if facts is None else trash.size_of(path)
+            thrown = trash.throw_away(self._store, path)
+            with self._writing, self._database.session() as session:
+                if (record := session.get(RunRecord, name)) is not None:
+                    session.delete(record)
+        self._remove(thrown)
+        return {"run": name, "bytes": size, "files": files}
+
+    @contextmanager
+    def alone(self, name: str) -> Iterator[None]:
+        """A block in which nobody else uses the run, and in which no job begins that writes it. Raises RunNeeded where somebody does."""
+        if not self._take([name]):
+            raise RunNeeded(f"run {name} is used by another request now; try again in a moment")
+        try:
+            yield
+        finally:
+            self._users.let_go(name)
+
+    def _moment(self) -> int:
+        return min(now(), self._steady())
+
+
+def _age_of(tag: str) -> int | None:
+    try:
+        return retention.age_of(tag)
+    except ValueError:  # an older Muster took any text
+        return None
+
+
+def _by_whom(archived: Mapping[str, Any] | None) -> str | None:
+    return None if archived is None else f"by {archived.get('by', 'an unknown key')}"

@@ -1,0 +1,86 @@
+"""Who uses a run now: requests that read it, or the one that deletes it. Of these, the first keeps out the others.
+
+A request that continues, clones, registers or cites a run uses it from its first look at the store until its answer. A job that was
+submitted needs no entry: its row is what keeps its runs (:mod:`orchestrator.persistence.references`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from orchestrator import machine
+from orchestrator.domain.errors import RequestError
+
+_REMEMBERED = 900.0
+"""Seconds for which a deletion is remembered: longer than any request takes that has read the store before."""
+
+
+class RunInUse(RequestError):
+    """The run is being deleted, or archived, now; one line."""
+
+    status = 409
+
+
+class RunUsers:
+    """Of the runs of one controller. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = Counter[str]()
+        self._taken: set[str] = set()
+        self._changed: dict[str, tuple[int, float]] = {}
+        """By run: its version, and when it got that (monotonic [s]); in the order of these moments."""
+        self._version = 0
+
+    @contextmanager
+    def using(self, run: str) -> Iterator[None]:
+        """A block in which nobody deletes the run. Raises RunInUse where that has begun."""
+        with self._lock:
+            self._check(run)
+            self._users[run] += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users[run] -= 1
+                if not self._users[run]:
+                    del self._users[run]
+
+    def check(self, run: str) -> None:
+        """Raises RunInUse where the run is being deleted or archived."""
+        with self._lock:
+            self._check(run)
+
+    def version(self, run: str) -> int:
+        """Another number after each deletion of the run: what was read of the store before counts no more."""
+        with self._lock:
+            return self._changed.get(run, (0, 0.0))[0]
+
+    def take(self, run: str) -> bool:
+        """Have the run for oneself until :meth:`let_go`; False where somebody uses it."""
+        moment = machine.monotonic()
+        with self._lock:
+            if run in self._users or run in self._taken:
+                return False
+            self._taken.add(run)
+            self._version += 1
+            self._changed.pop(run, None)
+            self._changed[run] = self._version, moment
+            while self._changed:
+                oldest = next(iter(self._changed))
+                if moment - self._changed[oldest][1] < _REMEMBERED or oldest in self._taken:
+                    break
+                del self._changed[oldest]
+            return True
+
+    def let_go(self, run: str) -> None:
+        """Others may use it again."""
+        with self._lock:
+            self._taken.discard(run)
+
+    def _check(self, run: str) -> None:
+        if run in self._taken:
+            raise RunInUse(f"run {run} is being deleted or archived now; try again in a moment")

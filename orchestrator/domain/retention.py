@@ -1,0 +1,193 @@
+"""What may go of old jobs and runs, and what is still needed, and why: pure decisions over facts.
+
+:func:`still_needed` is the one place that knows for what a run is kept. A new kind of thing that needs runs adds
+:class:`Reference` values where they are collected (:mod:`shared_store.references`, :mod:`orchestrator.persistence.references`);
+nothing changes here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+A_DAY = 24 * 3600 * 1000
+"""Milliseconds."""
+BATCH_DAYS = 90
+"""For which a job of the Batch API is kept where nobody has set a rule."""
+TRIAL_DAYS = 7
+"""After an upgrade, in which a controller only logs what it would take."""
+TAG = "muster:retention"
+"""Tag of a job queue: its rule."""
+OFF = "off"
+"""The rule that keeps everything."""
+_UNITS = {"m": 60_000, "h": 3_600_000, "d": A_DAY}
+
+
+def age_of(rule: str) -> int | None:
+    """Milliseconds of a rule such as ``90d``, ``36h`` or ``45m``; None of :data:`OFF`. Raises ValueError, in one line."""
+    if rule == OFF:
+        return None
+    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([mhd])", rule.strip())
+    if match is None:
+        raise ValueError(f"{rule[:40]!r} is no time; expected one such as 90d, 36h or 45m, or {OFF} to keep everything")
+    return int(float(match[1]) * _UNITS[match[2]])
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Something needs a run, or a job."""
+
+    kind: Literal["run", "job"]
+    name: str
+    """Of the run; id of the job."""
+    by: str
+    """What needs it, in words that follow "it is kept, since"."""
+
+
+@dataclass(frozen=True)
+class References:
+    """Everything that needs a run or a job."""
+
+    found: Mapping[tuple[str, str], Sequence[str]] = field(default_factory=dict)
+    """By kind and name: what needs it."""
+    unreadable: tuple[str, ...] = ()
+    """What could not be read, and may need any run that has results."""
+
+    @classmethod
+    def of(cls, references: Iterable[Reference], unreadable: Iterable[str] = ()) -> References:
+        found: dict[tuple[str, str], list[str]] = {}
+        for each in references:
+            found.setdefault((each.kind, each.name), []).append(each.by)
+        return cls(found, tuple(unreadable))
+
+    def to(self, kind: Literal["run", "job"], name: str) -> Sequence[str]:
+        """What needs it."""
+        return self.found.get((kind, name), ())
+
+    def __or__(self, other: References) -> References:
+        keys = self.found.keys() | other.found.keys()
+        found = {key: [*self.found.get(key, ()), *other.found.get(key, ())] for key in keys}
+        return References(found, (*self.unreadable, *other.unreadable))
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """A run, as the store has it."""
+
+    name: str
+    results: tuple[str, ...] = ()
+    """Files and directories that are neither Muster's records of the run nor its logs and outcomes."""
+    logged: frozenset[str] = frozenset()
+    """Jobs that have left logs or outcomes there."""
+    archived: str | None = None
+    """By whom and when; None where it is not archived."""
+    writer: str | None = None
+    """The attempt of another controller that writes it, in words."""
+    damage: str | None = None
+    """Why it can't be read."""
+
+
+@dataclass(frozen=True)
+class JobFacts:
+    """A job of a run, as the database has it."""
+
+    id: str
+    is_open: bool = False
+    due_at: int | None = None
+    """From when its rule lets it go (Unix time [ms]); None: never."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What goes of a run and its jobs."""
+
+    run: bool
+    """Whether the whole run goes."""
+    jobs: tuple[str, ...]
+    """The jobs that go, with their logs and outcomes."""
+    reasons: tuple[str, ...] = ()
+    """Why the rest stays; of what is due alone."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How long jobs are kept. Times are Unix milliseconds.
+
+    Attributes:
+        default: Of queues without a rule: for so many milliseconds; None: jobs of the Batch API for :data:`BATCH_DAYS`, where
+            ``batch`` says so, and all others without end.
+        queues: The rule of each queue that has one; None: without end.
+        since: When this database was upgraded to a Muster with these rules; 0 where it was made by one. Of jobs without a rule the time
+            counts from then on.
+        batch: Whether jobs of the Batch API go without a rule.
+    """
+
+    default: int | None = None
+    queues: Mapping[str, int | None] = field(default_factory=dict)
+    since: int = 0
+    batch: bool = True
+
+    def due_at(self, queue: str, from_yaml: bool, ended_at: int | None) -> int | None:
+        """From when a job may go; None where it may never, or has not ended."""
+        if ended_at is None:
+            return None
+        age = self.queues.get(queue, self.default)
+        if age is not None:
+            return ended_at + age
+        if queue in self.queues or from_yaml or not self.batch:
+            return None
+        return max(ended_at, self.since) + BATCH_DAYS * A_DAY
+
+    def batch_limit(self, moment: int) -> int | None:
+        """Before when a job of the Batch API without a rule must have ended to go at ``moment``; None where none may go yet."""
+        limit = moment - BATCH_DAYS * A_DAY
+        return limit if self.batch and limit >= self.since else None
+
+    def is_trial(self, moment: int) -> bool:
+        """Whether nothing goes by itself yet."""
+        return moment < self.since + TRIAL_DAYS * A_DAY
+
+
+def still_needed(run: RunFacts, jobs: Collection[JobFacts], references: References) -> list[str]:
+    """Why nothing of a run may go, whoever asks for it; empty where it may."""
+    reasons = [f"job {each.id} has not ended" for each in jobs if each.is_open]
+    reasons += references.to("run", run.name)
+    reasons += [by for each in jobs for by in references.to("job", each.id)]
+    if run.archived is not None:
+        reasons.append(f"it is archived ({run.archived})")
+    if run.writer is not None:
+        reasons.append(f"{run.writer} writes it")
+    if run.damage is not None:
+        reasons.append(f"it can't be read ({run.damage})")
+    if run.results:
+        reasons += [f"{each}, and may need it" for each in references.unreadable]
+    return list(dict.fromkeys(reasons))
+
+
+def decide(run: RunFacts | None, jobs: Sequence[JobFacts], references: References, moment: int) -> Decision:
+    """What goes of a run and its jobs at a moment (Unix time [ms]) by the rules.
+
+    Args:
+        run: None where the store has no such run, because its jobs never started or it was deleted.
+        jobs: All of its jobs that the database has.
+        references: What needs them.
+        moment: Now.
+    """
+    due = tuple(each.id for each in jobs if not each.is_open and each.due_at is not None and each.due_at <= moment)
+    if not due:
+        return Decision(False, ())
+    if run is None:
+        kept = [by for job in due for by in references.to("job", job)]
+        return Decision(False, tuple(job for job in due if not references.to("job", job)), tuple(dict.fromkeys(kept)))
+    if reasons := still_needed(run, jobs, references):
+        return Decision(False, (), tuple(reasons))
+    reasons = []
+    if run.results:
+        reasons.append(f"it holds {', '.join(run.results[:3])}{', …' * (len(run.results) > 3)}")
+    if strange := run.logged - {each.id for each in jobs}:
+        reasons.append(f"it holds logs of job {min(strange)}, which is not in this controller's database")
+    if waits := [each for each in jobs if each.id not in due]:
+        reasons.append(f"job {waits[0].id} of it is kept longer")
+    return Decision(not reasons, due, tuple(reasons))

@@ -1,0 +1,136 @@
+"""What in the database needs which run or job, and the facts about jobs on which retention decides."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+from sqlalchemy import ColumnElement, and_, delete, false, not_, or_, select
+from sqlalchemy.orm import Session, aliased
+
+from orchestrator.domain.job import TERMINAL
+from orchestrator.domain.retention import JobFacts, Reference, Rules
+from orchestrator.persistence.job_counts import note_deleted
+from orchestrator.persistence.models import (
+    Attempt,
+    AutomaticEvaluation,
+    Dependency,
+    Job,
+    JobDefinition,
+    Node,
+    RunRecord,
+    WebhookDelivery,
+)
+from orchestrator.persistence.own_models import RunUse
+
+_SUBMITTED = "MUSTER_DIRECTORY"
+"""Variable that only definitions have which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""
+
+
+def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules) -> dict[str, list[JobFacts]]:
+    """All jobs of these runs, by run."""
+    found: dict[str, list[JobFacts]] = {run: [] for run in runs}
+    query = select(Job.id, Job.run, Job.status, Job.queue, Job.from_yaml, Job.stopped_at).where(Job.run.in_(runs))
+    for job, run, status, queue, from_yaml, stopped_at in session.execute(query.order_by(Job.created_at, Job.id)):
+        due_at = rules.due_at(queue, from_yaml, stopped_at)
+        found[run].append(JobFacts(job, status not in TERMINAL, due_at))
+    return found
+
+
+def references(session: Session, runs: Collection[str], rules: Rules, moment: int) -> Iterator[Reference]:
+    """What needs these runs, or jobs of them, at a moment (Unix time [ms])."""
+    is_open = Job.status.not_in(TERMINAL)
+    uses = select(RunUse.run, Job.id).join(Job, Job.id == RunUse.job_id)
+    for used, job in session.execute(uses.where(RunUse.run.in_(runs), is_open)):
+        yield Reference("run", used, f"job {job} needs it")
+    evaluated = select(AutomaticEvaluation.run, AutomaticEvaluation.job).where(AutomaticEvaluation.open)
+    for evaluation in session.execute(evaluated.where(AutomaticEvaluation.run.in_(runs))):
+        yield Reference("run", evaluation.run, f"job {evaluation.job} evaluates it")
+    ids = select(Job.id).where(Job.run.in_(runs))
+    waits = select(Dependency.on_id, Dependency.job_id).join(Job, Job.id == Dependency.job_id)
+    for job, waiting in session.execute(waits.where(Dependency.on_id.in_(ids), is_open)):
+        yield Reference("job", job, f"job {waiting} waits for it")
+    array, child = aliased(Job), aliased(Job)
+    of_array = select(Job.id, array.id).join(array, array.id == Job.parent).where(Job.run.in_(runs))
+    for job, parent in session.execute(of_array.where(array.status.not_in(TERMINAL))):
+        yield Reference("job", job, f"it belongs to array {parent}, which has not ended")
+    kept = select(child.id).where(
+        child.parent == Job.id, or_(child.stopped_at.is_(None), not_(due(rules, moment, child)))
+    )
+    for job in session.scalars(select(Job.id).where(Job.run.in_(runs), Job.kind == "array", kept.exists())):
+        yield Reference("job", job, f"children of array {job} are kept longer")
+
+
+def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
+    """Which jobs may go at a moment (Unix time [ms]), as far as rules and times tell."""
+    each = [
+        and_(job.queue == queue, job.stopped_at <= moment - age)
+        for queue, age in rules.queues.items()
+        if age is not None
+    ]
+    others = job.queue.not_in(list(rules.queues))
+    if rules.default is not None:
+        each.append(and_(others, job.stopped_at <= moment - rules.default))
+    elif (limit := rules.batch_limit(moment)) is not None:
+        each.append(and_(others, job.from_yaml.is_(False), job.stopped_at <= limit))
+    return or_(false(), *each)
+
+
+def forget_jobs(session: Session, ids: Collection[str]) -> int:
+    """Delete the history of these jobs, but for those that a job waits for by now, and arrays with other children; returns how many were.
+
+    Definitions that nothing else needs go with them.
+    """
+    open_jobs = select(Job.id).where(Job.status.not_in(TERMINAL))
+    needed = select(Dependency.on_id).where(Dependency.on_id.in_(ids), Dependency.job_id.in_(open_jobs))
+    child = aliased(Job)
+    # the children of an array have their definition from it
+    has_others = select(child.id).where(child.parent == Job.id, child.id.not_in(ids)).exists()
+    query = select(Job.id, Job.parent, Job.queue, Job.status, Job.definition).where(Job.id.in_(ids))
+    found = session.execute(query.where(Job.status.in_(TERMINAL), Job.id.not_in(needed), not_(has_others))).all()
+    gone = [row.id for row in found]
+    note_deleted(session, [(row.parent, row.queue, row.status) for row in found])
+    session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(gone), WebhookDelivery.next_at.is_(None)))
+    session.execute(
+        delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(gone), AutomaticEvaluation.open.is_(False))
+    )
+    for table, column in (
+        (Node, Node.job_id),
+        (Attempt, Attempt.job_id),
+        (Dependency, Dependency.job_id),
+        (RunUse, RunUse.job_id),
+        (Job, Job.id),
+    ):
+        session.execute(delete(table).where(column.in_(gone)))
+    _forget_definitions(session, {row.definition for row in found})
+    return len(gone)
+
+
+def forget_owners(session: Session, runs: Collection[str]) -> None:
+    """Forget the owners of runs that are not in the store any more and that no job is about to create."""
+    named = select(Job.run).where(Job.run.in_(runs))
+    session.execute(delete(RunRecord).where(RunRecord.name.in_(runs), RunRecord.name.not_in(named)))
+
+
+def _forget_definitions(session: Session, arns: Collection[str]) -> None:
+    """Delete those of these definitions that no job has, and that no user needs: a submission of Muster's made it, or it is deregistered.
+
+    The newest revision that a client registered stays, so that no number is given twice.
+    """
+    used = set(session.scalars(select(Job.definition).where(Job.definition.in_(arns)).distinct()))
+    for arn in set(arns) - used:
+        name, _, revision = arn.rpartition("job-definition/")[2].rpartition(":")
+        found = session.get(JobDefinition, (name, int(revision))) if revision.isdecimal() else None
+        if found is None:
+            continue
+        newest = select(JobDefinition.revision).where(JobDefinition.name == name)
+        is_newest = session.scalar(newest.order_by(JobDefinition.revision.desc()).limit(1)) == found.revision
+        if _is_of_submission(found) or (found.status == "INACTIVE" and not is_newest):
+            session.delete(found)
+
+
+def _is_of_submission(definition: JobDefinition) -> bool:
+    """Whether `muster submit`, `run` or the like has made it."""
+    ranges = (definition.document.get("nodeProperties") or {}).get("nodeRangeProperties") or []
+    environments = ((each.get("container") or {}).get("environment") or [] for each in ranges)
+    names = {pair.get("name") for environment in environments for pair in environment}
+    return {_SUBMITTED, "MUSTER_SPEC"} <= names

@@ -1,0 +1,535 @@
+"""Retention on a database and a store: what a pass takes, what a death at each step leaves, and who is in its way."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select, update
+
+from orchestrator.control import retention as module
+from orchestrator.control.peers import Peers
+from orchestrator.control.retention import Place, Retention, RunNeeded, Whose
+from orchestrator.control.run_users import RunInUse, RunUsers
+from orchestrator.domain.retention import A_DAY, BATCH_DAYS
+from orchestrator.persistence import references
+from orchestrator.persistence.models import (
+    Attempt,
+    Base,
+    Dependency,
+    Job,
+    JobDefinition,
+    JobQueue,
+    Node,
+    RunRecord,
+    now,
+)
+from orchestrator.persistence.own_models import RetentionStart, RunUse
+from orchestrator.persistence.session import Database
+from shared_store import contents, trash
+from shared_store.files import sync_directory, write_json
+from shared_store.layout import Store
+from tests.support.orchestrator.rows import job
+
+LONG_AGO = now() - (BATCH_DAYS + 1) * A_DAY
+ARN = "arn:aws:batch:us-east-1:000000000000:job-definition/"
+
+
+class World:
+    """A database and a store, with jobs that ended long ago."""
+
+    def __init__(self, home: Path) -> None:
+        self.database = Database(f"sqlite:///{home}/muster.db")
+        self.store = Store(home / "store").open()
+        self.peers = Peers(self.store, home)
+        self.users, self.writing = RunUsers(), threading.Lock()
+        self.beginning: dict[str, object] = {}
+        self.absent: Callable[[], None] = lambda: None
+
+    def retention(self, default: float | None = None) -> Retention:
+        return Retention(
+            self.database,
+            self.store,
+            self.peers,
+            self.users,
+            self.beginning,
+            self.writing,
+            lambda: self.absent(),
+            now,
+            default,
+        )
+
+    def ended(self, name: str, *, run: str | None = None, directory: bool = True, **facts: Any) -> None:
+        """A job with an attempt, a node, an owner and a run with a log."""
+        run = run or name
+        values = {"status": "SUCCEEDED", "stopped_at": LONG_AGO, "owner": "key a", "run": run, **facts}
+        with self.database.session() as session:
+            session.add(job(name, **values))
+            session.add(Attempt(job_id=name, number=1, epoch=1, nodes=[Node(index=0, host="h")], stopped_at=1))
+            session.merge(RunRecord(name=run, queue="default", owner=values["owner"]))
+        if directory:
+            place = self.store.run(run)
+            write_json(place.path / "run.json", {"run": run, "spec": None})
+            place.logs(name, 1).mkdir(parents=True)
+            place.log(name, 1, 0).write_bytes(b"x" * 1000)
+            write_json(place.outcome(name, 1, 0), {})
+
+    def change(self, name: str, **values: Any) -> None:
+        with self.database.session() as session:
+            session.execute(update(Job).where(Job.id == name).values(values))
+
+    def add(self, *rows: Base) -> None:
+        with self.database.session() as session:
+            session.add_all(rows)
+
+    def jobs(self) -> list[str]:
+        with self.database.session() as session:
+            return sorted(session.scalars(select(Job.id)))
+
+    def runs(self) -> list[str]:
+        return sorted(run.name for run in self.store.runs())
+
+    def rows(self) -> int:
+        """Of all tables that a job adds to."""
+        tables = (Job, Attempt, Node, Dependency, RunUse, RunRecord)
+        with self.database.session() as session:
+            return sum(session.scalar(select(func.count()).select_from(table)) or 0 for table in tables)
+
+    def trashed(self) -> list[str]:
+        folder = self.store.path / "trash"
+        return os.listdir(folder) if folder.exists() else []
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    world = World(tmp_path)
+    yield world
+    world.database.close()
+
+
+def reasons(world: World, **options: Any) -> dict[str, str]:
+    """Of each run that is kept, why."""
+    looks, _ = world.retention().step(Place(), take=False, **options)
+    return {each["run"]: "; ".join(each["kept"]) for each in looks if each["kept"]}
+
+
+def test_a_pass_takes_old_jobs_of_the_batch_api_with_their_runs_and_nothing_else(world: World) -> None:
+    world.ended("old")
+    world.ended("young", stopped_at=now())
+    world.ended("native", from_yaml=True)
+    world.ended("never-ran", directory=False)
+    world.add(job("waits", status="RUNNABLE", run="waits"))
+    totals = world.retention().take_all()
+    assert (totals.jobs, totals.runs, totals.bytes > 1000) == (2, 1, True)
+    assert world.jobs() == ["native", "waits", "young"] and world.runs() == ["native", "young"]
+    assert world.trashed() == []
+    with world.database.session() as session:
+        assert sorted(session.scalars(select(RunRecord.name))) == ["native", "young"]
+        assert sorted(session.scalars(select(Node.job_id))) == sorted(session.scalars(select(Attempt.job_id)))
+
+
+def test_a_dry_run_tells_what_would_go_and_how_much_and_takes_nothing(world: World) -> None:
+    world.ended("old")
+    world.ended("kept")
+    contents.archive(world.store.run("kept"), "key a")
+    looks, following = world.retention().step(Place(), take=False)
+    assert following is None and world.jobs() == ["kept", "old"] and world.runs() == ["kept", "old"]
+    found = {each["run"]: each for each in looks}
+    assert (found["old"]["jobs"], found["old"]["whole"], found["old"]["files"]) == (["old"], True, 3)
+    assert found["old"]["bytes"] > 1000 and found["old"]["kept"] == []
+    assert (found["kept"]["jobs"], found["kept"]["kept"]) == ([], ["it is archived (by key a)"])
+
+
+def test_results_keep_the_run_and_its_logs_go_with_the_job(world: World) -> None:
+    world.ended("old")
+    (world.store.run("old").path / "results.csv").write_text("1,2")
+    world.retention().take_all()
+    run = world.store.run("old").path
+    assert world.jobs() == [] and sorted(os.listdir(run)) == ["logs", "outcomes", "results.csv", "run.json"]
+    assert os.listdir(run / "logs") == os.listdir(run / "outcomes") == []
+    with world.database.session() as session:
+        assert session.scalars(select(RunRecord.name)).all() == ["old"], "it still has its owner"
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda w: w.add(job("next", run="old", status="PENDING")), "job next has not ended"),
+        (lambda w: w.add(job("reads", status="RUNNABLE"), RunUse(job_id="reads", run="old")), "job reads needs it"),
+        (
+            lambda w: w.add(job("later", status="PENDING"), Dependency(job_id="later", on_id="old")),
+            "job later waits for it",
+        ),
+        (lambda w: contents.archive(w.store.run("old"), "key a"), "archived"),
+        (lambda w: (w.store.run("old").path / "metrics").symlink_to("/"), "can't be read"),
+    ],
+)
+def test_a_run_that_something_needs_is_kept_with_its_jobs(
+    world: World, make: Callable[[World], object], reason: str
+) -> None:
+    world.ended("old")
+    make(world)
+    before = world.rows()
+    assert reason in reasons(world)["old"]
+    world.retention().take_all()
+    assert world.rows() == before and (world.store.run("old").path / "logs" / "old").is_dir()
+    with pytest.raises(RunNeeded, match=reason):
+        world.retention().delete("old")
+    assert (world.store.run("old").path / "logs" / "old").is_dir()
+
+
+def test_a_reader_that_has_ended_keeps_nothing(world: World) -> None:
+    world.ended("old")
+    world.add(job("reads", status="FAILED", stopped_at=now()), RunUse(job_id="reads", run="old"))
+    world.retention().take_all()
+    assert world.jobs() == ["reads"] and world.runs() == []
+
+
+def test_an_array_goes_after_its_children_and_with_all_of_them(world: World) -> None:
+    world.ended("p", kind="array", directory=False)
+    for index in range(3):
+        world.ended(f"p:{index}", parent="p", run=f"p-{index}", node_properties=None)
+    world.change("p:2", stopped_at=now())
+    assert world.retention().take_all().jobs == 2
+    assert world.jobs() == ["p", "p:2"], "the child has its definition from the array"
+    world.change("p:2", stopped_at=LONG_AGO + 5)
+    world.retention().take_all()
+    world.retention().take_all()
+    assert world.jobs() == [] and world.runs() == []
+
+
+def test_children_of_an_array_that_has_not_ended_are_kept(world: World) -> None:
+    world.add(job("p", kind="array", status="PENDING"))
+    world.ended("p:0", parent="p", run="p-0", node_properties=None)
+    assert "array p, which has not ended" in reasons(world)["p-0"]
+    assert world.retention().take_all().jobs == 0
+
+
+def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_REST", 0.0)
+    for number in range(17):
+        world.ended(f"j{number:02}", stopped_at=LONG_AGO + number // 5)
+        if number % 4 == 0:
+            contents.archive(world.store.run(f"j{number:02}"), "key a")
+    monkeypatch.setattr(module, "A_STEP", 3)
+    place: Place | None = Place()
+    seen: list[str] = []
+    while place is not None:
+        looks, place = world.retention().step(place, take=False, most=3)
+        place = None if place is None else Place.of(str(place))
+        seen += [each["run"] for each in looks]
+    assert sorted(seen) == [f"j{number:02}" for number in range(17)]
+    place = Place()
+    while place is not None:
+        _, place = world.retention().step(place, take=True, most=3)
+    assert world.jobs() == world.runs() == [f"j{number:02}" for number in range(0, 17, 4)]
+    counts = world.database.counts
+    with world.database.session() as session:
+        before = counts.of()
+        counts.load(session)
+    assert before == counts.of() == {("default", "SUCCEEDED"): 5}, "each was counted off once"
+
+
+class Killed(BaseException):
+    """The controller dies."""
+
+
+@pytest.mark.parametrize("step", range(1, 12))
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_it(
+    world: World, monkeypatch: pytest.MonkeyPatch, step: int, whole: bool
+) -> None:
+    """At each of the calls that change something, before it and after it."""
+    world.ended("old")
+    if not whole:
+        (world.store.run("old").path / "results.csv").write_text("1")
+    calls = [0]
+
+    def dying(body: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            for part in (None, lambda: body(*arguments, **named)):
+                calls[0] += 1
+                if calls[0] == step:
+                    raise Killed
+                result = part() if part else None
+            return result
+
+        return call
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shared_store.trash.os.rename", dying(os.rename))
+        patched.setattr("shared_store.trash.sync_directory", dying(sync_directory))
+        patched.setattr("shared_store.trash.shutil.rmtree", dying(shutil.rmtree))
+        patched.setattr("orchestrator.persistence.references.forget_jobs", dying(references.forget_jobs))
+        try:
+            world.retention().take_all()
+        except Killed:
+            run = world.store.run("old").path
+            if whole:
+                in_place, in_trash = run.exists(), [each for each in world.trashed() if "old" in each]
+                assert in_place != bool(in_trash) or (not in_place and calls[0] > 6)
+                if in_place:
+                    assert sorted(os.listdir(run)) == ["logs", "outcomes", "run.json"], "nothing of it is missing"
+            else:
+                assert (run / "results.csv").is_file()
+    world.users = RunUsers()  # another process
+    later: list[Callable[[], object]] = []
+    following = world.retention()
+    following.start(later.append)
+    for each in later:
+        each()
+    following.take_all()
+    assert world.jobs() == [] and world.trashed() == []
+    assert world.runs() == ([] if whole else ["old"])
+    with world.database.session() as session:
+        assert session.scalars(select(RunRecord.name)).all() == ([] if whole else ["old"])
+
+
+def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
+    world.ended("old")
+
+    def away() -> None:
+        raise OSError("the volume is not there")
+
+    world.absent = away
+    with pytest.raises(OSError):
+        world.retention().take_all()
+    assert world.jobs() == ["old"] and world.runs() == ["old"]
+    os.rename(world.store.path, world.store.path.with_name("gone"))  # it vanishes between two looks
+    checks = [0]
+
+    def vanishing() -> None:
+        checks[0] += 1
+        if checks[0] > 3:
+            raise OSError("the volume is not there")
+
+    world.absent = vanishing
+    with pytest.raises(OSError):
+        world.retention().take_all()
+    assert world.jobs() == ["old"]
+
+
+# -- races ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_that_a_request_uses_is_not_taken_and_one_that_is_taken_is_not_used(world: World) -> None:
+    world.ended("old")
+    with world.users.using("old"):
+        assert world.retention().take_all().jobs == 0
+        with pytest.raises(RunNeeded, match="used by another request"):
+            world.retention().delete("old")
+    version = world.users.version("old")
+    with world.retention().alone("old"):
+        with pytest.raises(RunInUse), world.users.using("old"):
+            pass
+        with pytest.raises(RunInUse):
+            world.users.check("old")
+        assert world.retention().take_all().jobs == 0
+    assert world.users.version("old") != version, "what was read before counts no more"
+    world.users.check("old")
+    world.beginning["old"] = object()
+    assert world.retention().take_all().jobs == 0
+    del world.beginning["old"]
+    assert world.retention().take_all().jobs == 1
+
+
+def test_a_job_that_is_submitted_between_look_and_take_keeps_its_run(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.ended("old")
+    world.ended("other")
+    take = Retention._take
+
+    def late(self: Retention, runs: Any) -> Any:
+        assert sorted(runs) == ["old", "other"]
+        world.add(job("resumes", run="old", status="RUNNABLE"))
+        return take(self, runs)
+
+    monkeypatch.setattr(Retention, "_take", late)
+    world.retention().take_all()
+    assert world.jobs() == ["old", "resumes"] and world.runs() == ["old"]
+
+
+def test_a_job_that_begins_to_wait_for_one_that_is_being_taken_keeps_its_row(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.ended("old")
+    throw = trash.throw_away
+
+    def late(store: Store, *paths: Path) -> list[Path]:
+        world.add(job("waits", status="PENDING"), Dependency(job_id="waits", on_id="old"))
+        return throw(store, *paths)
+
+    monkeypatch.setattr(trash, "throw_away", late)
+    world.retention().take_all()
+    assert world.jobs() == ["old", "waits"]
+
+
+def test_requests_and_passes_at_once_never_share_a_run(world: World) -> None:
+    users = world.users
+    taken, used = set[str](), set[str]()
+    wrong: list[str] = []
+    ending = threading.Event()
+
+    def take() -> None:
+        while not ending.is_set():
+            for name in ("a", "b"):
+                if users.take(name):
+                    taken.add(name)
+                    if name in used:
+                        wrong.append(name)
+                    taken.discard(name)
+                    users.let_go(name)
+
+    def use(name: str) -> None:
+        for _ in range(3000):
+            try:
+                with users.using(name):
+                    used.add(name)
+                    if name in taken:
+                        wrong.append(name)
+                    used.discard(name)
+            except RunInUse:
+                pass
+
+    taker = threading.Thread(target=take)
+    taker.start()
+    threads = [threading.Thread(target=use, args=(name,)) for name in "ab"]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    ending.set()
+    taker.join()
+    assert wrong == [] and users._users == {}
+
+
+def test_deletions_are_not_remembered_for_ever(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    moment = [0.0]
+    monkeypatch.setattr("orchestrator.machine.monotonic", lambda: moment[0])
+    for number in range(5000):
+        moment[0] += 1.0
+        assert world.users.take(f"r{number}")
+        world.users.let_go(f"r{number}")
+    assert len(world.users._changed) < 1000
+
+
+# -- rules, owners, definitions -----------------------------------------------------------------------------------------
+
+
+def test_rules_of_queues_and_of_the_controller(world: World) -> None:
+    day = now() - A_DAY
+    for queue, tags in (
+        ("short", {"muster:retention": "2h"}),
+        ("kept", {"muster:retention": "off"}),
+        ("bad", {"muster:retention": "x"}),
+    ):
+        world.add(JobQueue(name=queue, compute_environments=["local"], tags=tags))
+    for queue in ("default", "short", "kept", "bad"):
+        world.ended(queue, queue=queue, stopped_at=day, from_yaml=True)
+    assert world.retention(default=inf).take_all().jobs == 1 and world.jobs() == ["bad", "default", "kept"]
+    assert world.retention(default=2 * 86_400).take_all().jobs == 0
+    looks, _ = world.retention().step(Place(), take=True, older=A_DAY // 2)
+    assert [each["jobs"] for each in looks] == [["default"]]
+    world.ended("default", stopped_at=day, from_yaml=True)
+    assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "kept"]
+
+
+def test_a_switch_turns_it_off(world: World) -> None:
+    world.ended("old")
+    calls: list[Callable[[], object]] = []
+    off, on = world.retention(default=inf), world.retention()
+    for each in (off, on):
+        each._next = 0.0
+        each.when_due(calls.append)
+        each.when_due(calls.append)
+    assert len(calls) == 1, "one pass at a time, of the one that is on"
+    calls[0]()
+    assert world.jobs() == []
+    on.when_due(calls.append)
+    assert len(calls) == 1, "the next pass comes later"
+
+
+def test_in_the_first_days_after_an_upgrade_it_only_logs(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    world.ended("old")
+    world.add(RetentionStart(id=1, since=now() - 2 * A_DAY))
+    with caplog.at_level(logging.WARNING):
+        world.retention()._pass()
+    assert "has taken nothing yet" in caplog.text and "1 jobs and 1 runs" in caplog.text
+    assert world.jobs() == ["old"] and world.runs() == ["old"]
+    with world.database.session() as session:
+        session.get_one(RetentionStart, 1).since = now() - 30 * A_DAY
+    world.retention()._pass()
+    assert world.jobs() == ["old"], "its time counts from the upgrade on"
+    with world.database.session() as session:
+        session.get_one(RetentionStart, 1).since = now() - 91 * A_DAY
+    world.retention()._pass()
+    assert world.jobs() == [] and world.runs() == []
+
+
+def test_a_key_with_some_queues_takes_only_what_is_its_own(world: World) -> None:
+    mine = Whose("key a", frozenset({"default"}))
+    world.ended("own")
+    world.ended("others", owner="key b")
+    world.ended("elsewhere", queue="lab")
+    world.ended("shared")
+    world.ended("shared-by-b", run="shared", owner="key b")  # its record says key b from now on
+    world.ended("of-b", owner="key b")
+    world.ended("in-run-of-b", run="of-b")
+    with world.database.session() as session:
+        session.get_one(RunRecord, "shared").owner = "key a"
+        session.get_one(RunRecord, "of-b").owner = "key b"
+    looks, _ = world.retention().step(Place(), take=True, whose=mine)
+    gone = sorted(name for each in looks for name in each["jobs"])
+    assert gone == ["own", "shared"]
+    assert world.runs() == ["elsewhere", "of-b", "others", "shared"]
+    assert not (world.store.run("shared").path / "logs" / "shared").exists()
+    assert (world.store.run("shared").path / "logs" / "shared-by-b").is_dir()
+
+
+def test_definitions_go_with_their_last_job_where_no_user_needs_them(world: World) -> None:
+    ours = [{"name": "MUSTER_DIRECTORY", "value": "/"}, {"name": "MUSTER_SPEC", "value": "{}"}]
+    compiled = {"nodeProperties": {"nodeRangeProperties": [{"container": {"environment": ours}}]}}
+    for name, revision, document, status in (
+        ("submitted", 1, compiled, "ACTIVE"),
+        ("used", 1, compiled, "ACTIVE"),
+        ("client", 1, {}, "INACTIVE"),
+        ("client", 2, {}, "ACTIVE"),
+        ("client", 3, {}, "INACTIVE"),
+    ):
+        world.add(JobDefinition(name=name, revision=revision, document=document, status=status))
+        world.ended(f"{name}-{revision}", definition=f"{ARN}{name}:{revision}")
+    world.add(job("open", status="RUNNABLE", definition=f"{ARN}used:1"))
+    world.retention().take_all()
+    with world.database.session() as session:
+        left = [(each.name, each.revision) for each in session.scalars(select(JobDefinition))]
+    assert sorted(left) == [("client", 2), ("client", 3), ("used", 1)], "no number of a client's is given twice"
+
+
+def test_a_run_is_deleted_whole_and_its_jobs_stay_in_the_history(world: World) -> None:
+    world.ended("old", stopped_at=now(), from_yaml=True)
+    (world.store.run("old").path / "results.csv").write_text("1")
+    deleted = world.retention().delete("old")
+    assert deleted["files"] == 4 and world.runs() == [] and world.trashed() == []
+    assert world.jobs() == ["old"]
+    with world.database.session() as session:
+        assert session.get(RunRecord, "old") is None, "a new run of the name has an owner of its own"
+    assert world.retention().delete("old")["files"] == 0
+
+
+def test_what_can_t_be_read_in_the_store_keeps_a_run_with_results_from_being_deleted(world: World) -> None:
+    world.ended("old")
+    world.ended("full")
+    (world.store.run("full").path / "results.csv").write_text("1")
+    (world.store.models / "ant" / "1").mkdir(parents=True)
+    with pytest.raises(RunNeeded, match=r"model ant@1.*model.json is missing, and may need it"):
+        world.retention().delete("full")
+    world.retention().delete("old")
+    assert world.runs() == ["full"]

@@ -1,0 +1,195 @@
+"""What may go of old jobs and runs: nothing that is needed, whatever the rules and their order."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from orchestrator.domain.retention import (
+    A_DAY,
+    BATCH_DAYS,
+    Decision,
+    JobFacts,
+    Reference,
+    References,
+    Rules,
+    RunFacts,
+    age_of,
+    decide,
+    still_needed,
+)
+
+NOW = 1_000 * A_DAY
+OLD = JobFacts("old", due_at=NOW - 1)
+RUN = RunFacts("r", logged=frozenset({"old"}))
+NOTHING = References()
+
+
+def test_an_old_run_that_holds_nothing_but_logs_goes_with_its_job() -> None:
+    assert decide(RUN, [OLD], NOTHING, NOW) == Decision(True, ("old",))
+    assert decide(None, [OLD], NOTHING, NOW) == Decision(False, ("old",)), "a job that never started"
+
+
+@pytest.mark.parametrize(
+    ("facts", "jobs", "references", "reason"),
+    [
+        ({"archived": "by key a"}, [], NOTHING, "archived"),
+        ({"writer": "job 1 of another controller"}, [], NOTHING, "another controller writes it"),
+        ({"damage": "run.json: not JSON"}, [], NOTHING, "can't be read"),
+        ({}, [JobFacts("new", is_open=True)], NOTHING, "job new has not ended"),
+        ({}, [], References.of([Reference("run", "r", "model a@1 is of it")]), "model a@1 is of it"),
+        ({}, [], References.of([Reference("job", "old", "job w waits for it")]), "job w waits for it"),
+        ({"results": ("checkpoints",)}, [], References.of([], ["model b@2 can't be read"]), "model b@2 can't be read"),
+    ],
+)
+def test_nothing_of_a_run_goes_while_something_needs_it(
+    facts: dict[str, Any], jobs: list[JobFacts], references: References, reason: str
+) -> None:
+    run = RunFacts(**{"name": "r", "logged": RUN.logged, **facts})
+    decision = decide(run, [OLD, *jobs], references, NOW)
+    assert (decision.run, decision.jobs) == (False, ())
+    assert reason in " ".join(decision.reasons)
+    assert list(decision.reasons) == still_needed(run, [OLD, *jobs], references)
+
+
+@pytest.mark.parametrize(
+    ("facts", "jobs", "reason"),
+    [
+        ({"results": ("checkpoints", "a.csv", "b.csv", "c.csv")}, [], "it holds checkpoints, a.csv, b.csv, …"),
+        ({"logged": frozenset({"old", "strange"})}, [], "logs of job strange"),
+        ({}, [JobFacts("young", due_at=NOW + 1)], "job young of it is kept longer"),
+        ({}, [JobFacts("kept", due_at=None)], "job kept of it is kept longer"),
+    ],
+)
+def test_old_jobs_go_without_their_run_where_that_holds_more(
+    facts: dict[str, Any], jobs: list[JobFacts], reason: str
+) -> None:
+    decision = decide(RunFacts(**{"name": "r", "logged": RUN.logged, **facts}), [OLD, *jobs], NOTHING, NOW)
+    assert (decision.run, decision.jobs) == (False, ("old",))
+    assert reason in " ".join(decision.reasons)
+
+
+def test_of_a_run_of_which_no_job_is_due_nothing_is_told() -> None:
+    assert decide(RUN, [JobFacts("old", due_at=NOW + 1)], NOTHING, NOW) == Decision(False, ())
+    assert decide(RUN, [], NOTHING, NOW) == Decision(False, ()), "a run of another controller, or of a lost database"
+
+
+def test_a_rule_of_a_queue_goes_before_that_of_the_controller_which_goes_before_the_batch_api_s() -> None:
+    ended = NOW - 10 * A_DAY
+    rules = Rules(default=A_DAY, queues={"short": A_DAY // 2, "kept": None})
+    assert rules.due_at("short", True, ended) == ended + A_DAY // 2
+    assert rules.due_at("kept", False, ended) is None
+    assert rules.due_at("other", True, ended) == rules.due_at("other", False, ended) == ended + A_DAY
+    assert Rules().due_at("other", True, ended) is None, "a job from YAML is kept without a rule"
+    assert Rules().due_at("other", False, ended) == ended + BATCH_DAYS * A_DAY
+    assert Rules(batch=False).due_at("other", False, ended) is None
+    assert Rules().due_at("other", False, None) is None
+
+
+def test_without_a_rule_the_time_counts_from_the_upgrade_on_and_nothing_goes_in_the_first_days() -> None:
+    upgraded = NOW - 5 * A_DAY
+    rules = Rules(since=upgraded)
+    assert rules.due_at("q", False, NOW - 400 * A_DAY) == upgraded + BATCH_DAYS * A_DAY
+    assert rules.batch_limit(NOW) is None
+    assert rules.is_trial(NOW) and not rules.is_trial(upgraded + 7 * A_DAY) and not Rules().is_trial(NOW)
+    later = upgraded + BATCH_DAYS * A_DAY
+    assert rules.batch_limit(later) == upgraded
+
+
+@pytest.mark.parametrize(
+    ("rule", "age"), [("90d", 90 * A_DAY), ("36h", 36 * 3_600_000), ("1.5d", 36 * 3_600_000), ("off", None)]
+)
+def test_a_rule_is_a_time_or_off(rule: str, age: int | None) -> None:
+    assert age_of(rule) == age
+
+
+@pytest.mark.parametrize("rule", ["", "90", "d", "-1d", "90 days", "1e9d", "Off", "99999999d"])
+def test_anything_else_is_no_rule(rule: str) -> None:
+    with pytest.raises(ValueError, match="expected one such as 90d"):
+        age_of(rule)
+
+
+class World:
+    """Runs, jobs and what needs them, as drawn; what is taken vanishes from it."""
+
+    def __init__(self, draw: random.Random) -> None:
+        self.draw = draw
+        self.runs = {f"r{number}" for number in range(draw.randint(1, 6))}
+        self.jobs = {
+            f"j{number}": (draw.choice(sorted(self.runs)), draw.choice(["open", "ended"]), draw.randint(0, 100) * A_DAY)
+            for number in range(draw.randint(0, 12))
+        }
+        self.from_yaml = {job: draw.random() < 0.5 for job in self.jobs}
+        self.queue = {job: draw.choice("abc") for job in self.jobs}
+        self.results = {run for run in self.runs if draw.random() < 0.4}
+        self.archived = {run for run in self.runs if draw.random() < 0.2}
+        self.needed_runs = {run for run in self.runs if draw.random() < 0.3}
+        self.needed_jobs = {job for job in self.jobs if draw.random() < 0.2}
+        self.strange = {run for run in self.runs if draw.random() < 0.1}
+
+    def rules(self) -> Rules:
+        queues = {queue: self._age() for queue in "abc" if self.draw.random() < 0.5}
+        return Rules(
+            self._age(), queues, self.draw.choice([0, self.draw.randint(0, 1000) * A_DAY]), self.draw.random() < 0.5
+        )
+
+    def _age(self) -> int | None:
+        return self.draw.choice([None, self.draw.randint(0, 120) * A_DAY])
+
+    def jobs_of(self, run: str, rules: Rules) -> list[JobFacts]:
+        return [
+            JobFacts(
+                job,
+                state == "open",
+                rules.due_at(self.queue[job], self.from_yaml[job], None if state == "open" else ended),
+            )
+            for job, (of, state, ended) in self.jobs.items()
+            if of == run
+        ]
+
+    def references(self) -> References:
+        return References.of(
+            [
+                *(Reference("run", run, "x") for run in self.needed_runs),
+                *(Reference("job", job, "x") for job in self.needed_jobs),
+            ]
+        )
+
+    def must_stay(self) -> tuple[set[str], set[str]]:
+        """Runs and jobs that no rule may take, by another road than the product's."""
+        open_runs = {of for of, state, _ in self.jobs.values() if state == "open"}
+        cited = {self.jobs[job][0] for job in self.needed_jobs & self.jobs.keys()}
+        whole = (self.archived | self.needed_runs | open_runs | cited) & self.runs
+        jobs = {job for job, (of, state, _) in self.jobs.items() if of in whole or state == "open"}
+        return whole | (self.runs & (self.results | self.strange)), jobs | (self.needed_jobs & self.jobs.keys())
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.randoms(use_true_random=False))
+def test_whatever_the_sequence_of_rules_nothing_that_is_needed_is_taken(draw: random.Random) -> None:
+    world = World(draw)
+    runs, jobs = world.must_stay()
+    for _ in range(6):
+        rules, moment = world.rules(), draw.randint(0, 1200) * A_DAY
+        for run in draw.sample(sorted(world.runs), len(world.runs)):
+            of_run = world.jobs_of(run, rules)
+            logged = {each.id for each in of_run} | ({"strange"} if run in world.strange else set())
+            facts = RunFacts(
+                run,
+                ("checkpoints",) if run in world.results else (),
+                frozenset(logged),
+                "by key a" if run in world.archived else None,
+            )
+            decision = decide(facts, of_run, world.references(), moment)
+            left = {each.id for each in of_run} - set(decision.jobs)
+            assert not (decision.run and left), "a run never goes without all of its jobs"
+            assert all(each.due_at is not None and each.due_at <= moment for each in of_run if each.id in decision.jobs)
+            for job in decision.jobs:
+                del world.jobs[job]
+            if decision.run:
+                world.runs.remove(run)
+        assert runs <= world.runs and jobs <= world.jobs.keys()
