@@ -199,6 +199,7 @@ class Server:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
         self._lock.withdraw()
         self.app.state.closing.set()
+        self.reconciler.logs.close()
         self._uvicorn.should_exit = True
         if self._thread.is_alive():
             self._thread.join(timeout=5)
