@@ -12,11 +12,13 @@ import asyncio
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,7 @@ MANY = 100_000
 _FLOOD = "for i in range({lines}): print('line', i, 'of the log of a program that prints much')"
 _LAST = "\nimport os, time\nif os.environ['NODE_RANK'] == '0': time.sleep(5)"
 """The main node waits for the others, since its end ends them."""
+_TIMES = re.compile(rb'{"time": "([^"]+)"')
 _SILENT = "import time; print('begun', flush=True); time.sleep(600)"
 _STEADY = "import time\nfor i in range(100_000): print('line', i, 'of a program that prints now and then', flush=True); time.sleep(0.02)"
 _SCRIPT = """
@@ -153,8 +156,9 @@ def batched(client: Client, job: str) -> int:
     return sum(map(len, client.log_batches(job)))
 
 
-def followers(url: str, home: str, controller: int) -> list[tuple[str, float, float, float]]:
-    """For each kind of crowd: its size and work, the share of a core [%], MiB of memory added, and lines a second that all received.
+def followers(url: str, home: str, controller: int) -> list[tuple[str, float, float, float, list[float]]]:
+    """For each kind of crowd: its size and work, the share of a core [%], MiB of memory added, lines a second that all
+    received, and their ages [s].
 
     A key has at most 100 followers, so that a larger crowd has several keys.
     """
@@ -181,9 +185,11 @@ def followers(url: str, home: str, controller: int) -> list[tuple[str, float, fl
                     [(job, token) for job, token in zip(jobs, tokens, strict=False) for _ in range(100)],
                     controller,
                 )
-                work, memory, lines = asyncio.run(reading)
+                work, memory, lines, ages = asyncio.run(reading)
                 share = 100 * (work - before[1]) / MEASURED
-                rows.append((f"{count} followers, {crowd}", share, (memory - before[0]) / 2**20, lines / MEASURED))
+                rows.append(
+                    (f"{count} followers, {crowd}", share, (memory - before[0]) / 2**20, lines / MEASURED, ages)
+                )
                 for job in jobs:
                     client.batch("TerminateJob", jobId=job, reason="measured")
     finally:
@@ -199,10 +205,10 @@ def busy(controller: int, meanwhile: Any) -> float:
     return cpu_seconds(controller) - before
 
 
-async def crowd_of(url: str, follows: list[tuple[str, str]], controller: int) -> tuple[float, float, int]:
-    """CPU seconds of the controller, its memory [bytes] and the lines of all followers, once all of them have come."""
+async def crowd_of(url: str, follows: list[tuple[str, str]], controller: int) -> tuple[float, float, int, list[float]]:
+    """CPU seconds of the controller, its memory [bytes], and the lines of all followers and their ages [s], once all have come."""
     host, _, port = url.removeprefix("http://").partition(":")
-    lines = 0
+    lines, ages = 0, list[float]()
 
     async def one(job: str, token: str) -> None:
         nonlocal lines
@@ -212,6 +218,8 @@ async def crowd_of(url: str, follows: list[tuple[str, str]], controller: int) ->
         )
         while chunk := await reader.read(1 << 16):
             lines += chunk.count(b'{"time"')
+            for stamp in _TIMES.findall(chunk):
+                ages.append(time.time() - datetime.fromisoformat(stamp.decode()).timestamp())
 
     tasks = [asyncio.ensure_future(one(*each)) for each in follows]
     while lines < len(tasks):
@@ -220,11 +228,12 @@ async def crowd_of(url: str, follows: list[tuple[str, str]], controller: int) ->
             raise SystemExit(f"a follower has left: {task.exception() or 'its stream ended'}")
     await asyncio.sleep(5)
     before, seen = cpu_seconds(controller), lines
+    ages.clear()
     await asyncio.sleep(MEASURED)
     work, memory, count = cpu_seconds(controller) - before, resident(controller), lines - seen
     for task in tasks:
         task.cancel()
-    return work, memory, count
+    return work, memory, count, sorted(ages)
 
 
 def resident(pid: int) -> float:
@@ -289,23 +298,28 @@ def main() -> None:
             server.wait()
     print(f"{os.cpu_count()} cores ({platform.machine()}), load {os.getloadavg()[0]:.1f}, {NODES} nodes")
     print()
-    print("| many at once | controller's CPU, share of a core | memory | lines/s received |")
-    print("|---|---|---|---|")
-    for name, share, memory, rate in many:
-        print(f"| {name} | {share:.1f} % | {memory:.0f} MiB | {rate:,.0f} |")
+    print("| many at once | controller's CPU, share of a core | memory | lines/s received | p50 | p99 |")
+    print("|---|---|---|---|---|---|")
+    for name, share, memory, rate, ages in many:
+        late = f"{_at(ages, 0.5)} | {_at(ages, 0.99)}" if ages else "– | –"
+        print(f"| {name} | {share:.1f} % | {memory:.0f} MiB | {rate:,.0f} | {late} |")
     if only:
         return
     print()
     print("| line printed → client | lines | p50 | p99 |")
     print("|---|---|---|---|")
     for name, values in rows:
-        middle, high = values[len(values) // 2] * 1000, values[int(len(values) * 0.99)] * 1000
-        print(f"| {name} | {len(values)} | {middle:.0f} ms | {high:.0f} ms |")
+        print(f"| {name} | {len(values)} | {_at(values, 0.5)} | {_at(values, 0.99)} |")
     print()
     print("| a whole log read by | lines | lines/s | controller's CPU for a line |")
     print("|---|---|---|---|")
     for name, count, rate, work in read:
         print(f"| {name} | {count} | {round(rate, -3):,.0f} | {work * 1e6:.1f} µs |")
+
+
+def _at(values: list[float], part: float) -> str:
+    """The value below which that part of sorted values [s] lies."""
+    return f"{values[int(len(values) * part)] * 1000:.0f} ms"
 
 
 if __name__ == "__main__":

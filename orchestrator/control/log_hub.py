@@ -15,14 +15,12 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from sqlalchemy import func, select
-
 from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.log_tail import MOST, JobLogs
 from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.queries import states_of
 from orchestrator.persistence.session import Database, DatabaseError
 from shared_store.bus import LOG_LEASE
 from shared_store.bus import Node as Address
@@ -230,25 +228,17 @@ class LogHub:
         for each in changed:
             each.is_changed = False
         by_job = {each.logs.job: each for each in changed}
-        nodes = func.count(Node.index)
-        query = (
-            select(Job.id, Job.status, Attempt.number, nodes)
-            .outerjoin(Attempt, (Attempt.job_id == Job.id) & Attempt.stopped_at.is_(None))
-            .outerjoin(Node, (Node.job_id == Attempt.job_id) & (Node.attempt == Attempt.number))
-            .where(Job.id.in_(by_job))
-            .group_by(Job.id, Job.status, Attempt.number)
-        )
         try:
             with self._database.session() as session:
-                rows = {job: (status, attempt, count) for job, status, attempt, count in session.execute(query)}
+                found = states_of(session, by_job)
         except DatabaseError:
             for each in changed:  # the next round tries again
                 each.is_changed = True
             return
         for job, each in by_job.items():
-            status, attempt, count = rows.get(job, (Status.FAILED, None, 0))
-            is_over = Status(status).is_terminal
-            if each.logs.note(attempt, count) or is_over:
+            status, attempt, nodes = found.get(job, (Status.FAILED, None, 0))
+            is_over = status.is_terminal
+            if each.logs.note(attempt, nodes) or is_over:
                 each.next_ask, each.next_look, each.asking = 0.0, 0.0, _ASK
                 each.logs.is_over = is_over
                 each.wake()
