@@ -148,7 +148,7 @@ class Attempts:
         attempt.held_since = self.clock.now()
         record_logs(session, job, nodes)
         job.attempts.append(attempt)
-        job.move(Status.STARTING, f"starting {self._state(job, attempt).terms.size}")
+        job.move(Status.STARTING, f"starting {state_of(job, attempt).terms.size}")
         yield self._memory(attempt).committed
         yield from self._happened(session, job, attempt, Due())
 

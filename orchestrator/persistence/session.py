@@ -374,7 +374,7 @@ def _tell(session: Session) -> None:
     database = session.info["database"]
     database.counts.add(session.info.pop("counts", {}))
     if jobs and database.committed:
-        database.committed(list(jobs.values()))
+        database.committed([jobs[job_id] for job_id in sorted(jobs)])
     if ids and database.changed:
         database.changed(ids)
 

@@ -27,7 +27,8 @@ def write_changes(session: Session) -> Sequence[Any]:
             changed = tuple(sorted(key for key in state.committed_state if key in columns and _differs(state, key)))
             if changed:
                 groups[kind, changed].append(state)
-    for (kind, changed), states in groups.items():
+    for kind, changed in sorted(groups, key=lambda group: (group[0].__name__, group[1])):
+        states = sorted(groups[kind, changed], key=_identity)  # a session's order differs from one time to the next
         columns = _columns(kind)
         statement, keys = _statement(kind, changed)
         rows = [
@@ -43,6 +44,11 @@ def write_changes(session: Session) -> Sequence[Any]:
             else:
                 state._commit(state.dict, changed)
     return [state.obj() for states in groups.values() for state in states]
+
+
+def _identity(state: InstanceState[Any]) -> tuple[Any, ...]:
+    assert state.key is not None
+    return state.key[1]
 
 
 def _differs(state: InstanceState[Any], key: str) -> bool:

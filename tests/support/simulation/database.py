@@ -13,6 +13,7 @@ from sqlalchemy import Dialect, Engine, StaticPool, create_engine, make_url
 from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.persistence.job_counts import JobCounts
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database, DatabaseError, _read_document
 from tests.support.simulation.machine import LoopWaits
@@ -82,6 +83,7 @@ class SimulatedDatabase(Database):
     def __init__(self, memory: Memory, world: Simulation) -> None:
         self._world, self._reserved = world, False
         self.committed = self.changed = self.ended = None
+        self.counts = JobCounts()
         self._lock = self._file_lock = self._damage = self._file = self._identity = None
         memory.rollback()  # what a process that was killed has not committed
 

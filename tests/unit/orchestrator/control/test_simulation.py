@@ -15,16 +15,16 @@ SECONDS = 20.0
 """Of a processor, for as many seeds as can be simulated meanwhile."""
 FOUND_AT = {
     "B1": (0, "is ended without a cause: lost"),
-    "B2": (24, "is ended without a cause: lost"),
+    "B2": (0, "is ended without a cause: lost"),
     "B3": (1, "the loop waits for a call"),
-    "B4": (0, "the loop waits for a call"),
-    "B9": (2, "is to be launched, although it is preempted"),
+    "B4": (21, "the loop waits for a call"),
+    "B9": (0, "is to be launched, although it is preempted"),
     "fault": (0, "is launched after ValueError in train.py, line 3 ended attempts"),
     "look": (0, "runs, and its job is STARTING"),
-    "missing": (0, "and its controller has not met"),
+    "missing": (1, "and its controller has not met"),
     "stop": (18, "and its engine is away"),
     "T1": (3, "the store does not have its run"),
-    "T2": (9, "is FAILED (main node: exit 0, outcome not written"),
+    "T2": (2, "is FAILED (main node: exit 0, outcome not written"),
 }
 """The first seed that finds each mutant, and how: ``python -m tests.support.simulation 0 200 --mutant B1``."""
 
