@@ -87,7 +87,9 @@ class Tail:
         while nexts := [at for at in self.early if at <= self.end]:
             early = self.early.pop(at := min(nexts))
             self._add(early[self.end - at :], most)
-        self.fed = self.fed or self.end > before
+        if self.end > before:
+            self.fed = True
+            self.stated = None if self.stated is None else max(self.stated, self.end)
         return self.end > before
 
     def missing(self, segments: Sequence[Segment]) -> Found | None:

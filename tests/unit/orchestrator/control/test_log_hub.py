@@ -95,6 +95,12 @@ class World:
         """Until the hub takes what nodes tell, which they do then."""
         wait_for(lambda: self.hub._followed and self.hub._followed["job"].logs._has_looked, what="the first look")
         self.state(max(number for number, _ in self.writers))
+        wait_for(self.is_quiet, what="that nobody looks at files")
+
+    def is_quiet(self) -> bool:
+        """Whether all nodes push, and no look at the files is under way."""
+        job = self.hub._followed["job"]
+        return job.logs.delivers() and not job.is_looked_at
 
     def close(self) -> None:
         self.closing.set()
@@ -106,7 +112,8 @@ class World:
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    monkeypatch.setattr(log_tail, "FRESH", 3600.0)  # what nodes tell counts until the test says otherwise
     world = World(tmp_path)
     yield world
     world.close()
@@ -143,7 +150,6 @@ def test_nodes_are_asked_to_push_and_a_line_reaches_all_followers_without_a_file
     wait_for(lambda: all(has(each, "before") for each in everyone))
     wait_for(lambda: world.asked["job", 1])
     world.heard()
-    wait_for(lambda: world.hub._followed["job"].logs.delivers())
     looks.clear()
     for number in range(50):
         world.write(f"line {number}", (1, number % 2))
@@ -156,7 +162,6 @@ def test_a_lost_push_costs_one_look_for_all_followers(world: World, looks: Count
     world.heard()
     world.write("first")
     wait_for(lambda: all(has(each, "first") for each in everyone))
-    wait_for(lambda: world.hub._followed["job"].logs.delivers())
     looks.clear()
     world.write("lost", push=False)
     world.state()
