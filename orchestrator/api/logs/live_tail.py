@@ -113,9 +113,11 @@ class LiveTail:
         """The jobs that are followed."""
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
-        self._watching = reconciler.logs.watch(self)
-        self._watching.__enter__()
-        self._refresh(from_now=True)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(reconciler.logs.watch(self))
+            stack.callback(self._leave_all)
+            self._refresh(from_now=True)
+            self._entered = stack.pop_all()
 
     def wake(self) -> None:
         """Some job has changed: there may be new streams."""
@@ -124,10 +126,7 @@ class LiveTail:
 
     def close(self) -> None:
         """Follow nothing any more."""
-        self._watching.__exit__(None, None, None)
-        for following, _ in self._jobs.values():
-            following.__exit__(None, None, None)
-        self._jobs.clear()
+        self._entered.close()
 
     def is_due(self) -> bool:
         """Whether the database may have new streams."""
@@ -189,6 +188,10 @@ class LiveTail:
         for job in self._jobs.keys() - {each.stream.job for each in self._open.values()}:
             self._jobs.pop(job)[0].__exit__(None, None, None)
 
+    def _leave_all(self) -> None:
+        while self._jobs:
+            self._jobs.popitem()[1][0].__exit__(None, None, None)
+
 
 async def messages(
     tail: LiveTail, start: dict[str, Any], account: str, closing: threading.Event
@@ -203,32 +206,31 @@ async def messages(
     """
     identity = {"requestId": str(uuid.uuid4()), "sessionId": str(uuid.uuid4())}
     over = time.monotonic() + LONGEST_SESSION
-    with contextlib.closing(tail):
-        yield eventstream.event("initial-response", {})
-        yield eventstream.event("sessionStart", {**identity, **start})
-        beat = time.monotonic() + _BEAT
-        while not closing.is_set():
-            try:
-                events, sampled = await _polled(tail)
-            except (OSError, StoreSilent) as error:  # the store is away: it may come back, and nothing is lost
-                log.warning("live tail: %s", error)
-                events, sampled = [], False
-                await asyncio.sleep(_AGAIN)
-            except Exception:
-                log.exception("a live tail failed")
-                yield eventstream.exception("SessionStreamingException", "the controller's log has the details")
-                return
-            current = time.monotonic()
-            if current >= over:
-                yield eventstream.exception("SessionTimeoutException", "the session was open for three hours")
-                return
-            if events or current >= beat:
-                identified = [(event, f"{account}:{tail.group_of[event.stream]}") for event in events]
-                for update in _updates(identified, sampled):
-                    yield update
-                beat = current + _BEAT
-            await tail.waker.wait(beat - time.monotonic())
-            await asyncio.sleep(pause(_PAUSE))
+    yield eventstream.event("initial-response", {})
+    yield eventstream.event("sessionStart", {**identity, **start})
+    beat = time.monotonic() + _BEAT
+    while not closing.is_set():
+        try:
+            events, sampled = await _polled(tail)
+        except (OSError, StoreSilent) as error:  # the store is away: it may come back, and nothing is lost
+            log.warning("live tail: %s", error)
+            events, sampled = [], False
+            await asyncio.sleep(_AGAIN)
+        except Exception:
+            log.exception("a live tail failed")
+            yield eventstream.exception("SessionStreamingException", "the controller's log has the details")
+            return
+        current = time.monotonic()
+        if current >= over:
+            yield eventstream.exception("SessionTimeoutException", "the session was open for three hours")
+            return
+        if events or current >= beat:
+            identified = [(event, f"{account}:{tail.group_of[event.stream]}") for event in events]
+            for update in _updates(identified, sampled):
+                yield update
+            beat = current + _BEAT
+        await tail.waker.wait(beat - time.monotonic())
+        await asyncio.sleep(pause(_PAUSE))
 
 
 async def _polled(tail: LiveTail) -> tuple[list[Event], bool]:
