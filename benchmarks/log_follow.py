@@ -291,8 +291,8 @@ def main() -> None:
         try:
             assert server.stdout is not None
             url = server.stdout.readline().split()[2]
-            many = followers(url, home, server.pid)
             rows, read = ([], []) if only else (measure(url, lines), rates(url, home, server.pid))
+            many = followers(url, home, server.pid)
         finally:
             server.terminate()
             server.wait()

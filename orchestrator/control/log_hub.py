@@ -27,7 +27,7 @@ from shared_store.bus import Node as Address
 from shared_store.layout import Run
 
 _MEMORY = 32 << 20
-"""Bytes that all tails together keep, whatever their number."""
+"""Bytes that all tails together keep, with what came too early, whatever their number."""
 _LOOK = 0.05
 """Seconds between two looks at the files of a job whose nodes do not push."""
 _SHARE = 0.005
@@ -117,7 +117,6 @@ class LogHub:
         with self._lock:
             followed = self._followed.setdefault(job, _Followed(run, job))
             followed.wakers.append(waker)
-            self._share()
             if self._thread is None:
                 self._thread = machine.thread("log hub", self._run)
             self._hurry()
@@ -128,7 +127,6 @@ class LogHub:
                 followed.wakers.remove(waker)
                 if not followed.wakers and self._followed.get(job) is followed:
                     del self._followed[job]
-                    self._share()
 
     @contextmanager
     def watch(self, waker: Wakes) -> Iterator[None]:
@@ -183,10 +181,6 @@ class LogHub:
         with self._lock:
             self._hurry()
 
-    def _share(self) -> None:
-        for followed in self._followed.values():
-            followed.logs.most = min(MOST, _MEMORY // (2 * len(self._followed)))
-
     def _run(self) -> None:
         """Rounds while somebody follows a job, each as soon as one is due."""
         pause = 0.0
@@ -208,6 +202,9 @@ class LogHub:
     def _round(self, followed: Collection[_Followed]) -> float:
         """Read changed rows, ask nodes to push, and look at the files of jobs whose nodes do not; returns the seconds until the next one."""
         self._read_rows([each for each in followed if each.is_changed])
+        share = _MEMORY // (3 * sum(max(1, len(each.logs)) for each in followed))
+        for each in followed:
+            each.logs.keep(min(MOST, share))
         now, due = machine.monotonic(), machine.monotonic() + _TICK
         looking = [each for each in followed if not each.logs.is_over and not each.logs.delivers()]
         for each in followed:

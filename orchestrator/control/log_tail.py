@@ -79,9 +79,8 @@ class Tail:
         """Take bytes that a node has pushed; whether something is new. ``most``: bytes to keep."""
         before = self.end
         if position > before:
-            if sum(map(len, self.early.values())) + len(data) > MOST:
-                self.early.clear()
             self.early[position] = data
+            self.trim(most)
             return False
         self._add(data[before - position :], most)
         while nexts := [at for at in self.early if at <= self.end]:
@@ -125,6 +124,12 @@ class Tail:
 
     def _add(self, data: bytes, most: int) -> None:
         self.data += data
+        self.trim(most)
+
+    def trim(self, most: int) -> None:
+        """Keep no more than a quarter above ``most`` bytes, and as many that came too early."""
+        if sum(map(len, self.early.values())) > most:
+            self.early.clear()
         if (excess := len(self.data) - most) > most // 4:  # seldom: it moves what is kept
             del self.data[:excess]
             self.start += excess
@@ -141,7 +146,7 @@ class JobLogs:
         """Number of its nodes."""
         self.is_over = False
         """Whether the job is over: its files get no more lines."""
-        self.most = MOST
+        self._most = MOST
         self._lock = threading.Lock()
         self._tails: dict[Key, Tail] = {}
         self._has_looked = False
@@ -161,12 +166,24 @@ class JobLogs:
             tail = self._tails.get(log)
             return b"" if tail is None else tail.read(position, most)
 
+    def __len__(self) -> int:
+        """Number of logs that have a tail."""
+        return len(self._tails)
+
     # what changes
+
+    def keep(self, most: int) -> None:
+        """Keep at most so many bytes of each log from now on, and of the pushes to it that come too early."""
+        with self._lock:
+            if most < self._most:
+                for tail in self._tails.values():
+                    tail.trim(most)
+            self._most = most
 
     def push(self, log: Key, position: int, data: bytes) -> bool:
         """A node has pushed a part of its log; whether something is new."""
         with self._lock:
-            return self._has_looked and self._tails.setdefault(log, Tail(0)).push(position, data, self.most)
+            return self._has_looked and self._tails.setdefault(log, Tail(0)).push(position, data, self._most)
 
     def state(self, log: Key, end: int | None, is_whole: bool) -> bool:
         """A node has stated where its log ends (None: it does not push it); whether something is missing here."""
@@ -228,4 +245,4 @@ class JobLogs:
             known = replace(tail, data=bytearray(), start=tail.end)
         found = Found(None, log_end(segments)) if is_first else known.missing(segments)
         with self._lock:
-            return found is not None and tail.take(found, self.most)
+            return found is not None and tail.take(found, self._most)

@@ -8,9 +8,9 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any
 
 from orchestrator.api.http.following import MEMORY_PIECE, looked, pause
@@ -24,8 +24,7 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.models import now
 from shared_store.layout import Run
-from shared_store.log_files import segments_of
-from shared_store.log_view import CHUNK, NodeLog, log_end
+from shared_store.log_view import Chosen, Key, LogView
 from shared_store.logs import LogLine
 
 LONGEST_SESSION = 3 * 3600.0
@@ -34,8 +33,6 @@ MOST_EVENTS = 500
 """Events of one update."""
 _MOST_PENDING = 10 * MOST_EVENTS
 """Events that are sent at once; of more, every n-th is kept: the client can't keep up, or nobody could read it."""
-_MOST_BEHIND = 4 << 20
-"""Bytes of a stream that a session goes back to when its client was slow; what is older is left out."""
 _PAUSE = 0.025
 """Seconds between two looks, while few are open."""
 _BEAT = 1.0
@@ -50,42 +47,33 @@ _OVERLAP = 5000
 log = logging.getLogger("muster.api")
 
 
-class _Tailed:
-    """What a session has of one stream."""
+@dataclass
+class _Job:
+    """A job that a session follows."""
 
-    def __init__(self, stream: Stream, logs: JobLogs, *, from_now: bool) -> None:
-        """``from_now``: without what it has already. Raises OSError."""
-        self.stream, self.logs = stream, logs
-        self.log = NodeLog(stream.attempt, stream.node, 0)
-        self.is_ended = False
-        """Whether no more lines can come, so that the next look is the last."""
-        if from_now:
-            view = stream.file.look()
-            self.log.position, self.top = view.end, view.top
-        else:
-            self.top = 0
+    view: LogView
+    logs: JobLogs
+    following: AbstractContextManager[JobLogs]
+    needs_files: bool = True
+    """Whether the files have what memory has not, or may have it."""
+    streams: dict[Key, Stream] = field(default_factory=dict)
+    """Those of its logs that are asked for."""
+    newest: dict[Key, int] = field(default_factory=dict)
+    """Time of each one's newest event [ms]: times never fall within a stream."""
 
-    def read(self, *, in_files: bool) -> bool:
-        """Read what is new; False where only the files have it."""
-        if not in_files:
-            return not self.is_ended and self.log.feed(self.logs, MEMORY_PIECE)
-        if segments := segments_of(self.stream.path):
-            self.log.fill(segments, CHUNK)
-        return True
+    @property
+    def is_over(self) -> bool:
+        """Whether no more lines can come, as the database had it before the files were looked at."""
+        return not any(stream.live for stream in self.streams.values())
 
-    def skip(self) -> bool:
-        """Leave out what is too far behind, in the files; whether something was. Raises OSError."""
-        segments = segments_of(self.stream.path)
-        least = log_end(segments) - _MOST_BEHIND if segments else 0
-        if is_skipped := self.log.position < least:
-            self.log.position, self.log.inside = least, True
-        return is_skipped
-
-    def event(self, line: LogLine) -> Event:
-        """The event of a line; times never fall within a stream."""
-        self.top = max(self.top, milliseconds(line.time))
-        source = self.stream.file.source
-        return Event(self.top, source, line.position, line.position, self.stream.name, line.text)
+    def events(self, lines: Iterable[LogLine]) -> Iterator[Event]:
+        """The events of those lines that are in a stream."""
+        for line in lines:
+            key = line.attempt, line.node
+            if key in self.streams and is_event(line):
+                time = self.newest[key] = max(self.newest.get(key, 0), milliseconds(line.time))
+                stream = self.streams[key]
+                yield Event(time, stream.file.source, line.position, line.position, stream.name, line.text)
 
 
 class LiveTail:
@@ -108,14 +96,12 @@ class LiveTail:
         self.calls, self.waker = reconciler.followed, Waker()
         self._started = self._asked = now()
         self._next_refresh, self._is_asked = 0.0, threading.Event()
-        self._open: dict[str, _Tailed] = {}
-        self._jobs: dict[str, tuple[AbstractContextManager[JobLogs], JobLogs]] = {}
-        """The jobs that are followed."""
+        self._jobs: dict[str, _Job] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
         with contextlib.ExitStack() as stack:
             stack.enter_context(reconciler.logs.watch(self))
-            stack.callback(self._leave_all)
+            stack.callback(lambda: self._leave(list(self._jobs)))
             self._refresh(from_now=True)
             self._entered = stack.pop_all()
 
@@ -128,36 +114,37 @@ class LiveTail:
         """Follow nothing any more."""
         self._entered.close()
 
-    def is_due(self) -> bool:
-        """Whether the database may have new streams."""
-        return self._is_asked.is_set() and time.monotonic() >= self._next_refresh
+    def poll_memory(self) -> list[Event] | None:
+        """The events since the last call, in order; None where only the files, or the database, have them."""
+        is_due = self._is_asked.is_set() and time.monotonic() >= self._next_refresh
+        if is_due or any(job.needs_files for job in self._jobs.values()):
+            return None
+        events = list[Event]()
+        for job in self._jobs.values():
+            lines = job.view.poll_memory(job.logs, MEMORY_PIECE)
+            job.needs_files = lines is None
+            events += job.events(lines or ())
+        return self._chosen(events)
 
-    def poll(self, *, in_files: bool) -> tuple[list[Event], bool] | None:
-        """The events since the last call, in order, and whether some were left out; None where only the files have them. Raises OSError.
-
-        ``in_files``: whether files are read, and the database for new streams.
-        """
-        if in_files and self.is_due():
+    def poll(self) -> list[Event]:
+        """:meth:`poll_memory` with the files and the database. Raises OSError."""
+        if self._is_asked.is_set():
             self._refresh(from_now=False)
-        followed = list(self._open.values())
-        sampled = in_files and any([each.skip() for each in followed])
-        fresh: list[Event] = []
-        reading = followed
-        while reading:
-            if not all([each.read(in_files=in_files) for each in reading]):
-                return None
-            fresh += self._taken(reading)
-            reading = [each for each in reading if each.log.more]
-        self._leave([each for each in followed if each.is_ended])
-        fresh.sort()
-        if len(fresh) > _MOST_PENDING:
-            count = len(fresh)  # the newest is always among them
-            return [fresh[(place + 1) * count // _MOST_PENDING - 1] for place in range(_MOST_PENDING)], True
-        return fresh, sampled
+        events = list[Event]()
+        for job in self._jobs.values():
+            if job.needs_files:
+                events += job.events(job.view.poll())
+                job.needs_files = job.view.behind
+        self._leave([name for name, job in self._jobs.items() if job.is_over and not job.needs_files])
+        return self._chosen(events)
 
-    def _taken(self, followed: Iterable[_Tailed]) -> list[Event]:
-        events = [each.event(line) for each in followed for _, line in each.log.take() if is_event(line)]
-        return [event for event in events if self._matches(event.text)]
+    @property
+    def is_behind(self) -> bool:
+        """Whether there is more already."""
+        return any(job.needs_files or job.view.behind for job in self._jobs.values())
+
+    def _chosen(self, events: Iterable[Event]) -> list[Event]:
+        return sorted(event for event in events if self._matches(event.text))
 
     def _refresh(self, *, from_now: bool) -> None:
         """Take up streams that began; those that ended before this call have their last look."""
@@ -169,28 +156,24 @@ class LiveTail:
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
         for stream in streams:
             if stream.run is not None and stream.name not in self._over and self._wanted(stream.name):
-                if stream.name not in self._open:
-                    logs = self._follow(stream.run, stream.job)
-                    self._open[stream.name] = _Tailed(stream, logs, from_now=from_now)
-                    self.group_of[stream.name] = stream.group
-                self._open[stream.name].is_ended = not stream.live
+                job = self._follow(stream.run, stream.job, from_now)
+                job.streams[stream.attempt, stream.node] = stream
+                job.needs_files = job.needs_files or job.is_over
+                self.group_of[stream.name] = stream.group
 
-    def _follow(self, run: Run, job: str) -> JobLogs:
+    def _follow(self, run: Run, job: str, from_now: bool) -> _Job:
         if job not in self._jobs:
+            chosen = Chosen(run, job)
+            places = chosen.end() if from_now else {}
             following = self._reconciler.logs.follow(run, job, self.waker)
-            self._jobs[job] = following, following.__enter__()
-        return self._jobs[job][1]
+            self._jobs[job] = _Job(LogView(chosen, places), following.__enter__(), following)
+        return self._jobs[job]
 
-    def _leave(self, ended: Sequence[_Tailed]) -> None:
-        for each in ended:
-            del self._open[each.stream.name]
-            self._over.add(each.stream.name)
-        for job in self._jobs.keys() - {each.stream.job for each in self._open.values()}:
-            self._jobs.pop(job)[0].__exit__(None, None, None)
-
-    def _leave_all(self) -> None:
-        while self._jobs:
-            self._jobs.popitem()[1][0].__exit__(None, None, None)
+    def _leave(self, jobs: Iterable[str]) -> None:
+        for name in jobs:
+            job = self._jobs.pop(name)
+            job.following.__exit__(None, None, None)
+            self._over.update(stream.name for stream in job.streams.values())
 
 
 async def messages(
@@ -229,16 +212,19 @@ async def messages(
             for update in _updates(identified, sampled):
                 yield update
             beat = current + _BEAT
-        await tail.waker.wait(beat - time.monotonic())
-        await asyncio.sleep(pause(_PAUSE))
+        if not tail.is_behind:
+            await tail.waker.wait(max(0.0, beat - time.monotonic()))
+            await asyncio.sleep(pause(_PAUSE))
 
 
 async def _polled(tail: LiveTail) -> tuple[list[Event], bool]:
-    """The new events: from memory where that has them, else from the files."""
-    if not tail.is_due() and (found := await looked(partial(tail.poll, in_files=False), None)) is not None:
-        return found
-    found = await looked(partial(tail.poll, in_files=True), tail.calls)
-    return found or ([], False)
+    """The new events, from memory where that has them, else from the files; and whether some of them were left out."""
+    found = await looked(tail.poll_memory, None)
+    if found is None:
+        found = await looked(tail.poll, tail.calls)
+    if (count := len(found)) > _MOST_PENDING:  # the newest is always among them
+        return [found[(place + 1) * count // _MOST_PENDING - 1] for place in range(_MOST_PENDING)], True
+    return found, False
 
 
 def _updates(events: list[tuple[Event, str]], sampled: bool) -> Iterator[bytes]:

@@ -256,14 +256,20 @@ def test_a_follower_that_takes_nothing_holds_no_other_up_and_keeps_little(world:
         assert kept <= 2 * log_tail.MOST
 
 
-def test_many_followed_jobs_share_a_bounded_memory(world: World) -> None:
-    waker, following = Waker(), []
-    for number in range(1000):
-        following.append(world.hub.follow(world.run, f"job-{number}", waker))
-        logs = following[-1].__enter__()
-    assert 1000 * 2 * logs.most <= log_hub._MEMORY
-    for each in following:
-        each.__exit__(None, None, None)
+def test_all_followed_logs_share_a_bounded_memory(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    bound = 1 << 20
+    monkeypatch.setattr(log_hub, "_MEMORY", bound)
+    with world.hub.follow(world.run, "job", Waker()) as logs:
+        world.heard()
+        for node in range(40):
+            for position in range(0, 1 << 18, 1 << 14):
+                world.bus.pushed(("job", 1, node), position, b"x" * (1 << 14))
+                world.bus.pushed(("job", 1, node), position + (1 << 30), b"x" * (1 << 14))
+
+        def kept() -> int:
+            return sum(len(tail.data) + sum(map(len, tail.early.values())) for tail in logs._tails.values())
+
+        wait_for(lambda: len(logs) == 40 and kept() < bound, what="that older parts are dropped")
 
 
 def test_an_idle_hub_has_no_thread_and_the_next_follower_starts_it_again(world: World) -> None:
