@@ -14,7 +14,6 @@ from pathlib import Path
 
 from benchmarks.load import Watch, add_option
 from benchmarks.scale import Bench, MemoryStore, ShortEngine, controller, large
-from orchestrator.engines.testing.fake import FakeEngine
 
 FIRST, AT_ONCE = 2000, 100
 
@@ -24,7 +23,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
 
 
-def end_gangs(bench: Bench[FakeEngine], first: int, last: int) -> None:
+def end_gangs(bench: Bench[ShortEngine], first: int, last: int) -> None:
     """Let the gangs of these numbers start and end, some at once; the engine forgets them, as a real one does."""
     queue = bench.reconciler.work_queue
     for start in range(first, last, AT_ONCE):

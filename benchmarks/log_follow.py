@@ -1,20 +1,24 @@
 """Speed of reading logs: ``python -m benchmarks.log_follow [lines]``.
 
 A gang of three nodes prints the time, ``lines`` times in all; a follower reads it over plain HTTP, as boto3 would. A line's latency is
-the time from just before ``print`` in the rank until the client has parsed it. Then long logs are read from beginning to end. Prints
-Markdown tables.
+the time from just before ``print`` in the rank until the client has parsed it. Then many follow at once, idle and not, and long logs
+are read from beginning to end. Work is that of the controller's process alone, in CPU seconds, so that a busy machine changes it little.
+``python -m benchmarks.log_follow followers`` measures many followers alone. Prints Markdown tables.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,11 +35,16 @@ PAUSE = 0.02
 """Seconds between two lines of a node."""
 POLL = 0.2
 """Seconds between two polls of a FilterLogEvents follower."""
+MEASURED = 20.0
+"""Seconds for which many followers are measured."""
 MANY = 100_000
 """Number of lines of a job whose log is read whole."""
 _FLOOD = "for i in range({lines}): print('line', i, 'of the log of a program that prints much')"
 _LAST = "\nimport os, time\nif os.environ['NODE_RANK'] == '0': time.sleep(5)"
 """The main node waits for the others, since its end ends them."""
+_TIMES = re.compile(rb'{"time": "([^"]+)"')
+_SILENT = "import time; print('begun', flush=True); time.sleep(600)"
+_STEADY = "import time\nfor i in range(100_000): print('line', i, 'of a program that prints now and then', flush=True); time.sleep(0.02)"
 _SCRIPT = """
 import time
 time.sleep(3)
@@ -147,6 +156,91 @@ def batched(client: Client, job: str) -> int:
     return sum(map(len, client.log_batches(job)))
 
 
+def followers(url: str, home: str, controller: int) -> list[tuple[str, float, float, float, list[float]]]:
+    """For each kind of crowd: its size and work, the share of a core [%], MiB of memory added, lines a second that all
+    received, and their ages [s].
+
+    A key has at most 100 followers, so that a larger crowd has several keys.
+    """
+    environment = {**os.environ, "MUSTER_HOME": home}
+    names = ["first", "second", "third"]
+    made = [
+        subprocess.run([MUSTER, "keys", "create", name, "--json"], env=environment, stdout=subprocess.PIPE, check=True)
+        for name in names
+    ]
+    keys = [json.loads(each.stdout) for each in made]
+    tokens = [f"{key['accessKeyId']}:{key['secretAccessKey']}" for key in keys]
+    rows = []
+    try:
+        with Client(url, tokens[0]) as client:
+            for crowd, count, script in (("idle", 300, _SILENT), ("at 50 lines/s", 100, _STEADY)):
+                jobs = [submit(client, "ticker", script, 1) for _ in tokens[: count // 100]]
+                for job in jobs:
+                    while not any(client.logs(job)):
+                        time.sleep(0.1)
+                time.sleep(5)  # until the start of the job is over
+                before = resident(controller), busy(controller, asyncio.sleep(MEASURED))
+                reading = crowd_of(
+                    url,
+                    [(job, token) for job, token in zip(jobs, tokens, strict=False) for _ in range(100)],
+                    controller,
+                )
+                work, memory, lines, ages = asyncio.run(reading)
+                share = 100 * (work - before[1]) / MEASURED
+                rows.append(
+                    (f"{count} followers, {crowd}", share, (memory - before[0]) / 2**20, lines / MEASURED, ages)
+                )
+                for job in jobs:
+                    client.batch("TerminateJob", jobId=job, reason="measured")
+    finally:
+        for name in names:
+            subprocess.run([MUSTER, "keys", "delete", name], env=environment, stdout=subprocess.DEVNULL, check=True)
+    return rows
+
+
+def busy(controller: int, meanwhile: Any) -> float:
+    """CPU seconds of the controller while ``meanwhile`` runs."""
+    before = cpu_seconds(controller)
+    asyncio.run(meanwhile)
+    return cpu_seconds(controller) - before
+
+
+async def crowd_of(url: str, follows: list[tuple[str, str]], controller: int) -> tuple[float, float, int, list[float]]:
+    """CPU seconds of the controller, its memory [bytes], and the lines of all followers and their ages [s], once all have come."""
+    host, _, port = url.removeprefix("http://").partition(":")
+    lines, ages = 0, list[float]()
+
+    async def one(job: str, token: str) -> None:
+        nonlocal lines
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(
+            f"GET /api/jobs/{job}/logs?follow=true HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
+        )
+        while chunk := await reader.read(1 << 16):
+            lines += chunk.count(b'{"time"')
+            for stamp in _TIMES.findall(chunk):
+                ages.append(time.time() - datetime.fromisoformat(stamp.decode()).timestamp())
+
+    tasks = [asyncio.ensure_future(one(*each)) for each in follows]
+    while lines < len(tasks):
+        await asyncio.sleep(0.1)
+        for task in filter(asyncio.Task.done, tasks):
+            raise SystemExit(f"a follower has left: {task.exception() or 'its stream ended'}")
+    await asyncio.sleep(5)
+    before, seen = cpu_seconds(controller), lines
+    ages.clear()
+    await asyncio.sleep(MEASURED)
+    work, memory, count = cpu_seconds(controller) - before, resident(controller), lines - seen
+    for task in tasks:
+        task.cancel()
+    return work, memory, count, sorted(ages)
+
+
+def resident(pid: int) -> float:
+    """Bytes."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def cpu_seconds(pid: int) -> float:
     user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
@@ -185,7 +279,8 @@ def measure(url: str, lines: int) -> list[tuple[str, list[float]]]:
 
 
 def main() -> None:
-    lines = int(sys.argv[1]) if len(sys.argv) > 1 else 900
+    only = sys.argv[1:] == ["followers"]
+    lines = int(sys.argv[1]) if len(sys.argv) > 1 and not only else 900
     with tempfile.TemporaryDirectory() as home:
         server = subprocess.Popen(
             [MUSTER, "serve", "--port", "0", "--cpus", "4"],
@@ -196,22 +291,35 @@ def main() -> None:
         try:
             assert server.stdout is not None
             url = server.stdout.readline().split()[2]
-            rows, read = measure(url, lines), rates(url, home, server.pid)
+            rows, read = ([], []) if only else (measure(url, lines), rates(url, home, server.pid))
+            many = followers(url, home, server.pid)
         finally:
             server.terminate()
             server.wait()
     print(f"{os.cpu_count()} cores ({platform.machine()}), load {os.getloadavg()[0]:.1f}, {NODES} nodes")
     print()
+    print("| many at once | controller's CPU, share of a core | memory | lines/s received | p50 | p99 |")
+    print("|---|---|---|---|---|---|")
+    for name, share, memory, rate, ages in many:
+        late = f"{_at(ages, 0.5)} | {_at(ages, 0.99)}" if ages else "– | –"
+        print(f"| {name} | {share:.1f} % | {memory:.0f} MiB | {rate:,.0f} | {late} |")
+    if only:
+        return
+    print()
     print("| line printed → client | lines | p50 | p99 |")
     print("|---|---|---|---|")
     for name, values in rows:
-        middle, high = values[len(values) // 2] * 1000, values[int(len(values) * 0.99)] * 1000
-        print(f"| {name} | {len(values)} | {middle:.0f} ms | {high:.0f} ms |")
+        print(f"| {name} | {len(values)} | {_at(values, 0.5)} | {_at(values, 0.99)} |")
     print()
     print("| a whole log read by | lines | lines/s | controller's CPU for a line |")
     print("|---|---|---|---|")
     for name, count, rate, work in read:
         print(f"| {name} | {count} | {round(rate, -3):,.0f} | {work * 1e6:.1f} µs |")
+
+
+def _at(values: list[float], part: float) -> str:
+    """The value below which that part of sorted values [s] lies."""
+    return f"{values[int(len(values) * part)] * 1000:.0f} ms"
 
 
 if __name__ == "__main__":

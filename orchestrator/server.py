@@ -207,6 +207,7 @@ class Server:
         machine.collect_all()
         self._lock.withdraw()
         self.app.state.closing.set()
+        self.reconciler.logs.close()
         self._uvicorn.should_exit = True
         if self._thread.is_alive():
             self._thread.join(timeout=5)

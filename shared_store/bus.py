@@ -1,4 +1,4 @@
-"""The bus's protocol, shared by both ends: the keys, and the credential that authenticates a message's sender.
+"""The bus's protocol, shared by both ends: the keys, the credential that authenticates a message's sender, and the messages about logs.
 
 A node's presence, progress and commands lie below ``muster/<job>/<attempt>/<node>``. Every node may connect to the router, so a
 key proves nothing: each attempt has a secret of its own, and each message carries a proof made with it.
@@ -17,6 +17,16 @@ LONGEST_ANSWER = 500_000
 """Characters of the answer to a command; longer answers are truncated."""
 LARGEST_PROGRESS = 65536
 """Bytes of JSON; the controller drops a larger report."""
+
+LARGEST_PUSH = 256 << 10
+"""Bytes of a node's log in one message; more is left to those who read the file."""
+LOG_LEASE = 40.0
+"""Seconds for which a node pushes its log after the command ``log``, which goes to all nodes of an attempt at once and has no answer.
+
+It publishes what it appends below ``log``, and states once a second, with its progress, where the file ends (``LOG_END``).
+"""
+LOG_END, LOG_IS_WHOLE = "logEnd", "logIsWhole"
+"""Members of a progress message: the end of the log [bytes], and whether the node has ended, so that nothing follows."""
 
 LEASE_MILLISECONDS = 2000
 """After how long without a sign the router counts a session as gone (the session's setting counts, not the router's). The controller's own
@@ -71,6 +81,16 @@ def presence_key(credential: Credential, job: str, attempt: int, node: int) -> s
     """The node's liveliness token. It carries no content, so its proof is part of the key, which only the controller can see."""
     key = f"{prefix(job, attempt, node)}/alive"
     return f"{key}/{credential.prove('presence', key)}"
+
+
+def log_command(job: str, attempt: int) -> str:
+    """The key of the command ``log`` to all nodes of an attempt."""
+    return f"muster/{job}/{attempt}/*/command/log"
+
+
+def push_proof(credential: Credential, key: str, position: int, data: bytes) -> str:
+    """The proof of a part of a log, which begins at ``position`` [bytes]."""
+    return credential.prove("log", key, str(position), hashlib.sha256(data).hexdigest())
 
 
 def node_of(key: str) -> Node | None:

@@ -1,7 +1,4 @@
-"""Windows of a job's log, read from anywhere and never whole: the lines before and after a place, and those that have a text.
-
-A place in the log of a job is the position in each of its nodes' logs, by ``attempt/node``, as :class:`.logs.LogFollower` has them.
-"""
+"""Windows of a job's log, read from anywhere and never whole: the lines before and after a place, and those that have a text."""
 
 from __future__ import annotations
 
@@ -10,23 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 
-from shared_store.files import open_regular
-from shared_store.layout import Run
-from shared_store.log_files import Segment, left_out, log_segments, read_log
-from shared_store.logs import HEAD, LIMIT_REACHED, LINES, LogFollower, LogLine, attempts_with_logs
-
-Places = dict[str, int]
+from shared_store.log_files import Segment, left_out, read_log
+from shared_store.log_view import CHUNK, WHOLE, Chosen, Key, LogView, Places, log_end, piece_before
+from shared_store.logs import LIMIT_REACHED, LogLine, lines_in
 
 LINES_A_WINDOW = 400
 _PIECE = 32 << 10
 """Bytes that are read of a log at once, backwards."""
-_WHOLE = 512 << 10
-"""More than the longest line."""
 _ROUNDS = 16
-"""Pieces of each log that are read for a window: few of its lines may be of the rank that is wanted."""
+"""Pieces of each log that are read for a window: few of its lines may be of the rank that was asked for."""
 _FORWARD = 64 << 10
 """Bytes that are read of each log at once, forwards: a window takes few of them."""
-_CHUNK = 1 << 20
 _SEARCHED = 32 << 20
 """Bytes that one search reads."""
 
@@ -58,32 +49,6 @@ class Window:
     """Whether there are earlier lines (of :func:`lines_before`) or later ones (of :func:`lines_after`)."""
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """Which lines of a job's log."""
-
-    run: Run
-    job: str
-    node: int | None = None
-    rank: int | None = None
-    attempt: int | None = None
-
-    def logs(self) -> dict[tuple[int, int], list[Segment]]:
-        """The files of each log, by attempt and node, in this order. Raises OSError."""
-        found = {}
-        for attempt in attempts_with_logs(self.run, self.job):
-            if self.attempt in (None, attempt):
-                for name, segments in log_segments(self.run.logs(self.job, attempt)).items():
-                    match = HEAD.fullmatch(name)
-                    if match and self.node in (None, int(match[1])):
-                        found[attempt, int(match[1])] = segments
-        return dict(sorted(found.items()))
-
-    def end(self) -> Places:
-        """The place after the last whole line. Raises OSError."""
-        return {f"{attempt}/{node}": _end(segments) for (attempt, node), segments in self.logs().items()}
-
-
 @dataclass
 class _Back:
     """One log that is read backwards."""
@@ -93,29 +58,21 @@ class _Back:
     segments: Sequence[Segment]
     place: int
     lines: list[tuple[int, LogLine]] = field(default_factory=list)
-    """Those that are wanted, with the positions before them."""
+    """Those that are chosen, with the positions before them."""
     oldest: str = ""
-    """Time of the first line that was read, wanted or not."""
+    """Time of the first line that was read, chosen or not."""
 
     def read(self, rank: int | None) -> None:
         """Read the piece before ``place``."""
-        start, data = _piece_before(self.segments, self.place, _PIECE)
+        start, data = piece_before(self.segments, self.place, _PIECE)
         if b"\n" not in data[:-1] and self.place - start >= _PIECE:
-            start, data = _piece_before(self.segments, self.place, _WHOLE)
+            start, data = piece_before(self.segments, self.place, WHOLE)
         cut = 0 if any(start == each.start for each in self.segments) else data.find(b"\n") + 1
         if cut == len(data):
             cut = 0  # a line that is none of Muster's: it is left out
-        found, oldest = [], ""
-        for match in LINES.finditer(data, cut):
-            written, number, stream, text = match.groups()
-            stamp = written.decode(errors="replace")
-            oldest = oldest or stamp
-            place = None if number == b"-" else int(number)
-            if rank is None or place == rank:
-                origin = (stamp, self.attempt, self.node, place, stream.decode())
-                line = LogLine(*origin, text.decode(errors="replace"), start + match.end())
-                found.append((start + match.start(), line))
-        self.oldest = oldest or self.oldest
+        every = list(lines_in(data, (self.attempt, self.node), start, cut))
+        self.oldest = every[0][1].time if every else self.oldest
+        found = [each for each in every if rank is None or each[1].rank == rank]
         missing = self._gap(start + cut)
         if missing:
             text = left_out(None, missing, LIMIT_REACHED)
@@ -191,7 +148,7 @@ def lines_after(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_WI
 
     Reads a bounded part of each log: it may return fewer lines than there are, and then has ``more``. Raises OSError.
     """
-    follower = LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(place), _FORWARD)
+    follower = LogView(chosen, dict(place), _FORWARD)
     lines = follower.poll()
     for _ in range(_ROUNDS - 1):
         if len(lines) >= most or not follower.behind:
@@ -237,24 +194,25 @@ def _search(
     for (attempt, node), segments in chosen.logs().items():
         key, inside, here = f"{attempt}/{node}", False, 0
         while True:
-            chunk = read_log(segments, reached.get(key, 0), _CHUNK, inside=inside)
+            chunk = read_log(segments, reached.get(key, 0), CHUNK, inside=inside)
             if not chunk.data:
                 break
             whole = chunk.data.rfind(b"\n") + 1
             inside = not whole
-            if not whole and len(chunk.data) < _CHUNK:
+            if not whole and len(chunk.data) < CHUNK:
                 break  # half a line, which is being written
             data = chunk.data[: whole or len(chunk.data)]
-            hits = _hits(data, needles, accepts, chosen.rank, (most - here if each else most - len(found)))
-            found += [LogLine(line.time, attempt, node, *line[3:6], chunk.start + line.position) for line in hits]
+            left_over = most - here if each else most - len(found)
+            hits = _hits(data, (attempt, node), chunk.start, needles, accepts, chosen.rank, left_over)
+            found += hits
             here += len(hits)
             is_enough = (here if each else len(found)) >= most
-            reached[key] = chunk.start + (hits[-1].position if is_enough else len(data))
+            reached[key] = hits[-1].position if is_enough else chunk.start + len(data)
             left -= len(data)
             if is_enough and not each:
                 return Found(found, reached, False)
             if is_enough:
-                reached[key] = _end(segments)
+                reached[key] = log_end(segments)
                 break
             if left <= 0:
                 return Found(found, reached, False)
@@ -262,9 +220,15 @@ def _search(
 
 
 def _hits(
-    data: bytes, needles: Sequence[bytes], accepts: Callable[[str], bool], rank: int | None, most: int
+    data: bytes,
+    log: Key,
+    start: int,
+    needles: Sequence[bytes],
+    accepts: Callable[[str], bool],
+    rank: int | None,
+    most: int,
 ) -> list[LogLine]:
-    """The first ``most`` lines with one of the needles; their positions are those in ``data``."""
+    """The first ``most`` lines with one of the needles in a part of a log, which begins at ``start``."""
     folded = data.lower()
     nexts = {needle: folded.find(needle) for needle in needles}
     hits: list[LogLine] = []
@@ -275,33 +239,10 @@ def _hits(
         begin, end = data.rfind(b"\n", 0, there) + 1, data.find(b"\n", there) + 1
         if end == 0:
             break
-        match = LINES.match(data, begin, end)
-        if match:
-            written, number, stream, text = (each.decode(errors="replace") for each in match.groups())
-            place = None if number == "-" else int(number)
-            if rank in (None, place) and accepts(text):
-                hits.append(LogLine(written, 0, 0, place, stream, text, end))
+        for _, line in lines_in(data, log, start, begin, end):
+            if rank in (None, line.rank) and accepts(line.text):
+                hits.append(line)
         for needle, at in nexts.items():
             if 0 <= at < end:
                 nexts[needle] = folded.find(needle, end)
     return hits
-
-
-def _end(segments: Sequence[Segment]) -> int:
-    """The position after the last whole line of a log."""
-    start, _, path = segments[-1]
-    size = start + path.stat().st_size
-    for most in (4 << 10, _WHOLE):
-        begin, data = _piece_before(segments, size, most)
-        if at := data.rfind(b"\n") + 1:
-            return begin + at
-    return start
-
-
-def _piece_before(segments: Sequence[Segment], place: int, most: int) -> tuple[int, bytes]:
-    """Up to ``most`` bytes of one file that end at ``place``, and the position of the first one."""
-    start, _, path = next((each for each in reversed(segments) if each.start < place), segments[0])
-    begin = max(start, place - most)
-    with open_regular(path) as file:
-        file.seek(max(0, begin - start))
-        return begin, file.read(max(0, place - begin))

@@ -98,8 +98,8 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     key = (id(reconciler), current_identity.get(), chosen.job)
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
     iteration, places = _had(last_id(request))
-    log = LiveLog(chosen, chosen.end() if places is None else places)
-    return stream(request, _Feed(look, log, chosen.run, iteration).changes, stored=True)
+    log = LiveLog(reconciler.logs, chosen, chosen.end() if places is None else places)
+    return stream(request, _Feed(look, log, chosen.run, iteration).changes, stored=True, during=log)
 
 
 def _read(
@@ -150,7 +150,7 @@ class _Feed:
             events += [Event(name, each.data) for each in rows.changes(seen[name], {})]
         if self.facts["run"]:
             events += self._curves()
-        lines, is_behind = self.log.changes()
+        lines, is_behind = self.log.changes(is_last=not self.facts["open"])
         events += [lines] if lines else []
         self.is_over = not self.facts["open"] and not is_behind
         given = json.dumps({"i": self.iteration, "l": self.log.places}, separators=(",", ":"))

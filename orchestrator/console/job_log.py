@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
@@ -11,12 +11,15 @@ from fastapi import Depends, Query, Request
 from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.following import PIECE
-from orchestrator.api.native.routes import permitted_job, positions_of
+from orchestrator.api.native.log_stream import positions_of
+from orchestrator.api.native.routes import permitted_job
 from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Event
 from orchestrator.console.routing import page_router
-from shared_store.log_windows import LINES_A_WINDOW, Chosen, Window, first_error, lines_after, lines_before, search
-from shared_store.logs import LogFollower, LogLine
+from orchestrator.control.log_hub import LogHub
+from shared_store.log_view import Chosen, LogView, Places
+from shared_store.log_windows import LINES_A_WINDOW, Window, first_error, lines_after, lines_before, search
+from shared_store.logs import LogLine
 
 router = page_router(stored=True)
 
@@ -57,11 +60,11 @@ def window(
     """A window of the log: its last lines, the lines before or after a place, or those around the line that ends at a place."""
     try:
         if after:
-            return _told(lines_after(chosen, positions_of(after)))
+            return _written(lines_after(chosen, positions_of(after)))
         if around:
             end = lines_after(chosen, positions_of(around), _AROUND).last
-            return _told(lines_before(chosen, end, LINES_A_WINDOW))
-        return _told(lines_before(chosen, positions_of(before) if before else chosen.end()))
+            return _written(lines_before(chosen, end, LINES_A_WINDOW))
+        return _written(lines_before(chosen, positions_of(before) if before else chosen.end()))
     except OSError as error:
         raise _unreadable(error) from None
 
@@ -86,7 +89,7 @@ def _unreadable(error: OSError) -> ClientError:
     return ClientError(f"the log can't be read now: {error.strerror or error}", 503)
 
 
-def _told(found: Window) -> dict[str, Any]:
+def _written(found: Window) -> dict[str, Any]:
     return {"lines": written(found.lines), "first": found.first, "last": found.last, "more": found.more}
 
 
@@ -95,36 +98,40 @@ def written(lines: Sequence[LogLine]) -> list[list[Any]]:
     return [[*line[:5], line.text if len(line.text) <= _LONGEST else f"{line.text[:_LONGEST]} …"] for line in lines]
 
 
-@dataclass
-class LiveLog:
-    """The lines of a log that are new to one page."""
+class LiveLog(AbstractContextManager["LiveLog"]):
+    """The lines of a log that are new to one page, while its block runs."""
 
-    chosen: Chosen
-    places: dict[str, int]
-    """The positions up to which the page has the lines."""
+    def __init__(self, hub: LogHub, chosen: Chosen, places: Places) -> None:
+        """``places``: the positions up to which the page has the lines."""
+        self.chosen, self.places = chosen, places
+        self._view, self._in_files = LogView(chosen, dict(places), PIECE), True
+        self._following = hub.follow(chosen.run, chosen.job, self)
 
-    def __post_init__(self) -> None:
-        self._follower = self._follow(self.places)
+    def __enter__(self) -> LiveLog:
+        self._logs = self._following.__enter__()
+        return self
 
-    def changes(self) -> tuple[Event | None, bool]:
-        """The event ``lines`` or ``window``, and whether there is more already.
+    def __exit__(self, *error: Any) -> None:
+        self._following.__exit__(*error)
+
+    def wake(self) -> None:
+        """The page looks at intervals anyway."""
+
+    def changes(self, is_last: bool) -> tuple[Event | None, bool]:
+        """The event ``lines`` or ``window``, and whether there is more already; ``is_last``: the job is over, so that the files have all.
 
         ``window``: the page has missed so much that it gets the last lines alone; ``skipped`` are the bytes before them. Raises OSError.
         """
-        end = self.chosen.end()
-        lag = sum(max(0, position - self.places.get(key, 0)) for key, position in end.items())
-        if lag > _MOST_LAG:
-            last = lines_before(self.chosen, end)
-            begun = sum(max(0, last.first.get(key, 0) - self.places.get(key, 0)) for key in end)
-            self._follower = self._follow(end)
-            self.places = dict(end)
-            return Event("window", {**_told(last), "skipped": begun}), False
-        lines = self._follower.poll()
-        self.places = dict(self._follower.offsets)
-        if not lines:
-            return None, self._follower.behind
-        return Event("lines", {"lines": written(lines), "last": self.places}), self._follower.behind
-
-    def _follow(self, places: Mapping[str, int]) -> LogFollower:
-        chosen = self.chosen
-        return LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(places), PIECE)
+        lines = None if is_last or self._in_files else self._view.poll_memory(self._logs, PIECE)
+        if lines is None:
+            end = self.chosen.end()
+            lag = sum(max(0, position - self.places.get(key, 0)) for key, position in end.items())
+            if lag > _MOST_LAG:
+                last = lines_before(self.chosen, end)
+                begun = sum(max(0, last.first.get(key, 0) - self.places.get(key, 0)) for key in end)
+                self._view, self.places = LogView(self.chosen, dict(end), PIECE), dict(end)
+                return Event("window", {**_written(last), "skipped": begun}), False
+            lines = self._view.poll()
+            self._in_files = self._view.behind
+        self.places = dict(self._view.offsets)
+        return Event("lines", {"lines": written(lines), "last": self.places}) if lines else None, self._view.behind

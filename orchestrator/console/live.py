@@ -7,7 +7,8 @@ import json
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import AsyncGenerator, Callable, Hashable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager, aclosing, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -58,8 +59,17 @@ def last_id(request: Request) -> str:
     return request.headers.get("last-event-id") or request.query_params.get("last", "")
 
 
-def stream(request: Request, look: Look, interval: float = INTERVAL, *, stored: bool = False) -> StreamingResponse:
+def stream(
+    request: Request,
+    look: Look,
+    interval: float = INTERVAL,
+    *,
+    stored: bool = False,
+    during: AbstractContextManager[object] | None = None,
+) -> StreamingResponse:
     """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends; ``stored``: it reads the store.
+
+    ``during``: a block around all looks.
 
     It also ends where its reader would not be admitted any more: a deleted key, a session that is over. The browser comes back, and is
     sent to the login.
@@ -73,7 +83,7 @@ def stream(request: Request, look: Look, interval: float = INTERVAL, *, stored: 
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
     calls = reconciler_of(request).followed if stored else None
-    events = _events(look, calls, interval, admitted, request.app.state.closing)
+    events = _within(during or nullcontext(), _events(look, calls, interval, admitted, request.app.state.closing))
     return _Live(events, media_type="text/event-stream", headers=headers)
 
 
@@ -81,6 +91,13 @@ class _Live(Following):
     def refusal(self, message: str) -> Response:
         trouble = _written(Event("trouble", f"{message}, and this one becomes live"))
         return Response(format_sse_event(retry=30_000, comment="Muster") + trouble, media_type=self.media_type)
+
+
+async def _within(block: AbstractContextManager[object], events: AsyncGenerator[bytes, None]) -> AsyncIterator[bytes]:
+    with block:
+        async with aclosing(events):
+            async for each in events:
+                yield each
 
 
 async def _events(

@@ -1,4 +1,4 @@
-"""The bus's router, inside the controller: which nodes are present, their progress, and commands to them.
+"""The bus's router, inside the controller: which nodes are present, their progress and logs, and commands to them.
 
 Every node may connect; access rules in the router let a node publish below node keys and answer commands, and nothing else: it
 can neither send a command nor read a message. A node's message counts only with the proof of its attempt's credential, and
@@ -27,12 +27,17 @@ from orchestrator.control.presence import Presence
 from shared_store.bus import (
     LARGEST_MESSAGE,
     LARGEST_PROGRESS,
+    LARGEST_PUSH,
     LEASE_MILLISECONDS,
+    LOG_END,
+    LOG_IS_WHOLE,
     Credential,
     Node,
+    log_command,
     node_of,
     prefix,
     presence_key,
+    push_proof,
 )
 from shared_store.files import DamagedFile, json_object, read_json, write_atomic, write_json
 
@@ -47,7 +52,7 @@ _ACCESS = {
             "permission": "allow",
             "flows": ["ingress"],
             "messages": ["put"],
-            "key_exprs": ["muster/*/*/*/progress"],
+            "key_exprs": ["muster/*/*/*/progress", "muster/*/*/*/log"],
         },
         {
             "id": "nodes-are-present",
@@ -86,6 +91,11 @@ _THREADS = "(rx: (worker_threads: 32))"
 """The router's receiving threads, in the syntax of ``ZENOH_RUNTIME``. A node that vanishes silently blocks one of them for 10 s
 (eclipse-zenoh/zenoh#2718): with the default of two, a host that dies with many nodes makes the router deaf for 5 s a node."""
 
+_UNANSWERED = 5.0
+"""Seconds for which a command without an answer is kept."""
+_DIGITS = 18
+"""Of the greatest position in a log."""
+
 _ITSELF: Node = ("controller", 0, 0)
 """The controller's own session, as a node that no job has."""
 
@@ -108,6 +118,12 @@ class Bus:
         """Which nodes are connected."""
         self.changed: Callable[[str], None] = lambda _: None
         """Called (on the network's thread) with the job of a node that came or went."""
+        self.pushed: Callable[[Node, int, bytes], None] = lambda *_: None
+        """Called (on the network's thread) with a part of a node's log and the position at which it begins."""
+        self.stated: Callable[[Node, int | None, bool], None] = lambda *_: None
+        """Called (on the network's thread) with the end of a node's log (None: it does not push it), and whether nothing follows."""
+        self.is_followed: Callable[[str], bool] = lambda _: False
+        """Whether somebody follows the logs of this job: pushes of others are dropped unread."""
         self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
         self._progress: dict[Node, dict[str, Any]] = {}
@@ -174,6 +190,7 @@ class Bus:
                     "muster/*/*/*/alive/*", direct(self._presence, indirect=False), history=True
                 ),
                 self._session.declare_subscriber("muster/*/*/*/progress", direct(self._note, indirect=False)),
+                self._session.declare_subscriber("muster/*/*/*/log", direct(self._take_log, indirect=False)),
             ]
             self._hear_itself(port)
         except zenoh.ZError as error:
@@ -254,6 +271,20 @@ class Bus:
                 return text
         raise BusError(f"node {node} did not answer within {seconds:g} s; is it still starting, frozen or cut off?")
 
+    def ask_for_logs(self, job: str, attempt: int) -> None:
+        """Have all nodes of an attempt push their logs for a while; those who know no pushes answer, and nobody listens."""
+        if self._session is None:
+            return
+        import zenoh
+
+        key, number = log_command(job, attempt), secrets.token_hex(16)
+        request = {"id": number, "proof": self._credential(job, attempt).prove("command", key, number)}
+        ignore: Any = zenoh.handlers.Callback(lambda _: None, indirect=False)
+        with contextlib.suppress(zenoh.ZError):  # the next time
+            self._session.get(
+                key, ignore, payload=json.dumps(request), target=zenoh.QueryTarget.ALL, timeout=_UNANSWERED
+            )
+
     def _credential(self, job: str, attempt: int) -> Credential:
         return Credential.derive(self._master, job, attempt)
 
@@ -284,9 +315,30 @@ class Bus:
             return
         self.presence.sent(node)
         progress = _message(payload)
+        end, is_whole = progress.pop(LOG_END, None), progress.pop(LOG_IS_WHOLE, False)
+        if self.is_followed(node[0]):
+            self.stated(node, end if type(end) is int and end >= 0 else None, is_whole is True)
         with self._lock:
             if progress and self.presence.expects(node):
                 self._progress[node] = progress
+
+    def _take_log(self, sample: Any) -> None:
+        key = str(sample.key_expr)
+        node = node_of(key)
+        if (
+            node is None
+            or sample.attachment is None
+            or not self.is_followed(node[0])
+            or not self.presence.expects(node)
+        ):
+            return
+        data, (proof, _, text) = sample.payload.to_bytes(), sample.attachment.to_bytes().partition(b" ")
+        if len(data) > LARGEST_PUSH or len(text) > _DIGITS or not text.isdigit():
+            return
+        position = int(text)
+        expected = push_proof(self._credential(*node[:2]), key, position, data)
+        if hmac.compare_digest(expected.encode(), proof):
+            self.pushed(node, position, data)
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.isolation import AT_ONCE, Isolation
 from orchestrator.control.kept_texts import KeptTexts
 from orchestrator.control.loaded import LoadedJobs
+from orchestrator.control.log_hub import LogHub
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention
@@ -88,6 +89,7 @@ class Reconciler:
         """The store, for requests."""
         self.followed = StoreCalls(store.path, self.store_problem)
         """The store, for those who follow logs and live pages: each has one call at most, however long that takes."""
+        self.logs = LogHub(database, bus, self.followed)
         self._is_cut_off = False
         self.work_queue = WorkQueue()
         self._loaded = LoadedJobs(database)
@@ -184,6 +186,7 @@ class Reconciler:
         if self._thread is not None:
             self._thread.join()
         self.attempts.close()
+        self.logs.close()
         self.calls.close()
         self.followed.close()
 
@@ -297,12 +300,14 @@ class Reconciler:
         """Note the jobs of a commit as they are, where this thread has made it; read them again after a commit of a request."""
         if threading.get_ident() == self._ticking:
             self.work_queue.note(jobs)
+            self.logs.changed(job.id for job in jobs)
         else:
             self._look_again([job.id for job in jobs])
 
     def _look_again(self, ids: Collection[str]) -> None:
         """Try failed actions on these jobs at once, since requests have changed the jobs."""
         self._loaded.changed(ids)
+        self.logs.changed(ids)
         for job_id in ids:
             for what in ("settle", "advance", "cancel", "preempt", "start"):
                 self._backoff.hurry((what, job_id))

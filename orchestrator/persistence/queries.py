@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
-from sqlalchemy import ColumnElement, and_, or_, select, update
+from sqlalchemy import ColumnElement, and_, func, or_, select, update
 from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.errors import RequestError
-from orchestrator.domain.job import EARLY, TERMINAL
+from orchestrator.domain.job import EARLY, TERMINAL, Status
 from orchestrator.domain.reasons import named
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.models import Attempt, Job, Node
 
 _NAMED = 5
 """Jobs that a refusal names."""
@@ -46,6 +46,18 @@ def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, can
         note_changed(session, session.scalars(select(Job.id).where(asked)))
         changes = {"stop_reason": reason, "cancelled": cancel}
         session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
+
+
+def states_of(session: Session, ids: Collection[str]) -> dict[str, tuple[Status, int | None, int]]:
+    """State of each of these jobs, and the number of its open attempt (None: it has none) with that of its nodes; those that are gone are left out."""
+    query = (
+        select(Job.id, Job.status, Attempt.number, func.count(Node.index))
+        .outerjoin(Attempt, (Attempt.job_id == Job.id) & Attempt.stopped_at.is_(None))
+        .outerjoin(Node, (Node.job_id == Attempt.job_id) & (Node.attempt == Attempt.number))
+        .where(Job.id.in_(ids))
+        .group_by(Job.id, Job.status, Attempt.number)
+    )
+    return {job: (Status(status), attempt, nodes) for job, status, attempt, nodes in session.execute(query)}
 
 
 def unknown_job(session: Session, reference: str, queues: Collection[str] | None = None) -> str:

@@ -17,7 +17,7 @@ from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
-from shared_store.logs import LogFollower
+from shared_store.log_view import LogView
 from shared_store.metrics import read_metrics
 from shared_store.outcomes import read_outcome
 from tests.conftest import PATIENCE, REPOSITORY, wait_for
@@ -83,6 +83,6 @@ def test_loss_and_delay_cost_time_and_a_cut_is_found_and_named(link: Link, tmp_p
     assert all(codes) and all(outcomes), (codes, outcomes)
     stalls = [outcome.reason for outcome in outcomes if outcome and "made no progress for" in outcome.reason]
     assert stalls and "it waits, perhaps for another rank" in stalls[0], outcomes
-    log = [line.text for line in LogFollower(run, "job").drain()]
+    log = [line.text for line in LogView.of(run, "job").drain()]
     assert any("stall: rank" in line for line in log) and any("all_reduce" in line for line in log), log[-30:]
     assert not processes_of(tmp_path)

@@ -1,4 +1,4 @@
-"""The node's end of the bus: its presence, its progress, and the commands that reach it.
+"""The node's end of the bus: its presence, its progress, its log while somebody follows it, and the commands that reach it.
 
 Only the supervisor speaks on the bus; training knows nothing of it, so a bus that is off, slow or restarted can't be noticed
 there. Nothing in here waits: a router that is away is tried again, and what is put meanwhile is lost, which is allowed.
@@ -11,9 +11,23 @@ import json
 import os
 import queue
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from shared_store.bus import LARGEST_PROGRESS, LEASE_MILLISECONDS, LONGEST_ANSWER, Credential, prefix, presence_key
+from shared_store.bus import (
+    LARGEST_PROGRESS,
+    LARGEST_PUSH,
+    LEASE_MILLISECONDS,
+    LOG_END,
+    LOG_IS_WHOLE,
+    LOG_LEASE,
+    LONGEST_ANSWER,
+    Credential,
+    log_command,
+    prefix,
+    presence_key,
+    push_proof,
+)
 from shared_store.contract import NodeContract
 from shared_store.files import json_object
 
@@ -22,6 +36,8 @@ if TYPE_CHECKING:
 
 _RETRY_SECONDS = 2.0
 _PROGRESS_SECONDS = 1.0
+_PUSHED_A_SECOND = 2 << 20
+"""Bytes of its log that a node pushes in one second; of more, those who follow it read the file."""
 
 
 class Command:
@@ -58,9 +74,33 @@ class NodeBus:
         self._session: zenoh.Session | None = None
         self._declared: list[Any] = []
         self._next_try = self._next_progress = 0.0
+        self._followed_until = 0.0
+        self._pushed = 0
+        """Bytes since the last progress."""
 
-    def tend(self, progress: dict[str, Any] | None) -> None:
-        """Open the session where there is none yet, and publish ``progress`` once a second: an empty one, too, is a sign of life."""
+    @property
+    def is_followed(self) -> bool:
+        """Whether somebody follows the node's log."""
+        return self._session is not None and time.monotonic() < self._followed_until
+
+    def push_log(self, position: int, data: bytes) -> None:
+        """Publish a part of the node's log, which begins at ``position`` [bytes]; too much at once is left to those who read the file."""
+        self._pushed += len(data)
+        if self._session is None or len(data) > LARGEST_PUSH or self._pushed > _PUSHED_A_SECOND:
+            return
+        key = f"{self._prefix}/log"
+        self._put(key, data, f"{push_proof(self._credential, key, position, data)} {position}")
+
+    def end_log(self, progress: dict[str, Any] | None, end: int | None) -> None:
+        """Tell those who follow the node's log that it is whole, and where it ends [bytes]."""
+        if self.is_followed and end is not None:
+            self._put_progress({**(progress or {}), LOG_END: end, LOG_IS_WHOLE: True})
+
+    def tend(self, progress: dict[str, Any] | None, log_end: Callable[[], int | None] = lambda: None) -> None:
+        """Open the session where there is none yet, and publish ``progress`` once a second: an empty one, too, is a sign of life.
+
+        ``log_end``: the end of the node's log [bytes], which followers of it are told; None where it is unknown.
+        """
         now = time.monotonic()
         if self.contract.bus is None:
             return
@@ -69,14 +109,22 @@ class NodeBus:
             self._open()
         if self._session is not None and now >= self._next_progress:
             self._next_progress = now + _PROGRESS_SECONDS
-            import zenoh
+            self._pushed = 0
+            end = log_end() if self.is_followed else None
+            self._put_progress({**(progress or {}), **({} if end is None else {LOG_END: end})})
 
-            # DROP: a reader that is slow must cost a message, not our time
-            drop = zenoh.CongestionControl.DROP
-            key, text = f"{self._prefix}/progress", json.dumps(progress or {})
-            if len(text) <= LARGEST_PROGRESS:
-                proof = self._credential.prove("progress", key, text)
-                self._session.put(key, text, attachment=proof, congestion_control=drop)
+    def _put_progress(self, progress: dict[str, Any]) -> None:
+        key, text = f"{self._prefix}/progress", json.dumps(progress)
+        if len(text) <= LARGEST_PROGRESS:
+            self._put(key, text, self._credential.prove("progress", key, text))
+
+    def _put(self, key: str, payload: str | bytes, attachment: str) -> None:
+        import zenoh
+
+        # DROP: a reader that is slow must cost a message, not our time
+        drop = zenoh.CongestionControl.DROP
+        if self._session is not None:
+            self._session.put(key, payload, attachment=attachment, congestion_control=drop)
 
     def close(self) -> None:
         """Leave the bus; the token is withdrawn."""
@@ -128,6 +176,10 @@ class NodeBus:
             number, proof = "", None
         known = not isinstance(number, str) or number in self._heard
         if known or not self._credential.proves(proof, "command", key, number):
+            query.drop()
+            return
+        if key == log_command(*self._node[:2]):
+            self._followed_until = time.monotonic() + LOG_LEASE
             query.drop()
             return
         self._heard.add(number)

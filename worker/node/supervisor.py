@@ -117,6 +117,7 @@ class Supervisor:
         if self._kept:
             self.write(None, "o", f"the job's directories are kept: {self._kept} on {socket.gethostname()}")
         self.write(None, "o", END_LINE.format(node=self.contract.node_index, reason=outcome.reason))
+        self.bus.end_log(self.ranks[0].progress, self._log_end())
         code = self._commit(outcome)
         self.bus.close()
         for number in _REQUESTS:  # whose default, which Python restores at its end, is another exit code
@@ -225,7 +226,7 @@ class Supervisor:
         """Carry out the commands that came, and tell how the node is."""
         if not self.ranks:
             return
-        self.bus.tend(self.ranks[0].progress)
+        self.bus.tend(self.ranks[0].progress, self._log_end)
         while not self.bus.commands.empty():
             command = self.bus.commands.get()
             if command.name == "checkpoint":
@@ -277,12 +278,26 @@ class Supervisor:
         if self._lost[0]:
             lines, size, why = self._lost
             note = left_out(lines, size, f"the log could not be written ({why})")
-            if self._log.append(format_line(time.time(), None, "e", note).encode()):
+            if self._append(format_line(time.time(), None, "e", note).encode()):
                 self._lost = (0, 0, "")
         data = format_lines(time.time(), rank, stream, texts).encode(errors="backslashreplace")
-        rest = data if self._lost[0] else data[self._log.append(data) :]
+        rest = data if self._lost[0] else data[self._append(data) :]
         if rest and self._log.error:
             self._lose(rest, self._log.error)
+
+    def _append(self, data: bytes) -> int:
+        """Append lines to the log, and push them to those who follow it; returns how many bytes the log has taken."""
+        written = self._log.append(data)
+        if written and self.bus.is_followed and (end := self._log_end()) is not None:
+            self.bus.push_log(end - written, data[:written])
+        return written
+
+    def _log_end(self) -> int | None:
+        """The end of the log; None where it can't be read now."""
+        try:
+            return self._log.end
+        except OSError:
+            return None
 
     def _lose(self, data: bytes, error: OSError) -> None:
         why = error.strerror or str(error)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from shared_store.files import read_json
 from shared_store.layout import Run
-from shared_store.logs import LogFollower
+from shared_store.log_view import LogView
 from shared_store.metrics import history_of
 from shared_store.wording import counted
 from worker.errors import UserError
@@ -59,7 +59,7 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
             print(f"note: the training has {counted(asking.worlds, 'world')} on its main rank", flush=True)
         if asking.note:
             print(f"note: {asking.note}", flush=True)
-        log = LogFollower(run, job)
+        log = LogView.of(run, job)
         for _ in log.drain():
             pass  # older than the recording
         segment.skip()

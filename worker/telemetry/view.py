@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from shared_store.layout import Run
-from shared_store.logs import LogFollower, LogLine
+from shared_store.log_view import LogView
+from shared_store.logs import LogLine
 from shared_store.metrics import history_of
 from shared_store.wording import counted
 from worker.accepting import CHANGED_ROBOTS
@@ -76,7 +77,7 @@ class Training:
         except BaseException:
             self._asking.withdraw()
             raise
-        self._log = LogFollower(run, job)
+        self._log = LogView.of(run, job)
         self._iteration = 0
         self.frames = 0
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from shared_store.files import DamagedFile, open_regular
 from shared_store.log_files import Segment, left_out, read_log, segments_of
-from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED
+from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
 
 _BLOCK = 32 << 10
 """Bytes between two marks."""
@@ -33,11 +33,10 @@ _BARREN = 64 << 20
 _ENDS = 256 << 10
 """Bytes at either end of a file that are read for its first and its last time: more than one line."""
 
-_STAMP = rb"(?:19[7-9]\d|2[01]\d\d)-(?:0[1-9]|1[0-2])-(?:0[1-9]|[12]\d|3[01])T(?:[01]\d|2[0-3]):[0-5]\d:[0-5]\d\.\d{6}Z"
-_SOURCE = rb" (?!- o " + END_LINE.format(node=r"\d+", reason="").encode() + rb")(?:-|\d+) [oe] "
-"""Rank and stream of a line that is an event: the supervisor's last line is none."""
-_LINE = re.compile(rb"(" + _STAMP + rb")" + _SOURCE + rb"(.*)", re.DOTALL)
-_STAMPS = re.compile(rb"^(" + _STAMP + rb")" + _SOURCE, re.MULTILINE)
+_END = END_LINE.format(node=r"\d+", reason="")
+_IS_END = re.compile(_END)
+_STAMPS = re.compile(rb"^(" + STAMP + rb") (?!- o " + _END.encode() + rb")(?:-|\d+) [oe] ", re.MULTILINE)
+"""Times of the lines that are events."""
 
 
 class Event(NamedTuple):
@@ -126,7 +125,7 @@ class LogFile:
                 self._mark(self._end)
             newest = max(_STAMPS.findall(chunk.data, start, stop), default=b"")
             self._barren += 0 if newest else stop - start
-            self._top = max(self._top, _milliseconds(newest))
+            self._top = max(self._top, milliseconds(newest.decode()))
             self._end, start = chunk.start + stop, stop
         return bool(whole)
 
@@ -205,13 +204,10 @@ class View:
             text = left_out(self.gap.lines, self.gap.end - self.gap.start, LIMIT_REACHED)
             return [Event(time, self.file.source, offset, self.gap.end, self.file.stream, text)]
         events = []
-        for line in self._read(offset, stop - offset).split(b"\n"):
-            end = offset + len(line) + 1
-            if match := _LINE.fullmatch(line):
-                time = max(time, _milliseconds(match[1]))
-                text = match[2].decode(errors="replace")
-                events.append(Event(time, self.file.source, offset, end, self.file.stream, text))
-            offset = end
+        for begin, line in lines_in(self._read(offset, stop - offset), (0, 0), offset):
+            if is_event(line):
+                time = max(time, milliseconds(line.time))
+                events.append(Event(time, self.file.source, begin, line.position, self.file.stream, line.text))
         return events
 
     def _read(self, offset: int, size: int) -> bytes:
@@ -245,8 +241,8 @@ def first_and_last(path: Path) -> tuple[int, int, int] | None:
         return None
     if not head:
         return None
-    first = _milliseconds(head[1])
-    return first, max(first, _milliseconds(max(tail, default=b""))), sum(sizes)
+    first = milliseconds(head[1].decode())
+    return first, max(first, milliseconds(max(tail, default=b"").decode())), sum(sizes)
 
 
 def stored_bytes(path: Path) -> int:
@@ -257,12 +253,17 @@ def stored_bytes(path: Path) -> int:
         return 0
 
 
-def _milliseconds(stamp: bytes) -> int:
+def is_event(line: LogLine) -> bool:
+    """Whether CloudWatch Logs shows a line: the supervisor's last one is no output of the job."""
+    return line.rank is not None or line.stream != "o" or _IS_END.match(line.text) is None
+
+
+def milliseconds(stamp: str) -> int:
     """Unix time [ms] of a line's stamp; 0 for none."""
     return _seconds(stamp[:19]) * 1000 + int(stamp[20:23]) if stamp else 0
 
 
 @lru_cache(maxsize=1024)
-def _seconds(stamp: bytes) -> int:
-    parts = re.split(rb"[-T:]", stamp)
+def _seconds(stamp: str) -> int:
+    parts = re.split("[-T:]", stamp)
     return timegm((*map(int, parts), 0, 0, 0))

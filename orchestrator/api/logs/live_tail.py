@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-import heapq
+import contextlib
 import logging
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Collection, Iterator
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from typing import Any
 
-from orchestrator.api.http.following import looked, pause
+from orchestrator.api.http.following import MEMORY_PIECE, looked, pause
 from orchestrator.api.logs import eventstream
-from orchestrator.api.logs.events import Event, LogFile
+from orchestrator.api.logs.events import Event, is_event, milliseconds
 from orchestrator.api.logs.filter import Matcher
-from orchestrator.api.logs.streams import newest_streams
+from orchestrator.api.logs.streams import Stream, newest_streams
+from orchestrator.control.log_hub import Waker
+from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.models import now
+from shared_store.layout import Run
+from shared_store.log_view import Chosen, Key, LogView
+from shared_store.logs import LogLine
 
 LONGEST_SESSION = 3 * 3600.0
 """Seconds, as on AWS."""
@@ -26,10 +33,10 @@ MOST_EVENTS = 500
 """Events of one update."""
 _MOST_PENDING = 10 * MOST_EVENTS
 """Events that are sent at once; of more, every n-th is kept: the client can't keep up, or nobody could read it."""
-_MOST_BEHIND = 4 << 20
-"""Bytes of a stream that a session goes back to when its client was slow; what is older is left out."""
-_POLL = 0.025
-"""Seconds between two looks at the files; longer where a look takes longer than a quarter of that."""
+_PAUSE = 0.025
+"""Seconds between two looks, while few are open."""
+_BEAT = 1.0
+"""Seconds after which an update without events is sent."""
 _AGAIN = 1.0
 """Seconds until a store that can't be read is tried again."""
 _REFRESH = 0.25
@@ -40,72 +47,133 @@ _OVERLAP = 5000
 log = logging.getLogger("muster.api")
 
 
+@dataclass
+class _Job:
+    """A job that a session follows."""
+
+    view: LogView
+    logs: JobLogs
+    following: AbstractContextManager[JobLogs]
+    needs_files: bool = True
+    """Whether the files have what memory has not, or may have it."""
+    streams: dict[Key, Stream] = field(default_factory=dict)
+    """Those of its logs that are asked for."""
+    newest: dict[Key, int] = field(default_factory=dict)
+    """Time of each one's newest event [ms]: times never fall within a stream."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no more lines can come, as the database had it before the files were looked at."""
+        return not any(stream.live for stream in self.streams.values())
+
+    def events(self, lines: Iterable[LogLine]) -> Iterator[Event]:
+        """The events of those lines that are in a stream."""
+        for line in lines:
+            key = line.attempt, line.node
+            if key in self.streams and is_event(line):
+                time = self.newest[key] = max(self.newest.get(key, 0), milliseconds(line.time))
+                stream = self.streams[key]
+                yield Event(time, stream.file.source, line.position, line.position, stream.name, line.text)
+
+
 class LiveTail:
-    """Follows streams from the moment of its construction. Not for more than one thread at a time."""
+    """Follows streams from the moment of its beginning. Not for more than one thread at a time."""
 
     def __init__(
         self, reconciler: Reconciler, groups: Collection[str], wanted: Callable[[str], bool], matches: Matcher
     ) -> None:
-        """Args:
-        controller: Whose jobs' logs are followed.
-        groups: Names of the log groups.
-        wanted: Whether a stream is asked for, by its name.
-        matches: Whether a line is asked for.
+        """Raises OSError.
+
+        Args:
+            reconciler: Whose jobs' logs are followed.
+            groups: Names of the log groups.
+            wanted: Whether a stream is asked for, by its name.
+            matches: Whether a line is asked for.
         """
         self._reconciler, self._groups, self._wanted, self._matches = reconciler, groups, wanted, matches
         self.group_of: dict[str, str] = {}
         """Group of each stream that was followed."""
-        self.calls = reconciler.followed
+        self.calls, self.waker = reconciler.followed, Waker()
         self._started = self._asked = now()
-        self._next_refresh = 0.0
-        self._read: dict[str, int] = {}
-        """Bytes of each stream that were looked through."""
-        self._begun: dict[str, int] = {}
-        """Each stream's number of beginnings when it was looked at last."""
-        self._open: dict[str, LogFile] = {}
+        self._next_refresh, self._is_asked = 0.0, threading.Event()
+        self._jobs: dict[str, _Job] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
-        self._refresh()
-        for name, file in self._open.items():
-            view = file.look()
-            self._read[name], self._begun[name] = view.end, view.begun
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(reconciler.logs.watch(self))
+            stack.callback(lambda: self._leave(list(self._jobs)))
+            self._refresh(from_now=True)
+            self._entered = stack.pop_all()
 
-    def poll(self) -> tuple[list[Event], bool]:
-        """The events since the last call, in order, and whether some were left out. Raises OSError."""
-        ended = self._refresh() if time.monotonic() >= self._next_refresh else []
-        fresh, behind = [], False
-        for name, file in self._open.items():
-            view = file.look()
-            start = self._read.get(name, 0)
-            told = []
-            if self._begun.setdefault(name, view.begun) != view.begun:
-                start, told, self._begun[name] = 0, [view.replaced()], view.begun
-            behind = behind or view.end - start > _MOST_BEHIND
-            events = view.forward(0, max(start, view.end - _MOST_BEHIND))
-            fresh.append([*told, *(event for event in events if self._matches(event.text))])
-            self._read[name] = view.end
-        for name in ended:
-            self._open.pop(name)
-            self._read.pop(name, None)
-            self._begun.pop(name, None)
-            self._over.add(name)
-        merged = list(heapq.merge(*fresh))
-        if len(merged) > _MOST_PENDING:
-            count = len(merged)  # the newest is always among them
-            return [merged[(place + 1) * count // _MOST_PENDING - 1] for place in range(_MOST_PENDING)], True
-        return merged, behind
+    def wake(self) -> None:
+        """Some job has changed: there may be new streams."""
+        self._is_asked.set()
+        self.waker.wake()
 
-    def _refresh(self) -> list[str]:
-        """Take up streams that began; returns the names of those that ended before this call: the next look is their last."""
+    def close(self) -> None:
+        """Follow nothing any more."""
+        self._entered.close()
+
+    def poll_memory(self) -> list[Event] | None:
+        """The events since the last call, in order; None where only the files, or the database, have them."""
+        is_due = self._is_asked.is_set() and time.monotonic() >= self._next_refresh
+        if is_due or any(job.needs_files for job in self._jobs.values()):
+            return None
+        events = list[Event]()
+        for job in self._jobs.values():
+            lines = job.view.poll_memory(job.logs, MEMORY_PIECE)
+            job.needs_files = lines is None
+            events += job.events(lines or ())
+        return self._chosen(events)
+
+    def poll(self) -> list[Event]:
+        """:meth:`poll_memory` with the files and the database. Raises OSError."""
+        if self._is_asked.is_set():
+            self._refresh(from_now=False)
+        events = list[Event]()
+        for job in self._jobs.values():
+            if job.needs_files:
+                events += job.events(job.view.poll())
+                job.needs_files = job.view.behind
+        self._leave([name for name, job in self._jobs.items() if job.is_over and not job.needs_files])
+        return self._chosen(events)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether there is more already."""
+        return any(job.needs_files or job.view.behind for job in self._jobs.values())
+
+    def _chosen(self, events: Iterable[Event]) -> list[Event]:
+        return sorted(event for event in events if self._matches(event.text))
+
+    def _refresh(self, *, from_now: bool) -> None:
+        """Take up streams that began; those that ended before this call have their last look."""
+        self._is_asked.clear()
         asked = now()
         with self._reconciler.database.session() as session:
             since = max(self._started, self._asked - _OVERLAP)
             streams = newest_streams(session, self._reconciler.store, self._groups, since=since)
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
-        found = [stream for stream in streams if stream.name not in self._over and self._wanted(stream.name)]
-        self._open.update({stream.name: stream.file for stream in found})
-        self.group_of.update({stream.name: stream.group for stream in found})
-        return [stream.name for stream in found if not stream.live]
+        for stream in streams:
+            if stream.run is not None and stream.name not in self._over and self._wanted(stream.name):
+                job = self._follow(stream.run, stream.job, from_now)
+                job.streams[stream.attempt, stream.node] = stream
+                job.needs_files = job.needs_files or job.is_over
+                self.group_of[stream.name] = stream.group
+
+    def _follow(self, run: Run, job: str, from_now: bool) -> _Job:
+        if job not in self._jobs:
+            chosen = Chosen(run, job)
+            places = chosen.end() if from_now else {}
+            following = self._reconciler.logs.follow(run, job, self.waker)
+            self._jobs[job] = _Job(LogView(chosen, places), following.__enter__(), following)
+        return self._jobs[job]
+
+    def _leave(self, jobs: Iterable[str]) -> None:
+        for name in jobs:
+            job = self._jobs.pop(name)
+            job.following.__exit__(None, None, None)
+            self._over.update(stream.name for stream in job.streams.values())
 
 
 async def messages(
@@ -120,14 +188,13 @@ async def messages(
         closing: Set when the server ends.
     """
     identity = {"requestId": str(uuid.uuid4()), "sessionId": str(uuid.uuid4())}
+    over = time.monotonic() + LONGEST_SESSION
     yield eventstream.event("initial-response", {})
     yield eventstream.event("sessionStart", {**identity, **start})
-    over = time.monotonic() + LONGEST_SESSION
-    beat = time.monotonic() + 1.0
+    beat = time.monotonic() + _BEAT
     while not closing.is_set():
-        before = time.monotonic()
         try:
-            events, sampled = await looked(tail.poll, tail.calls)
+            events, sampled = await _polled(tail)
         except (OSError, StoreSilent) as error:  # the store is away: it may come back, and nothing is lost
             log.warning("live tail: %s", error)
             events, sampled = [], False
@@ -144,8 +211,20 @@ async def messages(
             identified = [(event, f"{account}:{tail.group_of[event.stream]}") for event in events]
             for update in _updates(identified, sampled):
                 yield update
-            beat = current + 1.0
-        await asyncio.sleep(max(pause(_POLL), 4 * (current - before)))
+            beat = current + _BEAT
+        if not tail.is_behind:
+            await tail.waker.wait(max(0.0, beat - time.monotonic()))
+            await asyncio.sleep(pause(_PAUSE))
+
+
+async def _polled(tail: LiveTail) -> tuple[list[Event], bool]:
+    """The new events, from memory where that has them, else from the files; and whether some of them were left out."""
+    found = await looked(tail.poll_memory, None)
+    if found is None:
+        found = await looked(tail.poll, tail.calls)
+    if (count := len(found)) > _MOST_PENDING:  # the newest is always among them
+        return [found[(place + 1) * count // _MOST_PENDING - 1] for place in range(_MOST_PENDING)], True
+    return found, False
 
 
 def _updates(events: list[tuple[Event, str]], sampled: bool) -> Iterator[bytes]:

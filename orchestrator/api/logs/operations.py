@@ -11,7 +11,8 @@ import json
 import re
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import closing
 from functools import partial
 from itertools import chain, islice
 from typing import Any
@@ -19,6 +20,7 @@ from typing import Any
 from botocore.validate import ParamValidator
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from orchestrator.api.arns import here, log_group_arn
 from orchestrator.api.batch.service_model import service_model
@@ -56,13 +58,13 @@ _LIST_TOKEN = re.compile(r"([0-9]{1,15})/(.+)")
 
 
 async def answer(
-    reconciler: Reconciler, closing: threading.Event, target: str, body: Callable[[], Awaitable[Any]]
+    reconciler: Reconciler, ending: threading.Event, target: str, body: Callable[[], Awaitable[Any]]
 ) -> Response:
     """Answer one request; a refusal is an answer, too.
 
     Args:
-        controller: Whose logs these are.
-        closing: Set when the server ends, which ends the streams.
+        reconciler: Whose logs these are.
+        ending: Set when the server ends, which ends the streams.
         target: The header ``X-Amz-Target``.
         body: Reads the request's JSON. Raises ClientError.
     """
@@ -75,7 +77,7 @@ async def answer(
         check(Operation(operation))
         request = validate(operation, await body())
         if operation == "StartLiveTail":
-            return await reconciler.calls.answer(partial(start_live_tail, reconciler, closing, request))
+            return await reconciler.calls.answer(partial(start_live_tail, reconciler, ending, request))
         if operation in groups.WRITES:
             await run_in_threadpool(groups.write, reconciler, operation, request)
             return JSONResponse({}, media_type=JSON)
@@ -246,7 +248,7 @@ _INSTEAD = {
 """Substitutes for unsupported operations, by a part of their names."""
 
 
-def start_live_tail(reconciler: Reconciler, closing: threading.Event, request: dict[str, Any]) -> Response:
+def start_live_tail(reconciler: Reconciler, ending: threading.Event, request: dict[str, Any]) -> Response:
     """StartLiveTail: an event stream of the lines that are written from now on. Streams need not exist yet."""
     with reconciler.database.session() as session:
         tailed = [groups.existing(session, identifier) for identifier in request["logGroupIdentifiers"]]
@@ -265,11 +267,20 @@ def start_live_tail(reconciler: Reconciler, closing: threading.Event, request: d
     start |= {"logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
     tail = LiveTail(reconciler, tailed, asked_for, matches)
-    stream = messages(tail, start, here().id, closing)
-    return _Session(stream, media_type="application/vnd.amazon.eventstream")
+    return _Session(tail, messages(tail, start, here().id, ending))
 
 
 class _Session(Following):
+    media_type = "application/vnd.amazon.eventstream"
+
+    def __init__(self, tail: LiveTail, stream: AsyncIterator[bytes]) -> None:
+        super().__init__(stream)
+        self._tail = tail
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with closing(self._tail):  # which follows already
+            await super().__call__(scope, receive, send)
+
     def refusal(self, message: str) -> Response:
         return LogsError("LimitExceededException", message).response()
 

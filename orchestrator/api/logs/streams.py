@@ -18,7 +18,7 @@ from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.own_models import LogStream
-from shared_store.layout import Store
+from shared_store.layout import Run, Store
 
 MOST_STREAMS = 1000
 """A request that names no stream is about this many: those of the newest jobs that it can be about."""
@@ -40,6 +40,11 @@ class Stream:
     """Unix time [ms]."""
     live: bool = False
     """Whether more lines can come; asked before the file is looked at, so that False means: all is there."""
+    run: Run | None = None
+    job: str = ""
+    attempt: int = 0
+    node: int = 0
+    """Whose log it is; of a stream that a client has created, nobody's."""
 
     @property
     def file(self) -> LogFile:
@@ -116,4 +121,5 @@ def _streams(store: Store, job: Job, attempt: Attempt, groups: Collection[str]) 
         group = LOG_GROUP if node.log_group is None else node.log_group
         if group in groups:
             name = stream_name(job, attempt.number, node.index, node.log_prefix)
-            yield Stream(name, group, run.log(job.id, attempt.number, node.index), attempt.created_at, live)
+            path, log = run.log(job.id, attempt.number, node.index), (job.id, attempt.number, node.index)
+            yield Stream(name, group, path, attempt.created_at, live, run, *log)

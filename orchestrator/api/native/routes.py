@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-import threading
-import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Annotated, Any
@@ -22,7 +18,7 @@ from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import named_definition, queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
-from orchestrator.api.http.following import PIECE, Following, looked, looked_patiently, pause
+from orchestrator.api.http.following import PIECE, Following
 from orchestrator.api.native import (
     job_list,
     key_routes,
@@ -37,13 +33,13 @@ from orchestrator.api.native import (
     track_routes,
     webhook_routes,
 )
+from orchestrator.api.native.log_stream import followed, positions_of, stored
 from orchestrator.api.permissions import Operation
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
-from orchestrator.control.store_calls import StoreCalls, StoreSilent
-from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named, short_id
@@ -51,10 +47,9 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, unknown_job
-from orchestrator.persistence.session import DatabaseError
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
-from shared_store.logs import LogFollower, LogLine, timestamp
+from shared_store.log_view import Chosen, LogView
 from shared_store.phases import Phase, phase_in
 
 router = APIRouter(prefix="/api")
@@ -69,15 +64,6 @@ router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)
 router.include_router(plan_routes.router)
-
-_POLL = 0.05
-"""Seconds between two looks at a log that is followed, while few are."""
-_AGAIN = 1.0
-"""Seconds until a store that can't be read is tried again."""
-_PATIENCE = 30.0
-"""Seconds for which a log that is not followed may keep its reader waiting."""
-_HEARTBEAT = 5.0
-"""Seconds after which an idle stream sends an empty line, which is how a client that left is noticed."""
 
 
 def permitted_job(session: Session, reference: str, operation: Operation) -> Job:
@@ -237,24 +223,10 @@ def job_logs(
             raise ClientError(
                 f"job {named(job.name, job.id)} has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
-        follower = LogFollower(
-            reconciler.store.run(job.run), job.id, node, rank, attempt, positions_of(positions), PIECE
-        )
-        job_id = job.id
-    followed, closing = reconciler.followed, request.app.state.closing
-    lines = _follow(reconciler, job_id, follower, closing) if follow else _stored(followed, follower)
+        chosen = Chosen(reconciler.store.run(job.run), job.id, node, rank, attempt)
+    view, calls = LogView(chosen, positions_of(positions), PIECE), reconciler.followed
+    lines = followed(view, reconciler.logs, calls, request.app.state.closing) if follow else stored(view, calls)
     return Following(lines, media_type="application/x-ndjson")
-
-
-def positions_of(text: str) -> dict[str, int]:
-    """Raises ClientError."""
-    try:
-        given = json.loads(text)
-        if all(isinstance(position, int) and 0 <= position < 2**63 for position in given.values()):
-            return dict(given)
-    except (ValueError, AttributeError, RecursionError):
-        pass
-    raise ClientError('positions: expected a JSON object such as {"1/0": 4096}')
 
 
 @router.post("/jobs/{reference}/checkpoint")
@@ -323,64 +295,3 @@ def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
         "wastedCpuSeconds": attempt.wasted_cpu_seconds,
         "nodes": nodes,
     }
-
-
-async def _stored(calls: StoreCalls, follower: LogFollower) -> AsyncIterator[str]:
-    """All that is there, many lines at a time: each piece costs a hand-over between threads."""
-    pieces = map(_json_lines, follower.batches())  # on the thread: many may begin at once
-    try:
-        while (lines := await asyncio.wait_for(looked(lambda: next(pieces, None), calls), _PATIENCE)) is not None:
-            yield lines
-    except TimeoutError:
-        yield _trouble(OSError(f"the store has not answered for {_PATIENCE:.0f} s"))
-    except (OSError, ValueError, StoreSilent) as error:
-        yield _trouble(error)
-
-
-def _trouble(error: Exception) -> str:
-    """The last line of a stream that can't continue: of no node and no attempt."""
-    text = f"the log can't be read now: {excerpt(' '.join(str(error).split()), LONGEST_REASON)}"
-    return _json_lines([LogLine(timestamp(time.time()), 0, 0, None, "e", text)])
-
-
-def _json_lines(lines: Sequence[LogLine]) -> str:
-    return "".join([f"{line.to_json()}\n" for line in lines])
-
-
-async def _follow(
-    reconciler: Reconciler, job_id: str, follower: LogFollower, closing: threading.Event
-) -> AsyncIterator[str]:
-    """Lines as they come; a thread is taken only for each look, since many people may follow."""
-
-    def look() -> tuple[str, bool]:
-        with reconciler.database.session() as session:
-            status = session.scalar(select(Job.status).where(Job.id == job_id))
-        over = status is None or Status(status).is_terminal  # asked before the poll: nothing is written afterwards
-        return _json_lines(follower.poll()), over
-
-    spoken = time.monotonic()
-    while not closing.is_set():
-        lines, over = "", False
-        try:
-            async for found in looked_patiently(look, reconciler.followed, _HEARTBEAT):
-                if found is None:
-                    yield "\n"
-                else:
-                    lines, over = found
-        except StoreSilent:  # it may come back, and nothing is lost
-            await asyncio.sleep(_AGAIN)
-        except (OSError, ValueError, DatabaseError) as error:
-            yield _trouble(error)
-            return
-        if lines:
-            yield lines
-            spoken = time.monotonic()
-        if over:
-            async for lines in _stored(reconciler.followed, follower):
-                yield lines
-            return
-        if time.monotonic() - spoken > _HEARTBEAT:
-            yield "\n"
-            spoken = time.monotonic()
-        if not follower.behind:
-            await asyncio.sleep(pause(_POLL))

@@ -13,7 +13,7 @@ from orchestrator.engines.ray.node import Node
 from shared_store.contract import NodeContract
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
-from shared_store.logs import LogFollower
+from shared_store.log_view import LogView
 from shared_store.outcomes import read_outcome
 from shared_store.processes import end_all, find_process
 from tests.conftest import wait_for
@@ -42,7 +42,7 @@ def pids(contract: NodeContract) -> list[int]:
     """The process ids that the rank and its escaped process printed."""
 
     def both() -> list[int] | None:
-        lines = [line.text for line in LogFollower(Store(contract.store).run("run"), "ray-node").drain()]
+        lines = [line.text for line in LogView.of(Store(contract.store).run("run"), "ray-node").drain()]
         found = [int(line) for line in lines if line.isdigit()]
         return found if len(found) == 2 else None
 

@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from orchestrator.control.bus import Bus, BusError
-from shared_store.bus import Credential, presence_key
+from shared_store.bus import Credential, Node, log_command, presence_key, push_proof
 from tests.conftest import Serving, wait_for
 from tests.support.worker.node import node_contract
 from worker.node.bus import NodeBus
@@ -191,6 +191,36 @@ def test_an_answer_in_another_s_name_is_ignored(
         bus.command("victim", 1, 1, "checkpoint", 1)
     # all that it overheard is worth nothing: a number that was used, and a proof for this key alone
     assert overheard[0].keys() == {"id", "proof"} and len(held) == 2
+
+
+def test_a_node_pushes_into_no_other_s_log_and_makes_none_push(
+    bus: Bus, victim: Victim, mallory: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pushed: list[tuple[Node, int, bytes]] = []
+    monkeypatch.setattr(bus, "is_followed", lambda _: True)
+    monkeypatch.setattr(bus, "pushed", lambda *given: pushed.append(given))
+    lie, mine = b"2026-01-01T00:00:00.000000Z 0 o forged\n", "muster/mallory/1/0/log"
+    for key in (f"{KEY}/log", "muster/*/*/*/log", "muster/victim/1/*/log"):
+        proof = push_proof(own(bus), key, 0, lie)
+        for attachment in (
+            f"{proof} 0",
+            f"{push_proof(own(bus), mine, 0, lie)} 0",
+            proof,
+            f"{proof} -1",
+            b"\xff 0",
+            None,
+        ):
+            mallory.put(key, lie, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
+    number = "1"
+    for key in (log_command("victim", 1), "muster/**"):
+        request = json.dumps({"id": number, "proof": own(bus).prove("command", key, number)})
+        list(mallory.get(key, payload=request, target=zenoh.QueryTarget.ALL, timeout=0.5))
+    settled(bus)
+    assert pushed == [] and not victim.node.is_followed
+    bus.ask_for_logs("victim", 1)
+    wait_for(lambda: victim.node.is_followed, 10, "the command")
+    victim.node.push_log(7, b"true\n")
+    wait_for(lambda: pushed == [(VICTIM, 7, b"true\n")], 10, "the victim's own line")
 
 
 def test_a_command_that_is_repeated_is_not_carried_out_again(bus: Bus, victim: Victim) -> None:

@@ -21,7 +21,8 @@ from shared_store.epoch import close_claim, raise_epoch, read_epoch
 from shared_store.files import DamagedFile, write_json
 from shared_store.layout import Run
 from shared_store.log_files import LogWriter
-from shared_store.logs import LogFollower, format_line
+from shared_store.log_view import LogView
+from shared_store.logs import format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
 from tests.conftest import call_muster, submit_gang, wait_for
 from tests.support.definitions import nodes_of
@@ -254,7 +255,7 @@ def test_logs_and_outcomes_are_neither_read_nor_written_through_a_link(tmp_path:
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
     (run.path / place).parent.mkdir(parents=True)
     (run.path / place).symlink_to(other)
-    assert not list(LogFollower(run, "job").drain()) and not log_file(run.log("job", 1, 0), "s").look().segments
+    assert not list(LogView.of(run, "job").drain()) and not log_file(run.log("job", 1, 0), "s").look().segments
     assert read_outcome(run, "job", 1, 0) is None
     kind = place.partition("/")[0]
     with pytest.raises(DamagedFile, match=f"{place}: a link"):

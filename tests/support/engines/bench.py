@@ -12,7 +12,8 @@ from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
 from orchestrator.engines.toolkit.looks import status_of
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
-from shared_store.logs import LogFollower, LogLine
+from shared_store.log_view import LogView
+from shared_store.logs import LogLine
 from shared_store.outcomes import Outcome, read_outcome
 from tests.support.engines.sites import WAIT
 from tests.support.processes import processes_of
@@ -125,7 +126,7 @@ class Bench(ABC):
 
     def lines(self, attempt: int = 1, *, job: str = "", run: str = "run") -> list[LogLine]:
         """All lines of an attempt's log."""
-        found = LogFollower(self.store.run(run), job or self.job).drain()
+        found = LogView.of(self.store.run(run), job or self.job).drain()
         return [line for line in found if line.attempt == attempt]
 
     def log(self, attempt: int = 1, *, job: str = "", run: str = "run") -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 from shared_store.contract import NodeContract
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Run, Store
-from shared_store.logs import LogFollower
+from shared_store.log_view import LogView
 from shared_store.outcomes import Outcome, read_outcome
 from tests.support.waiting import PATIENCE, wait_for
 
@@ -77,7 +77,7 @@ class Node:
 
     def lines(self) -> list[tuple[int | None, str, str]]:
         """(rank, stream, text) of every line in the node's log."""
-        return [(line.rank, line.stream, line.text) for line in LogFollower(self.run, "job").drain()]
+        return [(line.rank, line.stream, line.text) for line in LogView.of(self.run, "job").drain()]
 
     def output(self) -> list[str]:
         """What the ranks printed."""

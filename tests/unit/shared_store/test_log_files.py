@@ -15,7 +15,8 @@ from orchestrator.api.logs import events
 from orchestrator.api.logs.events import LogFile
 from shared_store.layout import Run
 from shared_store.log_files import LEAST_LIMIT, LogWriter, left_out, log_segments, read_log, segments_of
-from shared_store.logs import REPLACED, LogFollower, format_line, timestamp
+from shared_store.log_view import LogView
+from shared_store.logs import REPLACED, format_line, timestamp
 
 START = 1_800_000_000.0
 LIMIT = LEAST_LIMIT
@@ -45,7 +46,7 @@ def written(path: Path, count: int) -> LogWriter:
 
 
 def drained(run: Run) -> list[str]:
-    return [line.text for line in LogFollower(run, "job").drain()]
+    return [line.text for line in LogView.of(run, "job").drain()]
 
 
 def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) -> None:
@@ -67,7 +68,7 @@ def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) 
 
 
 def test_a_follower_that_keeps_up_gets_every_line_once_whatever_is_deleted_behind_it(run: Run) -> None:
-    dice, writer, follower = random.Random(3), LogWriter(run.log("job", 1, 0), LIMIT), LogFollower(run, "job")
+    dice, writer, follower = random.Random(3), LogWriter(run.log("job", 1, 0), LIMIT), LogView.of(run, "job")
     count, texts = 0, []
     while count < 8000:
         more = dice.randrange(1, 180)
@@ -75,14 +76,14 @@ def test_a_follower_that_keeps_up_gets_every_line_once_whatever_is_deleted_behin
         assert writer.append(data) == len(data)
         count += more
         if dice.random() < 0.9:
-            follower = LogFollower(run, "job", offsets=follower.offsets) if dice.random() < 0.1 else follower
+            follower = LogView.of(run, "job", offsets=follower.offsets) if dice.random() < 0.1 else follower
             texts += [line.text for line in follower.drain()]
     texts += [line.text for line in follower.drain()]
     assert numbers(texts) == list(range(count)) and len(texts) == count
 
 
 def test_a_follower_that_falls_behind_learns_how_much_it_missed(run: Run) -> None:
-    writer, follower = written(run.log("job", 1, 0), 1200), LogFollower(run, "job")
+    writer, follower = written(run.log("job", 1, 0), 1200), LogView.of(run, "job")
     before = [line.text for line in follower.drain()]
     position = follower.offsets["1/0"]
     more(writer, 1200, 10_000)
@@ -171,7 +172,7 @@ def test_lines_of_a_node_keep_their_order_when_its_clock_is_set_back(run: Run) -
     lines = "".join(format_line(at, 0, "o", f"a{i}") for i, at in enumerate(clock))
     LogWriter(run.log("job", 1, 0)).append(lines.encode())
     LogWriter(run.log("job", 1, 1)).append(format_line(START + 1.5, 1, "o", "b").encode())
-    merged = list(LogFollower(run, "job").drain())
+    merged = list(LogView.of(run, "job").drain())
     assert [line.text for line in merged] == ["a0", "a1", "a2", "a3", "b", "a4"]
     assert merged[2].time == timestamp(START - 86_400), "the time that the node wrote is shown"
 
@@ -182,7 +183,7 @@ def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: 
         lines = [format_line(START + i + node / 10, node, "o", "z" * size) for i in range(1200)]
         LogWriter(run.log("job", 1, node)).append("".join(lines).encode())
     LogWriter(run.log("job", 2, 0)).append(format_line(START, 0, "o", "second attempt").encode())
-    lines = list(LogFollower(run, "job").drain())
+    lines = list(LogView.of(run, "job").drain())
     assert len(lines) == 3601
     keys = [(line.attempt, line.time) for line in lines]
     assert keys == sorted(keys)
@@ -192,7 +193,7 @@ def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: 
 def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_beginning(run: Run, how: str) -> None:
     path = run.log("job", 1, 0)
     LogWriter(path).append(lines_of(0, 100))
-    follower, file = LogFollower(run, "job"), LogFile(path, "stream")
+    follower, file = LogView.of(run, "job"), LogFile(path, "stream")
     assert len(follower.poll()) == 100 and file.look().begun == 1
     if how == "truncated":
         os.truncate(path, 0)

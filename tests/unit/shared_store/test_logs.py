@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from shared_store.layout import Run
 from shared_store.log_files import LEAST_LIMIT, Chunk, LogWriter, read_log
-from shared_store.log_windows import Chosen, first_error, lines_after, lines_before, search
-from shared_store.logs import LogFollower, LogLine, format_line, parse_line, timestamp
+from shared_store.log_view import Chosen, LogView
+from shared_store.log_windows import first_error, lines_after, lines_before, search
+from shared_store.logs import LogLine, format_line, parse_line, timestamp
 
 START = 1_800_000_000.0
 
@@ -57,7 +58,7 @@ def test_nodes_and_attempts_are_merged_by_time(run: Run) -> None:
     append(run, line(2, "b", 1) + line(3, "c", 1), node=1)
     append(run, line(5, "f") + line(5.5, "g"), node=0, attempt=2)
     append(run, line(4.5, "e", 10), node=10, attempt=2)
-    lines = LogFollower(run, "job").poll()
+    lines = LogView.of(run, "job").poll()
     assert texts(lines) == ["a", "b", "c", "d", "e", "f", "g"]
     assert [(line.attempt, line.node, line.rank) for line in lines[3:5]] == [(1, 0, 0), (2, 10, 10)]
 
@@ -65,34 +66,34 @@ def test_nodes_and_attempts_are_merged_by_time(run: Run) -> None:
 def test_the_tenth_attempt_comes_after_the_second_and_foreign_lines_hide_no_others(run: Run) -> None:
     for attempt in (10, 2, 9):
         append(run, line(1, str(attempt)), attempt=attempt)
-    assert texts(LogFollower(run, "job").poll()) == ["2", "9", "10"]
+    assert texts(LogView.of(run, "job").poll()) == ["2", "9", "10"]
     invalid = line(2, "b").encode()[:-1] + b"\xff\n"
     append(run, line(1, "a").encode() + b"\xff\xfe foreign\n" + invalid + line(3, "c").encode())
-    assert texts(LogFollower(run, "job").poll()) == ["a", "b\N{REPLACEMENT CHARACTER}", "c", "2", "9", "10"]
+    assert texts(LogView.of(run, "job").poll()) == ["a", "b\N{REPLACEMENT CHARACTER}", "c", "2", "9", "10"]
 
 
 def test_other_jobs_and_other_files_are_not_read(run: Run) -> None:
-    assert LogFollower(run, "job").poll() == LogFollower(run, "job", attempt=3).poll() == []
+    assert LogView.of(run, "job").poll() == LogView.of(run, "job", attempt=3).poll() == []
     append(run, line(1, "ours"))
     append(run, line(1, "theirs"), job="other")
     (run.logs("job", 1) / "node-0.log.gz").write_text(line(1, "no"))
     (run.path / "logs" / "job" / "notes").mkdir()
-    assert texts(LogFollower(run, "job").poll()) == ["ours"]
+    assert texts(LogView.of(run, "job").poll()) == ["ours"]
 
 
 def test_node_rank_and_attempt_select(run: Run) -> None:
     append(run, line(1, "0/0", 0) + line(2, "0/1", 1) + line(3, "supervisor", None))
     append(run, line(1, "1/2", 2), node=1)
     append(run, line(9, "second", 0), attempt=2)
-    assert texts(LogFollower(run, "job", node=1).poll()) == ["1/2"]
-    assert texts(LogFollower(run, "job", rank=1).poll()) == ["0/1"]
-    assert texts(LogFollower(run, "job", attempt=2).poll()) == ["second"]
-    assert texts(LogFollower(run, "job", node=0, rank=0).poll()) == ["0/0", "second"]
+    assert texts(LogView.of(run, "job", node=1).poll()) == ["1/2"]
+    assert texts(LogView.of(run, "job", rank=1).poll()) == ["0/1"]
+    assert texts(LogView.of(run, "job", attempt=2).poll()) == ["second"]
+    assert texts(LogView.of(run, "job", node=0, rank=0).poll()) == ["0/0", "second"]
 
 
 def test_draining_one_rank_finds_its_lines_behind_any_amount_of_another_rank_s(run: Run) -> None:
     append(run, line(1, "first", 1) + line(2, "y" * 1000) * 3000 + line(3, "last", 1))
-    assert texts(list(LogFollower(run, "job", rank=1).drain())) == ["first", "last"]
+    assert texts(list(LogView.of(run, "job", rank=1).drain())) == ["first", "last"]
 
 
 @settings(max_examples=40)
@@ -104,7 +105,7 @@ def test_however_the_writes_are_cut_every_line_is_read_once_and_in_order(
 ) -> None:
     with tempfile.TemporaryDirectory() as directory:
         run = Run(Path(directory))
-        follower, pending = LogFollower(run, "job"), {node: b"" for node in range(3)}
+        follower, pending = LogView.of(run, "job"), {node: b"" for node in range(3)}
         for second, (node, text) in enumerate(written):
             pending[node] += line(second, text, node).encode()
         read, sizes = list[LogLine](), itertools.cycle(cuts)
@@ -173,13 +174,13 @@ def test_going_back_window_by_window_gives_every_line_once_in_its_order(
     kept: Run, most: int, which: dict[str, int]
 ) -> None:
     found = backwards(Chosen(kept, JOB, **which), most)
-    assert seen(found) == seen(list(LogFollower(kept, JOB, **which).drain()))
+    assert seen(found) == seen(list(LogView.of(kept, JOB, **which).drain()))
 
 
 @pytest.mark.parametrize("most", [7, 250])
 def test_going_on_from_any_window_gives_what_follows_it(kept: Run, most: int) -> None:
     chosen = Chosen(kept, JOB)
-    everything = seen(list(LogFollower(kept, JOB).drain()))
+    everything = seen(list(LogView.of(kept, JOB).drain()))
     window = lines_before(chosen, lines_before(chosen, chosen.end(), 300).first, most)
     begin = everything.index(seen(window.lines)[0])
     assert seen(window.lines) == everything[begin : begin + most]
@@ -199,7 +200,7 @@ def test_a_window_of_long_logs_reads_little_of_each(tmp_path: Path, monkeypatch:
         read.append(len(chunk.data))
         return chunk
 
-    monkeypatch.setattr("shared_store.logs.read_log", counted)
+    monkeypatch.setattr("shared_store.log_view.read_log", counted)
     window = lines_after(Chosen(run, "job"), {}, 100)
     assert len(window.lines) == 100 and window.more and sum(read) <= nodes * 64 << 10
 
@@ -207,7 +208,7 @@ def test_a_window_of_long_logs_reads_little_of_each(tmp_path: Path, monkeypatch:
 def test_a_follower_goes_on_from_the_end_of_the_last_window(more: Run) -> None:
     chosen = Chosen(more, JOB)
     window = lines_before(chosen, chosen.end())
-    follower = LogFollower(more, JOB, offsets=dict(window.last))
+    follower = LogView.of(more, JOB, offsets=dict(window.last))
     assert follower.poll() == []
     write(more, 2, 1, [(90_000, 2, "new")])
     write(more, 3, 0, [(91_000, 0, "of a new attempt")])
@@ -243,7 +244,7 @@ def test_a_line_that_is_longer_than_a_piece_is_in_a_window_like_any_other(tmp_pa
 
 def test_a_search_finds_every_line_with_the_text_and_goes_on_after_the_last_one(kept: Run) -> None:
     chosen = Chosen(kept, JOB)
-    wanted = {(line.attempt, line.text) for line in LogFollower(kept, JOB).drain() if "line 12" in line.text}
+    wanted = {(line.attempt, line.text) for line in LogView.of(kept, JOB).drain() if "line 12" in line.text}
     found, place = list[LogLine](), {}
     while True:
         part = search(chosen, "LINE 12", place, 10)

@@ -1,0 +1,147 @@
+"""Logs that real nodes push to those who follow them; with and without a bus, and while messages are lost."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from orchestrator.client import Client
+from orchestrator.control import bus as bus_module
+from orchestrator.control import log_tail
+from orchestrator.server import Server
+from shared_store.bus import Node
+from tests.conftest import submit_gang, wait_for
+
+SAYS = """
+import os, sys, time
+done, path = 0, sys.argv[1] if sys.argv[1:] else {path!r}
+while True:
+    lines = open(path).read().splitlines() if os.path.exists(path) else []
+    for line in lines[done:]: print(os.environ["AWS_BATCH_JOB_NODE_INDEX"], line, sep=":", flush=True)
+    done = len(lines)
+    if "end" in lines: break
+    time.sleep(0.02)
+if os.environ["AWS_BATCH_JOB_NODE_INDEX"] == "0": time.sleep(1)
+"""
+"""Each node prints the lines of a file as they come."""
+
+
+class Talk:
+    """A job of two nodes that prints what it is given, and those who follow it."""
+
+    def __init__(self, server: Server, path: Path) -> None:
+        self.server, self.path = server, path
+        self.client = Client(server.url)
+        self.job = submit_gang(self.client, SAYS.format(path=str(path)), 2)
+        self.threads: list[threading.Thread] = []
+        self.said: list[str] = []
+
+    def say(self, *texts: str) -> None:
+        with open(self.path, "a") as file:
+            file.writelines(f"{text}\n" for text in texts)
+        self.said += texts
+
+    def follow(self) -> list[str]:
+        """The texts that a new follower gets, which grow."""
+        texts: list[str] = []
+
+        def read() -> None:
+            with httpx.stream("GET", f"{self.server.url}/api/jobs/{self.job}/logs?follow=true", timeout=60) as answer:
+                texts.extend(json.loads(line)["text"] for line in answer.iter_lines() if line)
+
+        self.threads.append(threading.Thread(target=read, daemon=True))
+        self.threads[-1].start()
+        return texts
+
+    def has_all(self, texts: list[str]) -> bool:
+        return all([each for each in texts if each.startswith(f"{node}:")] == self._of(node) for node in range(2))
+
+    def _of(self, node: int) -> list[str]:
+        return [f"{node}:{text}" for text in self.said]
+
+    def is_pushed(self) -> bool:
+        """Whether the nodes push all that they print, and nobody looks at a file."""
+        followed = self.server.reconciler.logs._followed.get(self.job)
+        return followed is not None and followed.logs.delivers() and not followed.is_looked_at
+
+
+@pytest.fixture
+def talk(tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Talk]:
+    if getattr(request, "param", None) == "no bus":
+        monkeypatch.setenv("MUSTER_BUS_OFF", "1")
+    server = Server(tmp_path / "home", cpus=2)
+    server.start()
+    talk = Talk(server, tmp_path / "talk")
+    try:
+        yield talk
+    finally:
+        server.close()
+        talk.client.close()
+
+
+def test_lines_come_by_push_alone_while_the_bus_delivers(talk: Talk, monkeypatch: pytest.MonkeyPatch) -> None:
+    everyone = [talk.follow() for _ in range(5)]
+    talk.say("first")
+    wait_for(lambda: all(map(talk.has_all, everyone)) and talk.is_pushed())
+    looks: list[Any] = []
+    genuine: Callable[..., Any] = log_tail.read_log
+    for module in (log_tail, "shared_store.log_view"):
+        name = f"{module}.read_log" if isinstance(module, str) else f"{module.__name__}.read_log"
+        monkeypatch.setattr(name, lambda *given: (looks.append(given), genuine(*given))[1])
+    monkeypatch.setattr(log_tail, "FRESH", 3600.0)  # the machine may be busy for longer than the node's word counts
+    for number in range(30):
+        talk.say(f"line {number}")
+        wait_for(lambda: all(map(talk.has_all, everyone)))
+    assert not looks
+    talk.say("end")
+    for thread in talk.threads:
+        thread.join(120)
+    assert all(map(talk.has_all, everyone)) and not talk.server.reconciler.logs._followed
+    assert all(texts[-1].startswith("node ") for texts in everyone), "the last lines are the supervisors'"
+
+
+@pytest.mark.parametrize("talk", ["no bus"], indirect=True)
+def test_without_a_bus_lines_come_from_the_files(talk: Talk) -> None:
+    everyone = [talk.follow() for _ in range(5)]
+    for number in range(5):
+        talk.say(f"line {number}")
+        wait_for(lambda: all(map(talk.has_all, everyone)))
+    talk.say("end")
+    for thread in talk.threads:
+        thread.join(120)
+        assert not thread.is_alive()
+    assert all(map(talk.has_all, everyone))
+
+
+def test_a_bus_that_loses_doubles_and_holds_back_pushes_loses_no_line(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = talk.server.bus
+    assert isinstance(bus, bus_module.Bus)
+    genuine, count, held = bus.pushed, 0, list[tuple[Node, int, bytes]]()
+
+    def bad(node: Node, position: int, data: bytes) -> None:
+        nonlocal count
+        count += 1
+        if count % 4 == 0:
+            held.append((node, position, data))
+        elif count % 4 != 1:
+            genuine(node, position, data)
+            genuine(node, position, data)
+            while held:
+                genuine(*held.pop())
+
+    bus.pushed = bad
+    texts = talk.follow()
+    for number in range(60):
+        talk.say(f"line {number}")
+        wait_for(lambda number=number: texts.count(f"0:line {number}") + texts.count(f"1:line {number}") == 2)
+    talk.say("end")
+    talk.threads[0].join(120)
+    assert talk.has_all(texts) and count > 20

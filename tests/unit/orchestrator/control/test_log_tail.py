@@ -1,0 +1,241 @@
+"""The newest part of a followed log, in memory: whatever happens to pushes, a reader gets each line once, and memory is bounded."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from orchestrator.control import log_tail
+from orchestrator.control.log_tail import MOST, JobLogs
+from shared_store.layout import Run
+from shared_store.log_files import LEAST_LIMIT, LogWriter
+from shared_store.log_view import LogView
+from shared_store.logs import REPLACED, format_line
+
+LOG = (1, 0)
+
+
+class Followed:
+    """A job of one node that somebody follows: its log, the messages of its node, and one reader."""
+
+    def __init__(self, directory: Path, limit: int = 1 << 30) -> None:
+        self.run = Run(directory)
+        self.path = self.run.log("job", *LOG)
+        self.writer = LogWriter(self.path, limit)
+        self.logs, self.view = JobLogs(self.run, "job"), LogView.of(self.run, "job")
+        self.seen: list[str] = []
+        self.hidden = b""
+        """What a network volume does not show to the controller yet."""
+        self.late: list[tuple[int, bytes]] = []
+        """Pushes that have not come."""
+        self.written = 0
+        self.logs.note(1, 1)
+        self.logs.look()
+
+    def write(self, *texts: str, push: bool = True, visible: bool = True) -> None:
+        data = "".join(format_line(1_800_000_000.0 + self.written, 0, "o", text) for text in texts).encode()
+        self.written += len(texts)
+        start = self.end
+        self.hidden += data
+        if visible:
+            self.show()
+        self.late.append((start, data))
+        if push:
+            self.deliver()
+
+    @property
+    def end(self) -> int:
+        return self.writer.end + len(self.hidden)
+
+    def show(self) -> None:
+        self.writer.append(self.hidden)
+        self.hidden = b""
+
+    def deliver(self, index: int = -1) -> None:
+        self.logs.push(LOG, *self.late.pop(index))
+
+    def state(self, *, is_whole: bool = False) -> bool:
+        return self.logs.state(LOG, self.end, is_whole)
+
+    def read(self, *, memory_alone: bool = False) -> list[str]:
+        """The texts that are new to the reader; it reads files only where it must, or where ``memory_alone`` fails the test."""
+        is_behind = True
+        while is_behind:
+            found = self.view.poll_memory(self.logs, 1 << 12)
+            assert found is not None or not memory_alone
+            lines = self.view.poll() if found is None else found
+            self.seen += [line.text for line in lines]
+            is_behind = bool(lines) or self.view.behind
+        return self.seen
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Followed:
+    return Followed(tmp_path / "run")
+
+
+def no_look(*_: object) -> None:
+    raise AssertionError("a file was looked at")
+
+
+def test_what_is_pushed_is_read_without_a_look_at_a_file(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
+    job.state()
+    monkeypatch.setattr(log_tail, "read_log", no_look)
+    monkeypatch.setattr("shared_store.log_view.read_log", no_look)
+    for number in range(100):
+        job.write(f"line {number}")
+        assert not job.state() and job.logs.delivers()
+        assert job.read(memory_alone=True)[-1] == f"line {number}"
+    assert len(job.seen) == 100
+
+
+def test_a_lost_push_is_noticed_by_the_next_word_of_the_node_and_filled_from_the_file(job: Followed) -> None:
+    job.write("first")
+    job.write("lost", push=False)
+    assert job.state() and not job.logs.delivers()
+    assert job.logs.look() and job.read(memory_alone=True) == ["first", "lost"]
+    assert job.logs.delivers() and not job.logs.look(), "there is nothing to look for any more"
+
+
+def test_a_push_that_comes_before_another_waits_for_it_and_doubles_change_nothing(job: Followed) -> None:
+    for text in "abc":
+        job.write(text, push=False)
+    double = job.late[1]
+    job.deliver(2)
+    job.deliver(1)
+    assert job.read() == [] and not job.logs.delivers()
+    job.deliver(0)
+    job.logs.push(LOG, *double)
+    assert job.read(memory_alone=True) == ["a", "b", "c"]
+
+
+def test_a_volume_that_shows_a_log_late_neither_hides_nor_doubles_a_line(job: Followed) -> None:
+    job.write("seen")
+    job.write("not in the file yet", visible=False)
+    job.write("lost", push=False, visible=False)
+    assert job.state()
+    job.logs.look()
+    assert job.read() == ["seen", "not in the file yet"]
+    assert job.view.poll() == [], "the file is shorter than what was read, and was not replaced"
+    job.show()
+    job.logs.look()
+    assert job.read() == ["seen", "not in the file yet", "lost"]
+
+
+def test_a_log_that_was_truncated_is_read_from_its_new_beginning(job: Followed) -> None:
+    job.write("one", "two")
+    job.read()
+    job.path.write_bytes(b"")
+    job.write("three", push=False)
+    assert job.state()
+    job.logs.look()
+    assert job.read() == ["one", "two", REPLACED, "three"]
+
+
+def test_a_node_that_does_not_push_is_looked_at_and_one_that_restarts_too(job: Followed) -> None:
+    assert not job.logs.delivers(), "it has not been heard"
+    job.write("polled", push=False)
+    assert job.logs.look() and job.read() == ["polled"]
+    job.state()
+    assert job.logs.delivers()
+    job.logs.state(LOG, None, False)  # its supervisor's successor does not know yet that somebody follows
+    assert not job.logs.delivers()
+    job.write("of the successor", push=False)
+    assert job.logs.look() and job.read() == ["polled", "of the successor"]
+
+
+def test_a_node_that_has_ended_needs_no_look_for_ever(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
+    job.write("last")
+    job.state(is_whole=True)
+    monkeypatch.setattr(log_tail, "FRESH", 0.0)
+    assert job.logs.delivers()
+
+
+def test_a_new_attempt_begins_with_its_own_log_and_the_last_lines_of_the_former_are_read(job: Followed) -> None:
+    job.write("first attempt")
+    job.write("lost at the end", push=False)
+    assert job.logs.note(2, 1) and not job.logs.note(2, 1)
+    writer = LogWriter(job.run.log("job", 2, 0))
+    writer.append(format_line(1_900_000_000.0, 0, "o", "second attempt").encode())
+    assert not job.logs.delivers()
+    job.logs.look()
+    assert job.read() == ["first attempt", "lost at the end", "second attempt"]
+    job.logs.state((2, 0), writer.end, False)
+    assert job.logs.delivers()
+
+
+def test_memory_is_bounded_and_a_slow_reader_goes_on_in_the_files(job: Followed) -> None:
+    text = "x" * 10_000
+    for number in range(300):
+        job.write(f"{number} {text}")
+    kept = job.logs._tails[LOG]
+    assert len(kept.data) <= MOST * 5 / 4
+    for number in range(300, 400):
+        job.write(f"{number} {text}", push=number % 2 == 0)
+    assert sum(map(len, kept.early.values())) <= MOST
+    assert job.state()
+    job.logs.look()
+    assert [int(each.split()[0]) for each in job.read()] == list(range(400))
+
+
+def test_more_than_one_look_reads_is_left_to_the_readers(job: Followed) -> None:
+    job.write(*(f"{number} " + "x" * 1000 for number in range(3000)), push=False)
+    job.state()
+    assert job.logs.look() and not job.logs._tails[LOG].data
+    assert [int(each.split()[0]) for each in job.read()] == list(range(3000))
+
+
+def test_a_reader_that_comes_too_late_hears_what_was_left_out(tmp_path: Path) -> None:
+    job = Followed(tmp_path / "run", LEAST_LIMIT)
+    for number in range(1500):
+        job.write(f"{number} " + "x" * 2000, push=number % 100 != 0)
+    while job.state():
+        job.logs.look()
+    texts = job.read()
+    assert texts[0].startswith("0 ") and texts[-1].startswith("1499 ")
+    assert sum("left out: the log reached its limit" in text for text in texts) == 1
+
+
+ACTIONS = st.one_of(
+    st.tuples(st.just("write"), st.booleans(), st.booleans()),
+    st.tuples(st.just("deliver"), st.integers(0, 5), st.just(0)),
+    st.tuples(
+        st.sampled_from(["lose", "double", "show", "state", "look", "read", "unknown"]), st.integers(0, 5), st.just(0)
+    ),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(ACTIONS, max_size=40))
+def test_whatever_happens_to_pushes_and_files_every_line_is_read_once_and_in_order(
+    actions: list[tuple[str, int, int]],
+) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        job = Followed(Path(directory) / "run")
+        for what, first, second in actions:
+            if what == "write":
+                job.write(f"line {job.written}", push=bool(first), visible=bool(second))
+            elif what == "show":
+                job.show()
+            elif what == "state":
+                job.state()
+            elif what == "unknown":
+                job.logs.state(LOG, None, False)
+            elif what == "look":
+                job.logs.look()
+            elif what == "read":
+                job.read()
+            elif job.late:
+                index = first % len(job.late)
+                if what == "double":
+                    job.logs.push(LOG, *job.late[index])
+                else:
+                    job.late.pop(index) if what == "lose" else job.deliver(index)
+        job.show()
+        job.state()
+        job.logs.look()
+        assert job.read() == [f"line {number}" for number in range(job.written)]
