@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from shared_store.metrics import finite
 
@@ -80,11 +80,13 @@ def bound(row: Mapping[str, Any], **targets: str) -> Markup:
     is the field ``name``. ``hidden`` hides the element while its field is empty; ``state`` is ``data-state``.
     """
     names = " ".join(f"{target}:{field}" for target, field in targets.items())
-    found = Markup('data-bind="{}"').format(names)
+    found = [
+        f'data-bind="{escape(names)}"'
+    ]  # the longest part of a large page: Markup's own format() takes thrice the time
     for target, field in targets.items():
         value = row.get(field)
         if target == "hidden":
-            found += Markup("" if value else " hidden")
+            found += [] if value else ["hidden"]
         elif target != "text" and value not in (None, ""):
-            found += Markup(' {}="{}"').format({"state": "data-state"}.get(target, target), value)
-    return found
+            found.append(f'{"data-state" if target == "state" else escape(target)}="{escape(value)}"')
+    return Markup(" ".join(found))
