@@ -181,10 +181,12 @@ class LogWriter:
         """Number of all lines ever written. Reads the head. Raises OSError."""
         return count_lines(self.path) + self._lines
 
-    @property
-    def end(self) -> int:
-        """Position after the last byte of the file, whoever has written it. Raises OSError."""
-        return self._segments[-1].start + os.fstat(self._file).st_size
+    def end(self) -> int | None:
+        """Position after the last byte of the file, whoever has written it; None where it can't be read now."""
+        try:
+            return self._segments[-1].start + os.fstat(self._file).st_size
+        except OSError:
+            return None
 
     def append(self, data: bytes) -> int:
         """Append whole lines; returns how many of their bytes are in the log, also as whole lines.

@@ -117,7 +117,7 @@ class Supervisor:
         if self._kept:
             self.write(None, "o", f"the job's directories are kept: {self._kept} on {socket.gethostname()}")
         self.write(None, "o", END_LINE.format(node=self.contract.node_index, reason=outcome.reason))
-        self.bus.end_log(self.ranks[0].progress, self._log_end())
+        self.bus.end_log(self.ranks[0].progress, self._log.end())
         code = self._commit(outcome)
         self.bus.close()
         for number in _REQUESTS:  # whose default, which Python restores at its end, is another exit code
@@ -226,7 +226,7 @@ class Supervisor:
         """Carry out the commands that came, and tell how the node is."""
         if not self.ranks:
             return
-        self.bus.tend(self.ranks[0].progress, self._log_end)
+        self.bus.tend(self.ranks[0].progress, self._log.end)
         while not self.bus.commands.empty():
             command = self.bus.commands.get()
             if command.name == "checkpoint":
@@ -288,16 +288,9 @@ class Supervisor:
     def _append(self, data: bytes) -> int:
         """Append lines to the log, and push them to those who follow it; returns how many bytes the log has taken."""
         written = self._log.append(data)
-        if written and self.bus.is_followed and (end := self._log_end()) is not None:
+        if written and self.bus.is_followed and (end := self._log.end()) is not None:
             self.bus.push_log(end - written, data[:written])
         return written
-
-    def _log_end(self) -> int | None:
-        """The end of the log; None where it can't be read now."""
-        try:
-            return self._log.end
-        except OSError:
-            return None
 
     def _lose(self, data: bytes, error: OSError) -> None:
         why = error.strerror or str(error)

@@ -68,15 +68,15 @@ class World:
 
     def write(self, text: str, log: tuple[int, int] = (1, 0), *, push: bool = True) -> None:
         writer = self.writers[log]
-        data = format_line(1_800_000_000.0 + writer.end, 0, "o", text).encode()
+        data = format_line(1_800_000_000.0 + (writer.end() or 0), 0, "o", text).encode()
         writer.append(data)
         if push:
-            self.bus.pushed(("job", *log), writer.end - len(data), data)
+            self.bus.pushed(("job", *log), (writer.end() or 0) - len(data), data)
 
     def state(self, attempt: int = 1, *, end: int | None = None, is_whole: bool = False) -> None:
         for (number, node), writer in self.writers.items():
             if number == attempt:
-                self.bus.stated(("job", number, node), writer.end if end is None else end, is_whole)
+                self.bus.stated(("job", number, node), writer.end() if end is None else end, is_whole)
 
     def follow(self) -> list[str]:
         """The pieces that a new follower gets, which grow; it has begun."""

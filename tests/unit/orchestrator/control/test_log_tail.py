@@ -49,7 +49,7 @@ class Followed:
 
     @property
     def end(self) -> int:
-        return self.writer.end + len(self.hidden)
+        return (self.writer.end() or 0) + len(self.hidden)
 
     def show(self) -> None:
         self.writer.append(self.hidden)
@@ -164,7 +164,7 @@ def test_a_new_attempt_begins_with_its_own_log_and_the_last_lines_of_the_former_
     assert not job.logs.delivers()
     job.logs.look()
     assert job.read() == ["first attempt", "lost at the end", "second attempt"]
-    job.logs.state((2, 0), writer.end, False)
+    job.logs.state((2, 0), writer.end(), False)
     assert job.logs.delivers()
 
 
