@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from benchmarks.load import Watch, add_option, own_seconds
-from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.peers import Peers
@@ -175,7 +174,6 @@ def self_now() -> int:
 @contextmanager
 def controller(engine: E, store_type: type[RunStore], watch: Watch) -> Iterator[Bench[E]]:
     """A controller that runs, on a database in a folder of its own."""
-    machine.collect_seldom()  # as the server does
     MemoryStore.epochs.clear()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         home = Path(folder)

@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import uvicorn
 
-from orchestrator import machine
 from orchestrator.api import arns
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
@@ -199,12 +198,10 @@ class Server:
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
-        machine.collect_seldom()
         self._lock.publish(self.url, self._temporary, arns.here().region)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
-        machine.collect_all()
         self._lock.withdraw()
         self.app.state.closing.set()
         self.reconciler.logs.close()

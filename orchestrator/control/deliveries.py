@@ -25,7 +25,8 @@ from orchestrator import machine
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.persistence.models import Job, JobQueue, WebhookDelivery, now
+from orchestrator.persistence.models import Job, JobQueue, now
+from orchestrator.persistence.own_models import WebhookDelivery
 from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__

@@ -160,6 +160,7 @@ class Reconciler:
     def start(self) -> None:
         self.disk.start()
         self._thread = machine.thread("controller", self._loop)
+        machine.collect_seldom()
 
     def wake(self) -> None:
         """Look now instead of at the next interval, since something changed."""
@@ -185,6 +186,7 @@ class Reconciler:
         self._wake.set()
         if self._thread is not None:
             self._thread.join()
+            machine.collect_all()
         self.attempts.close()
         self.logs.close()
         self.calls.close()

@@ -276,52 +276,6 @@ class RunRecord(Base):
     created_at: Mapped[int] = mapped_column(default=now)
 
 
-class AutomaticEvaluation(Base):
-    """Progress of a training's automatic evaluations (:mod:`orchestrator.api.native.automatic`)."""
-
-    __tablename__ = "automatic_evaluations"
-    run: Mapped[str] = mapped_column(primary_key=True)
-    training: Mapped[str]
-    """Id of the job that trains, or trained last."""
-    seen: Mapped[str]
-    """Name of its newest checkpoint that was counted; empty before the first."""
-    waiting: Mapped[int]
-    """Checkpoints that were counted since the last evaluation was submitted."""
-    passed: Mapped[int]
-    """Checkpoints that were due and are not evaluated, since a newer one was."""
-    checkpoint: Mapped[str | None] = mapped_column(default=None)
-    job: Mapped[str | None] = mapped_column(default=None)
-    """The last evaluation that was submitted: of which checkpoint, and the id of its job."""
-    open: Mapped[bool] = mapped_column(default=False, index=True)
-    """Whether that job waits or runs, so that retention keeps its checkpoint."""
-    problem: Mapped[str | None] = mapped_column(default=None)
-    """Why the evaluation that was due last could not be submitted."""
-
-    @validates("problem")
-    def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
-
-
-class WebhookDelivery(Base):
-    """A message about a job that ended, until its receiver has accepted it (:mod:`orchestrator.control.deliveries`)."""
-
-    __tablename__ = "webhook_deliveries"
-    __table_args__ = (Index("ix_webhook_deliveries_due", "webhook", "next_at"),)
-    id: Mapped[str] = mapped_column(primary_key=True)
-    """Its ``webhook-id``."""
-    webhook: Mapped[str]
-    """Name of the webhook; its URL and its secret are not here."""
-    job: Mapped[str] = mapped_column(index=True)
-    created_at: Mapped[int] = mapped_column(default=now)
-    next_at: Mapped[int | None]
-    """When it is tried next; None where it was given up."""
-    tries: Mapped[int] = mapped_column(default=0)
-    body: Mapped[str | None] = mapped_column(default=None)
-    """The message, unchanged from the first try on."""
-    problem: Mapped[str | None] = mapped_column(default=None)
-    """Error of the last try."""
-
-
 class Dependency(Base):
     """One job waits for the success of another."""
 

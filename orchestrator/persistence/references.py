@@ -10,17 +10,8 @@ from sqlalchemy.orm import Session, aliased
 from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import JobFacts, Reference, Rules
 from orchestrator.persistence.job_counts import note_deleted
-from orchestrator.persistence.models import (
-    Attempt,
-    AutomaticEvaluation,
-    Dependency,
-    Job,
-    JobDefinition,
-    Node,
-    RunRecord,
-    WebhookDelivery,
-)
-from orchestrator.persistence.own_models import RunUse
+from orchestrator.persistence.models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
+from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, WebhookDelivery
 
 _SUBMITTED = "MUSTER_DIRECTORY"
 """Variable that only definitions have which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""

@@ -29,7 +29,8 @@ from orchestrator.domain.errors import SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.persistence.models import AutomaticEvaluation, Job
+from orchestrator.persistence.models import Job
+from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.spec.evaluations import (
     AUTOMATIC_TAG,

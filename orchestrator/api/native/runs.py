@@ -26,7 +26,8 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import AutomaticEvaluation, Job, RunRecord
+from orchestrator.persistence.models import Job, RunRecord
+from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
