@@ -12,12 +12,12 @@ import pytest
 from sqlalchemy import delete, event, select, text
 from sqlalchemy.orm import Session
 
-from orchestrator.control.usage import forget_before
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.job_counts import JobCounts, note_deleted
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.references import forget_jobs
 from orchestrator.persistence.session import Database
 
 QUEUES = [f"queue-{number}" for number in range(60)]
@@ -248,7 +248,7 @@ def test_history_that_is_forgotten_is_not_counted(database: Database) -> None:
         session.add_all([job("old", 1, status="FAILED", stopped_at=5), job("new", 2, status="FAILED", stopped_at=50)])
     assert database.counts.by_status() == {"FAILED": 2}
     with database.session() as session:
-        forget_before(session, 10)
+        forget_jobs(session, ["old"])
     assert database.counts.by_status() == {"FAILED": 1}
 
 
