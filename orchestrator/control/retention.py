@@ -49,6 +49,8 @@ _REMOVERS = 8
 """Threads that remove what was thrown away."""
 _FRESH = 600.0
 """Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
+_PATIENCE = 10.0
+"""Seconds for which the end of a controller waits for a step."""
 _LOGGED = 24 * 3600.0
 """Seconds between two reports of what would go."""
 
@@ -183,7 +185,7 @@ class Retention:
         self._scanning = threading.Lock()
         self._next, self._next_report = machine.monotonic() + _FIRST, machine.monotonic()
         self._is_under_way = False
-        self._is_closing = threading.Event()
+        self._is_closing, self._passing = threading.Event(), threading.Lock()
 
     # -- passes ---------------------------------------------------------------------------------------------------------
 
@@ -192,8 +194,10 @@ class Retention:
         later(self._empty_trash)
 
     def close(self) -> None:
-        """End a pass at its next step."""
+        """End a pass after its present step, for which this waits some seconds: then the database is another controller's."""
         self._is_closing.set()
+        if self._passing.acquire(timeout=_PATIENCE):
+            self._passing.release()
         self._removing.close()
 
     def when_due(self, later: Callable[[Callable[[], object]], None]) -> None:
@@ -204,12 +208,8 @@ class Retention:
 
     def _pass(self) -> None:
         try:
-            with self._database.session() as session:
-                rules = self.rules(session)
-            if rules.is_trial(self._moment()):
-                self._report()
-            else:
-                self.take_all()
+            with self._passing:
+                self._take_or_report()
         except (OSError, Unavailable) as error:
             log.warning("old jobs and runs can't be taken now (%s); trying again later", " ".join(str(error).split()))
         except Exception:
@@ -217,6 +217,16 @@ class Retention:
         finally:
             self._next = machine.monotonic() + _INTERVAL
             self._is_under_way = False
+
+    def _take_or_report(self) -> None:
+        if self._is_closing.is_set():
+            return
+        with self._database.session() as session:
+            rules = self.rules(session)
+        if rules.is_trial(self._moment()):
+            self._report()
+        else:
+            self.take_all()
 
     def take_all(self) -> Totals:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
@@ -373,6 +383,8 @@ class Retention:
         self._check()
         thrown = trash.throw_away(self._store, *(path for look in looks for path in look.directories))
         self._check()
+        if self._is_closing.is_set():
+            return  # the next controller deletes the rows
         # an array behind its children
         jobs = sorted((job for look in looks for job in look.decision.jobs), key=lambda job: ":" not in job)
         gone = [look.run for look in looks if look.decision.run or look.is_missing]

@@ -218,7 +218,6 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
         world.ended(f"j{number:02}", stopped_at=LONG_AGO + number // 5)
         if number % 4 == 0:
             contents.archive(world.store.run(f"j{number:02}"), "key a")
-    monkeypatch.setattr(module, "A_STEP", 3)
     place: Place | None = Place()
     seen: list[str] = []
     while place is not None:
@@ -290,6 +289,27 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
     assert world.runs() == ([] if whole else ["old"])
     with world.database.session() as session:
         assert session.scalars(select(RunRecord.name)).all() == ([] if whole else ["old"])
+
+
+def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.ended("old")
+    ending, throw = world.retention(), trash.throw_away
+
+    def late(store: Store, *paths: Path) -> list[Path]:
+        ending._is_closing.set()
+        return throw(store, *paths)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(trash, "throw_away", late)
+        ending._pass()
+    ending.close()
+    assert world.jobs() == ["old"] and world.runs() == [] and len(world.trashed()) == 1
+    following = world.retention()
+    following._empty_trash()
+    following.take_all()
+    assert world.jobs() == [] and world.trashed() == []
 
 
 def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
