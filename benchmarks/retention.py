@@ -1,6 +1,7 @@
 """Whether a controller's store and database stay as large as they are, however many jobs go through.
 
     python -m benchmarks.retention [--jobs 100000] [--rounds 10] [--off]
+    python -m benchmarks.retention --rows [--jobs 100000] [--rounds 50]    # rows of jobs that have ended, without runs
 
 Gangs of one node run on an engine that starts nothing (:mod:`benchmarks.scale`): each leaves a run with an outcome and a log, durably on
 this disk. Meanwhile one pass of retention follows another, in the steps and with the rests that they always have. After each round a line
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import quantiles
 
-from sqlalchemy import func, select
+from sqlalchemy import func, insert, select
 
 from benchmarks.load import Watch, add_option
 from benchmarks.scale import Bench, ShortEngine, large
@@ -148,6 +149,33 @@ def rounds(bench: Bench[FakeEngine], home: Path, jobs: int, count: int, takes: b
     return found
 
 
+def rows_alone(bench: Bench[FakeEngine], home: Path, jobs: int, count: int) -> list[Size]:
+    """Rows of ended jobs, in so many portions, each of which is taken at once."""
+    found, each = [], jobs // count
+    for number in range(count):
+        names = [f"row-{index:07d}" for index in range(number * each, (number + 1) * each)]
+        shared = {
+            "queue": "default",
+            "definition": "bench:1",
+            "request": {},
+            "status": Status.SUCCEEDED,
+            "stopped_at": 1,
+        }
+        with bench.database.session() as session:
+            session.execute(insert(Job), [{**shared, "id": name, "name": name, "run": name} for name in names])
+            session.execute(
+                insert(Attempt), [{"job_id": name, "number": 1, "epoch": 1, "stopped_at": 1} for name in names]
+            )
+            session.execute(insert(Node), [{"job_id": name, "attempt": 1, "index": 0, "host": "h"} for name in names])
+            session.execute(insert(RunRecord), [{"name": name, "queue": "default"} for name in names])
+        used = time.process_time()
+        bench.reconciler.retention.take_all()
+        milliseconds = 1000 * (time.process_time() - used) / each
+        found.append(size(bench, home))
+        print(f"{(number + 1) * each:7,} through: {found[-1]}; {milliseconds:.2f} ms of CPU a job", flush=True)
+    return found
+
+
 def forget_ended(bench: Bench[FakeEngine]) -> None:
     """The fake cluster keeps every gang that it had."""
     with suppress(RuntimeError):
@@ -159,12 +187,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=100_000, help="number of jobs")
     parser.add_argument("--rounds", type=int, default=10, help="number of rounds")
+    parser.add_argument("--rows", action="store_true", help="rows of ended jobs alone")
     parser.add_argument("--off", action="store_true", help="take nothing")
     add_option(parser)
     options = parser.parse_args()
     watch = Watch(options.loaded_anyway)
     with tempfile.TemporaryDirectory() as folder, controller(Path(folder), watch) as bench:
-        rounds(bench, Path(folder), options.jobs, options.rounds, not options.off)
+        if options.rows:
+            rows_alone(bench, Path(folder), options.jobs, options.rounds)
+        else:
+            rounds(bench, Path(folder), options.jobs, options.rounds, not options.off)
 
 
 if __name__ == "__main__":

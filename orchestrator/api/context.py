@@ -180,10 +180,11 @@ def find_run(reconciler: Reconciler, name: str) -> Run:
 
 
 @contextmanager
-def using(reconciler: Reconciler, *runs: str) -> Iterator[None]:
-    """A block in which nobody deletes these runs, and after which something in the store may need them. Raises RunInUse."""
+def using(reconciler: Reconciler, *runs: str, cites: bool = True) -> Iterator[None]:
+    """A block in which nobody deletes these runs; ``cites``: afterwards something in the store may need them. Raises RunInUse."""
     with ExitStack() as stack:
-        stack.callback(reconciler.retention.look_again)
+        if cites:
+            stack.callback(reconciler.retention.look_again)
         for run in runs:
             stack.enter_context(reconciler.run_users.using(run))
         yield

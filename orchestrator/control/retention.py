@@ -23,11 +23,12 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.peers import Peers
+from orchestrator.control.retention_looks import CONTROLLER, Look, Place, Totals, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import Decision, JobFacts, References, Rules, RunFacts, decide, still_needed
+from orchestrator.domain.retention import JobFacts, References, Rules, RunFacts, decide, still_needed
 from orchestrator.persistence import references as rows
 from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart
@@ -49,6 +50,8 @@ _REMOVERS = 8
 """Threads that remove what was thrown away."""
 _FRESH = 600.0
 """Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
+_PATIENCE = 10.0
+"""Seconds for which the end of a controller waits for a step."""
 _LOGGED = 24 * 3600.0
 """Seconds between two reports of what would go."""
 
@@ -59,84 +62,6 @@ class RunNeeded(RequestError):
     status = 409
 
 
-@dataclass(frozen=True)
-class Whose:
-    """Who asks: nothing but what is theirs goes."""
-
-    name: str
-    queues: frozenset[str] | None = None
-    """None: everything is theirs."""
-
-    def owns(self, owner: str | None, queue: str) -> bool:
-        """Whether a job or a run is theirs."""
-        return self.queues is None or (owner == self.name and queue in self.queues)
-
-
-CONTROLLER = Whose("this controller")
-
-
-@dataclass(frozen=True)
-class Look:
-    """What a step does, or would do, with a run and its jobs."""
-
-    run: str
-    decision: Decision
-    directories: tuple[Path, ...] = ()
-    """That go."""
-    is_missing: bool = False
-    """Whether the store has no such run."""
-
-    def described(self) -> dict[str, Any]:
-        """For the API; sizes in bytes."""
-        sizes = [trash.size_of(path) for path in self.directories]
-        return {
-            "run": self.run,
-            "whole": self.decision.run,
-            "jobs": list(self.decision.jobs),
-            "bytes": sum(size for size, _ in sizes),
-            "files": sum(count for _, count in sizes),
-            "kept": list(self.decision.reasons),
-        }
-
-
-@dataclass
-class Totals:
-    """What a pass has taken."""
-
-    jobs: int = 0
-    runs: int = 0
-    kept: int = 0
-    bytes: int = 0
-
-    def add(self, looks: Sequence[Mapping[str, Any]]) -> None:
-        self.jobs += sum(len(each["jobs"]) for each in looks)
-        self.runs += sum(each["whole"] for each in looks)
-        self.bytes += sum(each["bytes"] for each in looks)
-        self.kept += sum(bool(each["kept"]) for each in looks)
-
-    def __str__(self) -> str:
-        return f"{self.jobs} jobs and {self.runs} runs ({self.bytes / 2**20:.1f} MiB)"
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a pass is: everything that ended before was looked at."""
-
-    stopped_at: int = -1
-    job: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.stopped_at}.{self.job}"
-
-    @classmethod
-    def of(cls, text: str) -> Place:
-        """Raises ValueError."""
-        moment, dot, job = text.partition(".")
-        if not dot or not moment.isdecimal() or len(moment) > 16:
-            raise ValueError(f"{text[:100]!r} is no place of a pass")
-        return cls(int(moment), job)
-
-
 @dataclass
 class _Stored:
     """What in the store needs runs, as it was found."""
@@ -144,6 +69,8 @@ class _Stored:
     references: References = field(default_factory=References)
     found_at: float | None = None
     """Monotonic [s]; None before it was looked for."""
+    version: int = 0
+    """:attr:`Retention._version` before it was looked for."""
 
 
 class Retention:
@@ -179,11 +106,11 @@ class Retention:
         self._is_on = default != inf
         self._default = int(default * 1000) if default is not None and self._is_on else None
         self._removing = machine.pool("emptying the trash", _REMOVERS)
-        self._stored = _Stored()
+        self._stored, self._version = _Stored(), 0
         self._scanning = threading.Lock()
         self._next, self._next_report = machine.monotonic() + _FIRST, machine.monotonic()
         self._is_under_way = False
-        self._is_closing = threading.Event()
+        self._is_closing, self._passing = threading.Event(), threading.Lock()
 
     # -- passes ---------------------------------------------------------------------------------------------------------
 
@@ -192,8 +119,10 @@ class Retention:
         later(self._empty_trash)
 
     def close(self) -> None:
-        """End a pass at its next step."""
+        """End a pass after its present step, for which this waits some seconds: then the database is another controller's."""
         self._is_closing.set()
+        if self._passing.acquire(timeout=_PATIENCE):
+            self._passing.release()
         self._removing.close()
 
     def when_due(self, later: Callable[[Callable[[], object]], None]) -> None:
@@ -204,12 +133,8 @@ class Retention:
 
     def _pass(self) -> None:
         try:
-            with self._database.session() as session:
-                rules = self.rules(session)
-            if rules.is_trial(self._moment()):
-                self._report()
-            else:
-                self.take_all()
+            with self._passing:
+                self._take_or_report()
         except (OSError, Unavailable) as error:
             log.warning("old jobs and runs can't be taken now (%s); trying again later", " ".join(str(error).split()))
         except Exception:
@@ -217,6 +142,17 @@ class Retention:
         finally:
             self._next = machine.monotonic() + _INTERVAL
             self._is_under_way = False
+
+    def _take_or_report(self) -> None:
+        if self._is_closing.is_set():
+            return
+        self._empty_trash()
+        with self._database.session() as session:
+            rules = self.rules(session)
+        if rules.is_trial(self._moment()):
+            self._report()
+        else:
+            self.take_all()
 
     def take_all(self) -> Totals:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
@@ -341,6 +277,7 @@ class Retention:
         with self._database.session() as session:  # after the store: what was submitted meanwhile counts
             jobs = self._jobs(session, runs, rules, whose)
             needed = References.of(rows.references(session, runs, rules, moment)) | stored
+        needed = needed if whose.queues is None else needed.unnamed()
         return [self._look(run, facts[run], jobs[run], needed, moment) for run in sorted(runs)]
 
     def _jobs(self, session: Session, runs: Collection[str], rules: Rules, whose: Whose) -> dict[str, list[JobFacts]]:
@@ -373,6 +310,8 @@ class Retention:
         self._check()
         thrown = trash.throw_away(self._store, *(path for look in looks for path in look.directories))
         self._check()
+        if self._is_closing.is_set():
+            return  # the next controller deletes the rows
         # an array behind its children
         jobs = sorted((job for look in looks for job in look.decision.jobs), key=lambda job: ":" not in job)
         gone = [look.run for look in looks if look.decision.run or look.is_missing]
@@ -410,30 +349,31 @@ class Retention:
     def _stored_references(self, fresh: float) -> References:
         """What in the store needs runs, as it was at most so many seconds ago. Raises Unavailable, OSError."""
         with self._scanning:
-            stored = self._stored
-            if stored.found_at is None or machine.monotonic() - stored.found_at > fresh:
+            stored, version = self._stored, self._version
+            is_old = stored.found_at is None or machine.monotonic() - stored.found_at > fresh
+            if is_old or stored.version != version:
                 began = machine.monotonic()
                 self._check()
                 needed, unreadable = stored_references(self._store)
                 self._check()
                 references = References.of((retention.Reference(*each) for each in needed), unreadable)
-                self._stored = _Stored(references, began)
+                self._stored = _Stored(references, began, version)
             return self._stored.references
 
     def look_again(self) -> None:
-        """Something in the store needs other runs than before."""
-        with self._scanning:
-            self._stored = _Stored()
+        """Something in the store needs other runs than before. Waits for nothing."""
+        self._version += 1
 
     # -- one run, as a person asks --------------------------------------------------------------------------------------
 
-    def needs(self, name: str) -> tuple[RunFacts | None, list[str]]:
-        """A run as the store has it, and why it may not be deleted. Raises Unavailable, OSError."""
+    def needs(self, name: str, whose: Whose = CONTROLLER) -> tuple[RunFacts | None, list[str]]:
+        """A run as the store has it, and why it may not be deleted, in words for who asks. Raises Unavailable, OSError."""
         stored, facts, moment = self._stored_references(0.0), self.facts([name])[name], self._moment()
         with self._database.session() as session:
             rules = self.rules(session)
             jobs = rows.jobs_of_runs(session, [name], rules)[name]
             needed = References.of(rows.references(session, [name], rules, moment)) | stored
+        needed = needed if whose.queues is None else needed.unnamed()
         return facts, [] if facts is None else still_needed(facts, jobs, needed)
 
     def open_job(self, name: str) -> str | None:
@@ -442,15 +382,15 @@ class Retention:
             query = select(Job.id).where(Job.run == name, Job.status.not_in(TERMINAL))
             return session.scalars(query.limit(1)).first()
 
-    def delete(self, name: str) -> dict[str, Any]:
-        """Delete a run with all that it holds; its jobs stay in the history. Returns its size, in ``bytes`` and ``files``.
+    def delete(self, name: str, whose: Whose = CONTROLLER) -> dict[str, Any]:
+        """Delete a run with all that it holds, for who asks; its jobs stay in the history. Returns its size, in ``bytes`` and ``files``.
 
         Raises:
             RunNeeded: Something needs it, or a request uses it.
             Unavailable, OSError: The store or the database can't be used.
         """
         with self.alone(name):
-            facts, reasons = self.needs(name)
+            facts, reasons = self.needs(name, whose)
             if reasons:
                 raise RunNeeded(f"run {name} is kept: {'; '.join(reasons)}")
             path = self._store.run(name).path

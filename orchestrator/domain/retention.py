@@ -66,6 +66,12 @@ class References:
         """What needs it."""
         return self.found.get((kind, name), ())
 
+    def unnamed(self) -> References:
+        """The same for who may not see everything: that something needs a run, and not what."""
+        hidden = ["something needs it, and a key with all queues sees what"]
+        unreadable = ["something in the store can't be read"] if self.unreadable else ()
+        return References(dict.fromkeys(self.found, hidden), tuple(unreadable))
+
     def __or__(self, other: References) -> References:
         keys = self.found.keys() | other.found.keys()
         found = {key: [*self.found.get(key, ()), *other.found.get(key, ())] for key in keys}

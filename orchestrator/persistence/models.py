@@ -417,14 +417,3 @@ class Node(Base):
             **{key: value for key, value in known.items() if value is not None},
             **(ended if self.exit_code is not None else {}),
         }
-
-
-class ShareUsage(Base):
-    """A share's use of a queue, decayed to ``as_of`` (steady time [ms])."""
-
-    __tablename__ = "share_usage"
-    queue: Mapped[str] = mapped_column(primary_key=True)
-    share: Mapped[str] = mapped_column(primary_key=True)
-    seconds: Mapped[float]
-    """GPU-seconds; CPU-seconds of jobs without GPUs."""
-    as_of: Mapped[int]

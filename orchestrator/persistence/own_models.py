@@ -1,4 +1,4 @@
-"""The tables of what a controller is and keeps: its clock, store, account, texts, messages, uses of runs, log groups. Jobs are in :mod:`.models`."""
+"""The tables of what a controller is and keeps: its clock, store, account, texts, messages, log groups, uses of runs and queues. Jobs are in :mod:`.models`."""
 
 from __future__ import annotations
 
@@ -63,6 +63,17 @@ class KeptText(Base):
     uploaded_at: Mapped[int]
     used_at: Mapped[int]
     """When it was uploaded, or a definition or a job that names it was registered, last."""
+
+
+class ShareUsage(Base):
+    """A share's use of a queue, decayed to ``as_of`` (steady time [ms])."""
+
+    __tablename__ = "share_usage"
+    queue: Mapped[str] = mapped_column(primary_key=True)
+    share: Mapped[str] = mapped_column(primary_key=True)
+    seconds: Mapped[float]
+    """GPU-seconds; CPU-seconds of jobs without GPUs."""
+    as_of: Mapped[int]
 
 
 class KnownAccount(Base):

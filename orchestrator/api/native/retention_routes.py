@@ -14,7 +14,8 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.control.retention import Place, RunNeeded, Whose
+from orchestrator.control.retention import RunNeeded
+from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.domain.retention import age_of
 from shared_store import contents
 
@@ -91,18 +92,22 @@ def delete_run(request: Request, name: str) -> dict[str, Any]:
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.DELETE_RUN)
     reconciler.check_writable(adds=False)
-    return reconciler.retention.delete(run.name)
+    return reconciler.retention.delete(run.name, _caller())
+
+
+def _caller() -> Whose:
+    identity = permissions.current_identity.get()
+    return Whose(identity.name, identity.queues)
 
 
 def _part(reconciler: Reconciler, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
     """The next part of a pass. Raises ClientError for a malformed member."""
-    identity = permissions.current_identity.get()
+    whose = _caller()
     try:
         place = Place.of(after) if after else Place()
         older = age_of(older_than) if older_than else None
     except ValueError as error:
         raise ClientError(str(error)) from None
-    whose = Whose(identity.name, identity.queues)
     found: list[dict[str, Any]] = []
     deadline = time.monotonic() + _A_PART
     while True:

@@ -172,7 +172,7 @@ def resume(reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: 
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
-    with using(reconciler, run.name):
+    with using(reconciler, run.name, cites=False):
         return with_teacher(reconciler, lambda teacher: _resume(reconciler, run, changes, idempotency_key, teacher))
 
 

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.client import Client
 from orchestrator.control.clock import Clock
 from orchestrator.control.usage import usage_at
-from orchestrator.persistence.models import ShareUsage
+from orchestrator.persistence.own_models import ShareUsage
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from tests.conftest import submit_gang

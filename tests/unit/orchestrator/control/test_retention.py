@@ -5,26 +5,23 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select, update
+from sqlalchemy import select
 
 from orchestrator.control import retention as module
-from orchestrator.control.peers import Peers
-from orchestrator.control.retention import Place, Retention, RunNeeded, Whose
+from orchestrator.control.retention import Retention, RunNeeded
+from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.control.run_users import RunInUse, RunUsers
-from orchestrator.domain.retention import A_DAY, BATCH_DAYS
+from orchestrator.domain.retention import A_DAY
 from orchestrator.persistence import references
 from orchestrator.persistence.models import (
     Attempt,
-    Base,
     Dependency,
-    Job,
     JobDefinition,
     JobQueue,
     Node,
@@ -32,79 +29,13 @@ from orchestrator.persistence.models import (
     now,
 )
 from orchestrator.persistence.own_models import RetentionStart, RunUse
-from orchestrator.persistence.session import Database
 from shared_store import contents, trash
-from shared_store.files import sync_directory, write_json
+from shared_store.files import sync_directory
 from shared_store.layout import Store
+from tests.support.orchestrator.retention import LONG_AGO, World
 from tests.support.orchestrator.rows import job
 
-LONG_AGO = now() - (BATCH_DAYS + 1) * A_DAY
 ARN = "arn:aws:batch:us-east-1:000000000000:job-definition/"
-
-
-class World:
-    """A database and a store, with jobs that ended long ago."""
-
-    def __init__(self, home: Path) -> None:
-        self.database = Database(f"sqlite:///{home}/muster.db")
-        self.store = Store(home / "store").open()
-        self.peers = Peers(self.store, home)
-        self.users, self.writing = RunUsers(), threading.Lock()
-        self.beginning: dict[str, object] = {}
-        self.absent: Callable[[], None] = lambda: None
-
-    def retention(self, default: float | None = None) -> Retention:
-        return Retention(
-            self.database,
-            self.store,
-            self.peers,
-            self.users,
-            self.beginning,
-            self.writing,
-            lambda: self.absent(),
-            now,
-            default,
-        )
-
-    def ended(self, name: str, *, run: str | None = None, directory: bool = True, **facts: Any) -> None:
-        """A job with an attempt, a node, an owner and a run with a log."""
-        run = run or name
-        values = {"status": "SUCCEEDED", "stopped_at": LONG_AGO, "owner": "key a", "run": run, **facts}
-        with self.database.session() as session:
-            session.add(job(name, **values))
-            session.add(Attempt(job_id=name, number=1, epoch=1, nodes=[Node(index=0, host="h")], stopped_at=1))
-            session.merge(RunRecord(name=run, queue="default", owner=values["owner"]))
-        if directory:
-            place = self.store.run(run)
-            write_json(place.path / "run.json", {"run": run, "spec": None})
-            place.logs(name, 1).mkdir(parents=True)
-            place.log(name, 1, 0).write_bytes(b"x" * 1000)
-            write_json(place.outcome(name, 1, 0), {})
-
-    def change(self, name: str, **values: Any) -> None:
-        with self.database.session() as session:
-            session.execute(update(Job).where(Job.id == name).values(values))
-
-    def add(self, *rows: Base) -> None:
-        with self.database.session() as session:
-            session.add_all(rows)
-
-    def jobs(self) -> list[str]:
-        with self.database.session() as session:
-            return sorted(session.scalars(select(Job.id)))
-
-    def runs(self) -> list[str]:
-        return sorted(run.name for run in self.store.runs())
-
-    def rows(self) -> int:
-        """Of all tables that a job adds to."""
-        tables = (Job, Attempt, Node, Dependency, RunUse, RunRecord)
-        with self.database.session() as session:
-            return sum(session.scalar(select(func.count()).select_from(table)) or 0 for table in tables)
-
-    def trashed(self) -> list[str]:
-        folder = self.store.path / "trash"
-        return os.listdir(folder) if folder.exists() else []
 
 
 @pytest.fixture
@@ -218,7 +149,6 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
         world.ended(f"j{number:02}", stopped_at=LONG_AGO + number // 5)
         if number % 4 == 0:
             contents.archive(world.store.run(f"j{number:02}"), "key a")
-    monkeypatch.setattr(module, "A_STEP", 3)
     place: Place | None = Place()
     seen: list[str] = []
     while place is not None:
@@ -290,6 +220,27 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
     assert world.runs() == ([] if whole else ["old"])
     with world.database.session() as session:
         assert session.scalars(select(RunRecord.name)).all() == ([] if whole else ["old"])
+
+
+def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.ended("old")
+    ending, throw = world.retention(), trash.throw_away
+
+    def late(store: Store, *paths: Path) -> list[Path]:
+        ending._is_closing.set()
+        return throw(store, *paths)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(trash, "throw_away", late)
+        ending._pass()
+    ending.close()
+    assert world.jobs() == ["old"] and world.runs() == [] and len(world.trashed()) == 1
+    following = world.retention()
+    following._empty_trash()
+    following.take_all()
+    assert world.jobs() == [] and world.trashed() == []
 
 
 def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
@@ -370,55 +321,6 @@ def test_a_job_that_begins_to_wait_for_one_that_is_being_taken_keeps_its_row(
     monkeypatch.setattr(trash, "throw_away", late)
     world.retention().take_all()
     assert world.jobs() == ["old", "waits"]
-
-
-def test_requests_and_passes_at_once_never_share_a_run(world: World) -> None:
-    users = world.users
-    taken, used = set[str](), set[str]()
-    wrong: list[str] = []
-    ending = threading.Event()
-
-    def take() -> None:
-        while not ending.is_set():
-            for name in ("a", "b"):
-                if users.take(name):
-                    taken.add(name)
-                    if name in used:
-                        wrong.append(name)
-                    taken.discard(name)
-                    users.let_go(name)
-
-    def use(name: str) -> None:
-        for _ in range(3000):
-            try:
-                with users.using(name):
-                    used.add(name)
-                    if name in taken:
-                        wrong.append(name)
-                    used.discard(name)
-            except RunInUse:
-                pass
-
-    taker = threading.Thread(target=take)
-    taker.start()
-    threads = [threading.Thread(target=use, args=(name,)) for name in "ab"]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
-    ending.set()
-    taker.join()
-    assert wrong == [] and users._users == {}
-
-
-def test_deletions_are_not_remembered_for_ever(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    moment = [0.0]
-    monkeypatch.setattr("orchestrator.machine.monotonic", lambda: moment[0])
-    for number in range(5000):
-        moment[0] += 1.0
-        assert world.users.take(f"r{number}")
-        world.users.let_go(f"r{number}")
-    assert len(world.users._changed) < 1000
 
 
 # -- rules, owners, definitions -----------------------------------------------------------------------------------------

@@ -73,6 +73,13 @@ def test_old_jobs_go_without_their_run_where_that_holds_more(
     assert reason in " ".join(decision.reasons)
 
 
+def test_who_may_not_see_everything_is_not_told_what_needs_a_run() -> None:
+    references = References.of([Reference("run", "r", "run secret is a clone of it")], ["model hidden can't be read"])
+    for run in (RUN, RunFacts("r2", ("checkpoints",))):
+        [reason] = still_needed(run, [OLD], references.unnamed())
+        assert "something" in reason and "secret" not in reason and "hidden" not in reason
+
+
 def test_of_a_run_of_which_no_job_is_due_nothing_is_told() -> None:
     assert decide(RUN, [JobFacts("old", due_at=NOW + 1)], NOTHING, NOW) == Decision(False, ())
     assert decide(RUN, [], NOTHING, NOW) == Decision(False, ()), "a run of another controller, or of a lost database"
