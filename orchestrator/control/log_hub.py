@@ -208,8 +208,8 @@ class LogHub:
         now, due = machine.monotonic(), machine.monotonic() + _TICK
         looking = [each for each in followed if not each.logs.is_over and not each.logs.delivers()]
         for each in followed:
-            if now >= each.next_ask and each.logs.attempt is not None:
-                self._ask(each, now)
+            if now >= each.next_ask and (attempt := each.logs.attempt) is not None:
+                self._ask(each, attempt, now)
         for each in looking:
             if each.is_looked_at:
                 continue
@@ -240,13 +240,11 @@ class LogHub:
                 each.logs.is_over = is_over
                 each.wake()
 
-    def _ask(self, each: _Followed, now: float) -> None:
+    def _ask(self, each: _Followed, attempt: int, now: float) -> None:
         """Ask the nodes of the open attempt to push their logs."""
-        if each.logs.attempt is None:
-            return
         each.asking = _ASK_SELDOM if each.logs.is_heard() else min(2 * each.asking, _ASK_SELDOM)
         each.next_ask = now + each.asking
-        self._bus.ask_for_logs(each.logs.job, each.logs.attempt)
+        self._bus.ask_for_logs(each.logs.job, attempt)
 
     def _look(self, each: _Followed, pause: float) -> None:
         def look() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -241,6 +242,18 @@ def test_while_the_store_is_away_lines_come_from_memory_and_nothing_is_lost(worl
     (world.directory / "unmounted").rename(world.directory / "run")
     world.problem = None
     wait_for(lambda: has(pieces, "before", "pushed meanwhile", "lost meanwhile"))
+
+
+def test_a_log_that_can_not_be_read_ends_its_stream_with_the_reason(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> list[int]:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(log_view, "attempts_with_logs", broken)
+    pieces = world.follow()
+    world.threads[-1].join(60)
+    assert "the log can't be read now: [Errno 5] Input/output error" in "".join(pieces)
 
 
 def test_a_follower_that_takes_nothing_holds_no_other_up_and_keeps_little(world: World) -> None:
