@@ -10,17 +10,27 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import time
 from pathlib import Path
 
 from benchmarks.load import Watch, add_option
 from benchmarks.scale import Bench, MemoryStore, ShortEngine, controller, large
 
 FIRST, AT_ONCE = 2000, 100
+SETTLED = 5.0
+"""Seconds after which the controller has forgotten the last jobs."""
 
 
 def resident() -> int:
     """Resident memory of this process [kB]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+def kept() -> tuple[int, int]:
+    """Resident memory [kB], and the number of objects, once the controller rests."""
+    time.sleep(SETTLED)
+    gc.collect()
+    return resident(), len(gc.get_objects())
 
 
 def end_gangs(bench: Bench[ShortEngine], first: int, last: int) -> None:
@@ -42,13 +52,12 @@ def main() -> None:
     watch = Watch(options.loaded_anyway)
     with controller(ShortEngine(capacity=large(AT_ONCE)), MemoryStore, watch) as bench:
         end_gangs(bench, 0, FIRST)
-        gc.collect()
-        before, objects = resident(), len(gc.get_objects())
+        before, objects = kept()
         end_gangs(bench, FIRST, options.gangs)
-        gc.collect()
-        more, count = resident() - before, options.gangs - FIRST
-        print(f"after {FIRST} gangs {before / 1024:.0f} MiB; {count} more: {more / count:.2f} kB each, ", end="")
-        print(f"{(len(gc.get_objects()) - objects) / count:.2f} objects each")
+        after, more = kept()
+        count = options.gangs - FIRST
+        print(f"after {FIRST} gangs {before / 1024:.0f} MiB; {count} more: ", end="")
+        print(f"{(after - before) / count:.2f} kB and {(more - objects) / count:.2f} objects each")
 
 
 if __name__ == "__main__":

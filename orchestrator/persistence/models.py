@@ -260,8 +260,8 @@ class Job(Base):
             self.status_reason = reason
 
 
-_TOP = Job.parent.is_(None)
-Index("ix_jobs_named", Job.name, Job.created_at, sqlite_where=_TOP, postgresql_where=_TOP)
+_alone = Job.parent.is_(None)
+Index("ix_jobs_named", Job.name, Job.created_at, sqlite_where=_alone, postgresql_where=_alone)
 
 
 class RunRecord(Base):

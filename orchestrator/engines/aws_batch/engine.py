@@ -27,7 +27,6 @@ from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import AWS_NOT_STARTED, TERMINAL
 from orchestrator.domain.resources import Resources
 from orchestrator.engines.api import (
-    Cause,
     EngineError,
     Gang,
     GangStatus,
@@ -42,8 +41,8 @@ from orchestrator.engines.api import (
 from orchestrator.engines.aws_batch import TRAITS
 from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
+from orchestrator.engines.aws_batch.node_status import node_ended, waiting, waits
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
-from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
@@ -341,7 +340,7 @@ class AwsBatchEngine:
         if not over:
             if status == "RUNNING":
                 return NodeStatus(NodePhase.RUNNING, address)
-            return _waits(status, address, _waiting(handle, index, status, detail, parent))
+            return waits(status, address, waiting(handle, index, status, detail, parent))
         watched.ended.setdefault(index, time.monotonic())
         code = container.get("exitCode")
         code = 0 if code is None and status == "SUCCEEDED" else code
@@ -351,7 +350,7 @@ class AwsBatchEngine:
         outcome = seen(handle, index, code or 0, str(reason), stopped, asked)
         if code is not None and not self._settled(handle, watched, log, outcome):
             return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
-        return _ended(address, code, str(reason), code is None and detail.get("statusReason") == AWS_NOT_STARTED)
+        return node_ended(address, code, str(reason), code is None and detail.get("statusReason") == AWS_NOT_STARTED)
 
     def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, outcome: Outcome) -> bool:
         """Whether the store has the node's outcome; it is written here if it was missing."""
@@ -404,38 +403,6 @@ class AwsBatchEngine:
             for each in described.get("computeEnvironments", [])
         ]
         return max([*sizes, 0]) or self.config.max_vcpus
-
-
-def _waiting(handle: Handle, index: int, status: str, detail: Mapping[str, Any], parent: Mapping[str, Any]) -> str:
-    """Why a node has not been started, in words a person can act on."""
-    said = detail.get("statusReason") or parent.get("statusReason") or ""
-    if said and status != "STARTING":
-        return f"AWS Batch: {said}"
-    count, queue = handle.nodes, str(handle.facts["queue"]).rpartition("/")[2]
-    if status == "STARTING":
-        return f"AWS Batch starts node {index}: its instance pulls the image"
-    if parent["status"] == "RUNNING":
-        return f"AWS Batch starts node {index} now that the main node runs"
-    return (
-        f"AWS Batch gets {counted(count, 'instance')} for queue {queue} ({status}); "
-        "if that lasts, see `muster aws status` for limits and the account's quota of vCPUs"
-    )
-
-
-def _waits(status: str, address: str, why: str) -> NodeStatus:
-    """A node that AWS has not started; ``status``: SUBMITTED, PENDING, RUNNABLE or STARTING."""
-    return NodeStatus(NodePhase.STARTING if status == "STARTING" else NodePhase.QUEUED, address, why)
-
-
-def _ended(address: str, code: int | None, reason: str, not_started: bool = False) -> NodeStatus:
-    """A node that has ended, by its exit code and AWS's reason: of memory and lost hosts AWS tells in words alone."""
-    if not_started:
-        return NodeStatus(NodePhase.ENDED, address, reason, Cause.CANNOT_START)
-    if reason.startswith("OutOfMemoryError"):
-        return NodeStatus(NodePhase.ENDED, address, reason, Cause.OUT_OF_MEMORY, code)
-    if code is None and reason and not reason.startswith("Host EC2"):
-        return NodeStatus(NodePhase.ENDED, address, reason)  # AWS does not say
-    return ended(address, code, reason)
 
 
 def _is_transient(error: ClientError) -> bool:

@@ -57,7 +57,7 @@ def stop(bench: Bench, name: str) -> None:
 
 def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_withdrawn(bench: Bench) -> None:
     gc.collect()
-    before = {id(each) for each in gc.get_objects() if isinstance(each, State)}
+    before = {id(each) for each in gc.get_objects() if isinstance(each, State | Handle)}
     bench.runs_and_ends("a", "b")
     bench.submit("stopped")
     bench.wait("stopped", Status.RUNNING)
@@ -68,9 +68,9 @@ def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_
     stop(bench, "waits")
     attempts: Attempts = bench.reconciler.attempts
 
-    def kept() -> list[State]:
+    def kept() -> list[State | Handle]:
         gc.collect()
-        return [each for each in gc.get_objects() if isinstance(each, State) and id(each) not in before]
+        return [each for each in gc.get_objects() if isinstance(each, State | Handle) and id(each) not in before]
 
     wait_for(lambda: not kept() and not attempts._memories, 10, "that nothing is kept")
 
