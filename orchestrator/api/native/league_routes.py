@@ -241,12 +241,7 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
         entry = {
             "racer": _racer(body),
             "owner": _caller(),
-            "model": {
-                "name": model.name,
-                "version": model.version,
-                "digest": _digest(model),
-                "task": summary.get("task"),
-            },
+            "model": {**_identity(model), "task": summary.get("task")},
             "evaluation": {"run": cited, "name": summary["name"], "job": job, "time": summary["time"]},
             "versions": summary.get("versions"),
             "race": summary["race"],
@@ -388,6 +383,10 @@ def _checked(reconciler: Reconciler, league: League, model: Model) -> Checkpoint
     if found.manifest["files"] != facts.get("checkpoint_files"):
         raise gone  # another run has the name of the one that was trained
     return found
+
+
+def _identity(model: Model) -> dict[str, Any]:
+    return {"name": model.name, "version": model.version, "digest": _digest(model)}
 
 
 def _race_of(reconciler: Reconciler, league: League, reference: str) -> tuple[str, str]:

@@ -428,39 +428,6 @@ def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
     assert step(state, Gone(T, ends, SAVED)) == (Close(T, spent, status, reason),)
 
 
-HOW = "cancelled in Slurm (scancel), not by Muster (job 7)"
-
-
-@pytest.mark.parametrize(
-    ("before", "most", "allowed", "status", "words"),
-    [
-        (0, 3, 3, Status.RUNNABLE, "; starting again (1 of 3 times)"),
-        (2, 3, 3, Status.RUNNABLE, "; starting again (3 of 3 times)"),
-        (3, 3, 99, Status.FAILED, "; not started again after 4 cancellations: ask who did it before you resume it"),
-        (0, 0, 99, Status.FAILED, "; not started again after 1 cancellation: ask who did it before you resume it"),
-    ],
-)
-def test_a_gang_that_others_cancel_is_started_again_a_bounded_number_of_times(
-    before: int, most: int, allowed: int, status: Status, words: str
-) -> None:
-    state = ending(Ending.REQUEUE, "left on request", 75)
-    state = replace(state, terms=replace(TERMS, cancelled=before, allowed=allowed))
-    gone = Gone(T, (NodeEnd(75, "left on request", 1.0, asked=True),) * 2, SAVED, HOW, most)
-    (close,) = step(state, gone)
-    assert close == Close(T, False, status, f"attempt 2 was {HOW}{SAVED}{words}", HOW)
-
-
-def test_a_gang_that_others_cancel_at_once_spends_an_attempt_and_one_that_its_user_stops_is_stopped() -> None:
-    state = replace(ending(Ending.REQUEUE, "left on request", 75), running_since=T - SHORTEST_REQUEUE + 1)
-    gone = Gone(T, (), SAVED, HOW, 3)
-    (close,) = step(replace(state, terms=replace(TERMS, allowed=3, spent=1)), gone)
-    assert isinstance(close, Close) and (close.spent, close.status) == (True, Status.RUNNABLE)
-    (close,) = step(replace(state, terms=replace(TERMS, allowed=2, spent=2)), gone)
-    assert isinstance(close, Close) and (close.spent, close.status) == (True, Status.FAILED)
-    (close,) = step(replace(state, stop_reason="enough"), gone)
-    assert close == Close(T, True, Status.FAILED, f"enough{SAVED}")
-
-
 def test_a_long_reason_leaves_room_for_the_fault_that_came_again() -> None:
     state = faulty(FAULT)
     long = replace(state, verdict=replace(FAILED, reason="y" * 5000, fault=FAULT))
