@@ -34,6 +34,8 @@ _SHARE = 0.005
 """Seconds between two looks, for each job that is looked at: all of them together are looked at 200 times a second."""
 _AGAIN = 1.0
 """Seconds until a store or a database that can't be read is tried again."""
+_ROWS = 10.0
+"""Seconds after which the rows of all followed jobs are read, whether a commit has told of a change or not."""
 _TICK = 1.0
 """Seconds between two rounds in which nothing happens."""
 _ASK, _ASK_SELDOM = 2.0, LOG_LEASE / 2
@@ -109,6 +111,8 @@ class LogHub:
         self._watching: list[Wakes] = []
         self._thread: threading.Thread | None = None
         self._is_closing = self._is_due = False
+        self._read_at = 0.0
+        """When the rows of all jobs were read (monotonic [s])."""
         bus.pushed, bus.stated, bus.is_followed = self._pushed, self._stated, self._followed.__contains__
 
     @contextmanager
@@ -201,7 +205,9 @@ class LogHub:
 
     def _round(self, followed: Collection[_Followed]) -> float:
         """Read changed rows, ask nodes to push, and look at the files of jobs whose nodes do not; returns the seconds until the next one."""
-        self._read_rows([each for each in followed if each.is_changed])
+        if is_late := machine.monotonic() - self._read_at > _ROWS:
+            self._read_at = machine.monotonic()
+        self._read_rows([each for each in followed if each.is_changed or is_late])
         share = _MEMORY // (3 * sum(max(1, len(each.logs)) for each in followed))
         for each in followed:
             each.logs.keep(min(MOST, share))

@@ -204,6 +204,18 @@ def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_l
     assert not world.hub._followed, "nothing is kept for nobody"
 
 
+def test_followers_end_though_no_commit_told_of_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_hub, "_ROWS", 0.0)
+    pieces = world.follow()
+    world.heard()
+    world.write("seen")
+    wait_for(lambda: has(pieces, "seen"))
+    world.database.committed = None
+    world.end(1, Status.FAILED)
+    world.threads[-1].join(60)
+    assert not world.threads[-1].is_alive()
+
+
 def test_the_follower_of_a_job_that_is_over_or_gone_ends(world: World) -> None:
     world.write("all", push=False)
     with world.database.session() as session:
