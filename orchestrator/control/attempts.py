@@ -209,7 +209,7 @@ class Attempts:
         """The rows of these jobs were read anew."""
         for job_id in jobs:
             if (opened := self._open.get(job_id)) is not None:
-                opened.is_current, opened.taking = False, None
+                opened.is_current, opened.taking, opened.uncommitted = False, None, []
 
     def _opened(self, job: Job, attempt: Attempt) -> _Open:
         opened = self._open.get(job.id)
