@@ -168,7 +168,7 @@ class Attempts:
         if state.phase is Phase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
         elif self._stops.has_begun(key):
-            pause = _LATER
+            pause = self._stops.pause(key)
         elif state.done_since is not None:
             pause = (state.done_since + FINISHING - self.clock.now()) / 1000
         elif state.verdict is not None:

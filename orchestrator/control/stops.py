@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 
 from orchestrator import machine
 from orchestrator.control.run_store import Key
@@ -18,6 +19,8 @@ from orchestrator.machine import Pool
 
 _THREADS = 128
 """Stops that are under way at once on one engine: those on another one wait for none of them."""
+_QUIET = 1.0
+"""Seconds for which a stop may wait for its turn before its job says so."""
 _AGAIN, _RARELY = 2.0, 30.0
 """Seconds until another try to stop a gang that could not be stopped: at first, and at most."""
 
@@ -29,7 +32,14 @@ class _Stop:
     engine: str
     waited: bool
     """Whether all threads for the engine were busy."""
+    asked: float
+    """When it was asked for (monotonic [s])."""
     result: Future[GangStatus]
+
+    @property
+    def unsaid(self) -> float:
+        """Seconds until its job says that it waits, or has waited; 0 from then on."""
+        return max(0.0, self.asked + _QUIET - machine.monotonic()) if self.waited else inf
 
 
 class Stops:
@@ -80,7 +90,7 @@ class Stops:
         if failure := self._denied.failure(key):
             return failure
         stop = self._under_way.get(key)
-        if stop is None or not stop.waited:
+        if stop is None or stop.unsaid:
             return None
         if not (stop.result.running() or stop.result.done()):
             return f"attempt {key[1]} waits for its turn to be stopped: the {stop.engine} engine is stopping {_THREADS} others"
@@ -91,7 +101,11 @@ class Stops:
         return key in self._under_way or key in self._stopped
 
     def pause(self, key: Key) -> float:
-        """Seconds until the next try."""
+        """Seconds until the next try, or until the job says that the stop waits; infinity where neither comes."""
+        if key in self._stopped:
+            return inf
+        if (stop := self._under_way.get(key)) is not None:
+            return stop.unsaid or inf
         return self._denied.pause(key)
 
     def forget(self, key: Key) -> None:
@@ -107,8 +121,9 @@ class Stops:
             self._pools[engine] = machine.pool(f"stop {engine}", _THREADS)
         waits = self._busy[engine] >= _THREADS
         self._busy[engine] += 1
-        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, waits))
-        self._under_way[key] = _Stop(engine, waits, result)
+        asked = machine.monotonic()
+        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, asked if waits else inf))
+        self._under_way[key] = _Stop(engine, waits, asked, result)
         result.add_done_callback(lambda _: self._changed(key[0]))
 
     def _take(self, key: Key) -> _Stop:
@@ -116,7 +131,7 @@ class Stops:
         self._busy[stop.engine] -= 1
         return stop
 
-    def _stop(self, job: str, handle: str, grace: float, waited: bool) -> GangStatus:
-        if waited:
+    def _stop(self, job: str, handle: str, grace: float, waits_since: float) -> GangStatus:
+        if machine.monotonic() - waits_since >= _QUIET:
             self._changed(job)
         return self._engine.stop(handle, grace)

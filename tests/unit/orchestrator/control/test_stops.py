@@ -16,6 +16,7 @@ from tests.support.waiting import wait_for
 
 def test_a_stop_waits_for_those_of_its_own_engine_alone_and_its_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stops, "_THREADS", 2)
+    monkeypatch.setattr(stops, "_QUIET", 0.1)
     answers, changed = threading.Event(), list[str]()
 
     def stop(handle: str, grace: float) -> GangStatus:
@@ -34,6 +35,8 @@ def test_a_stop_waits_for_those_of_its_own_engine_alone_and_its_reason_says_so(m
             assert ask(job, "docker") is None
         ask("d", "slurm")
         wait_for(lambda: ask("d", "slurm") == [], 2, "a stop on an engine that answers")
+        assert 0 < asked.pause(("c", 1)) <= 0.1 or asked.reason(("c", 1))
+        wait_for(lambda: asked.reason(("c", 1)), 2, "that it says so, once it has waited for a while")
         assert [asked.reason((job, 1)) for job in ("a", "b", "d")] == [None] * 3
         waits = "attempt 1 waits for its turn to be stopped: the docker engine is stopping 2 others"
         assert asked.reason(("c", 1)) == waits and asked.has_begun(("c", 1))
