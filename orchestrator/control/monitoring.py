@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.snapshot import open_attempts
@@ -171,17 +171,13 @@ class _Moment(Collector):
         counts: dict[tuple[str, ...], float] = {
             (queue, status): 0.0 for queue in session.scalars(select(JobQueue.name)) for status in Status
         }
-        query = select(Job.queue, Job.status, func.count()).where(Job.kind != "array").group_by(Job.queue, Job.status)
-        for queue, status, count in session.execute(query):
-            if (queue, status) in counts:  # its queue may be deleted
-                counts[queue, status] = float(count)
+        gangs = self._reconciler.database.counts.gangs()
+        counts |= {kind: float(gangs[kind]) for kind in gangs.keys() & counts.keys()}  # a queue may be deleted
         yield _gauge("muster_jobs", "Jobs by state, as long as their history is kept.", ["queue", "status"], counts)
-        since = select(Job.queue, func.min(Job.queued_since)).where(Job.status == Status.RUNNABLE, Job.kind != "array")
-        waits = {
-            (queue,): max(0.0, (self._reconciler.clock.now() - oldest) / 1000)
-            for queue, oldest in session.execute(since.group_by(Job.queue))
-            if oldest is not None
-        }
+        moment, since = self._reconciler.clock.now(), dict[tuple[str, ...], int]()
+        for each in self._reconciler.work_queue.waiting():
+            since[each.queue,] = min(each.created_at, since.get((each.queue,), moment))
+        waits = {queue: (moment - oldest) / 1000 for queue, oldest in since.items()}
         oldest = "How long the job that has waited longest for room has waited."
         yield _gauge("muster_queue_longest_wait_seconds", oldest, ["queue"], waits)
 

@@ -1,10 +1,11 @@
-"""How many jobs there are, by queue and state: kept in memory, so that no list counts rows."""
+"""How many jobs there are, by queue and state: kept in memory, so that no list, page or metric counts rows."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
+from enum import Enum
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, attributes
@@ -12,12 +13,25 @@ from sqlalchemy.orm import Session, attributes
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
 
-Kind = tuple[str, str]
-"""A queue and a state."""
+
+class Place(Enum):
+    """Where a job stands."""
+
+    ALONE = "alone"
+    ARRAY = "array"
+    CHILD = "child"
+
+    @classmethod
+    def of(cls, parent: str | None, kind: str | None) -> Place:
+        return cls.CHILD if parent is not None else cls.ARRAY if kind == "array" else cls.ALONE
+
+
+Kind = tuple[str, str, Place]
+"""A queue, a state and a place."""
 
 
 class JobCounts:
-    """Of one database; children of arrays are not counted. Any thread may call."""
+    """Of one database. Any thread may call."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -25,9 +39,12 @@ class JobCounts:
 
     def load(self, session: Session) -> None:
         """Count the rows."""
-        grouped = select(Job.queue, Job.status, func.count()).where(Job.parent.is_(None))
-        found = session.execute(grouped.group_by(Job.queue, Job.status))
-        counts = Counter({(queue, str(status)): int(count) for queue, status, count in found})
+        kinds = (Job.queue, Job.status, Job.parent.is_(None), Job.kind == "array")
+        found = session.execute(select(*kinds, func.count()).group_by(*kinds))
+        counts = Counter[Kind]()
+        for queue, status, is_top, is_array, count in found:
+            place = Place.CHILD if not is_top else Place.ARRAY if is_array else Place.ALONE
+            counts[queue, str(status), place] += int(count)
         with self._lock:
             self._counts = counts
 
@@ -40,36 +57,45 @@ class JobCounts:
                     del self._counts[kind]
 
     def by_status(self, queues: Collection[str] | None = None) -> dict[str, int]:
-        """The jobs of these queues, or of all, in each state; states of none are left out."""
+        """The jobs of these queues, or of all, in each state, an array as one; states of none are left out."""
         found = Counter[str]()
-        with self._lock:
-            for (queue, status), count in self._counts.items():
-                if queues is None or queue in queues:
-                    found[status] += count
+        for (queue, status, place), count in self._kinds():
+            if place is not Place.CHILD and (queues is None or queue in queues):
+                found[status] += count
         return dict(found)
+
+    def gangs(self) -> dict[tuple[str, str], int]:
+        """The jobs of each queue in each state, an array as its children."""
+        found = Counter[tuple[str, str]]()
+        for (queue, status, place), count in self._kinds():
+            if place is not Place.ARRAY:
+                found[queue, status] += count
+        return dict(found)
+
+    def _kinds(self) -> list[tuple[Kind, int]]:
+        with self._lock:
+            return list(self._counts.items())
 
 
 def note_counts(session: Session, changed: Iterable[object]) -> None:
     """Note, before a flush, what its new, ``changed`` and deleted objects change of the counts, for :meth:`JobCounts.add` after the commit."""
     changes = _changes(session)
     for each in session.new:
-        if isinstance(each, Job) and each.parent is None:
-            changes[each.queue, str(each.status or Status.SUBMITTED)] += 1
+        if isinstance(each, Job):
+            changes[each.queue, str(each.status or Status.SUBMITTED), Place.of(each.parent, each.kind)] += 1
     for each in changed:
-        if isinstance(each, Job) and (before := _stored(each)) != each.status and each.parent is None:
-            changes[each.queue, before] -= 1
-            changes[each.queue, str(each.status)] += 1
+        if isinstance(each, Job) and (before := _stored(each)) != each.status:
+            place = Place.of(each.parent, each.kind)
+            changes[each.queue, before, place] -= 1
+            changes[each.queue, str(each.status), place] += 1
     for each in session.deleted:
-        if isinstance(each, Job) and each.parent is None:
-            changes[each.queue, _stored(each)] -= 1
+        if isinstance(each, Job):
+            changes[each.queue, _stored(each), Place.of(each.parent, each.kind)] -= 1
 
 
-def note_deleted(session: Session, jobs: Iterable[tuple[str | None, str, str]]) -> None:
-    """The same for rows that a statement deletes: of each the parent, the queue and the state."""
-    changes = _changes(session)
-    for parent, queue, status in jobs:
-        if parent is None:
-            changes[queue, str(status)] -= 1
+def note_rows(session: Session, queue: str, status: str, place: Place, change: int) -> None:
+    """The same for rows that a statement inserts, or deletes (``change`` < 0)."""
+    _changes(session)[queue, str(status), place] += change
 
 
 def _changes(session: Session) -> Counter[Kind]:

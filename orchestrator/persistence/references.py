@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import JobFacts, Reference, Rules
-from orchestrator.persistence.job_counts import note_deleted
+from orchestrator.persistence.job_counts import Place, note_rows
 from orchestrator.persistence.models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
 from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, WebhookDelivery
 
@@ -76,10 +76,11 @@ def forget_jobs(session: Session, ids: Collection[str]) -> int:
     child = aliased(Job)
     # the children of an array have their definition from it
     has_others = select(child.id).where(child.parent == Job.id, child.id.not_in(ids)).exists()
-    query = select(Job.id, Job.parent, Job.queue, Job.status, Job.definition).where(Job.id.in_(ids))
+    query = select(Job.id, Job.parent, Job.kind, Job.queue, Job.status, Job.definition).where(Job.id.in_(ids))
     found = session.execute(query.where(Job.status.in_(TERMINAL), Job.id.not_in(needed), not_(has_others))).all()
     gone = [row.id for row in found]
-    note_deleted(session, [(row.parent, row.queue, row.status) for row in found])
+    for row in found:
+        note_rows(session, row.queue, row.status, Place.of(row.parent, row.kind), -1)
     session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(gone), WebhookDelivery.next_at.is_(None)))
     session.execute(
         delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(gone), AutomaticEvaluation.open.is_(False))

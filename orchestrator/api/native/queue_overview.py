@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from fastapi import APIRouter, Query, Request
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api.context import reconciler_of
@@ -19,8 +19,9 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
 from orchestrator.control.usage import held_by, placements_of, usage_at
 from orchestrator.domain.hosts import Capacity, Queued, engine_of
-from orchestrator.domain.job import TERMINAL, Status
+from orchestrator.domain.job import Status
 from orchestrator.domain.resources import Resources
+from orchestrator.persistence.job_counts import JobCounts
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 from orchestrator.scheduling.order import score, weight
 from orchestrator.scheduling.snapshot import Queue
@@ -64,7 +65,7 @@ def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
         held = open_attempts(session, reconciler.work_queue.active())
         decays = {name: queue.policy.decay_seconds for name, queue in read.items() if queue.policy}
         used = usage_at(session, reconciler.clock.now(), decays, held)
-        counts = _counts(session)
+        counts = _counts(reconciler.database.counts)
         found = [
             {
                 "name": row.name,
@@ -100,12 +101,12 @@ def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
     }
 
 
-def _counts(session: Session) -> dict[str, dict[str, int]]:
+def _counts(counts: JobCounts) -> dict[str, dict[str, int]]:
     """Jobs that are not over, by queue and state; an array is counted by its children."""
-    query = select(Job.queue, Job.status, func.count()).where(Job.status.not_in(TERMINAL), Job.kind != "array")
     found: dict[str, dict[str, int]] = defaultdict(dict)
-    for queue, status, count in session.execute(query.group_by(Job.queue, Job.status)):
-        found[queue][str(status)] = count
+    for (queue, status), count in counts.gangs().items():
+        if not Status(status).is_terminal:
+            found[queue][status] = count
     return found
 
 

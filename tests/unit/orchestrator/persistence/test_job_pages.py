@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
-from orchestrator.persistence.job_counts import JobCounts, note_deleted
+from orchestrator.persistence.job_counts import JobCounts, Place, note_rows
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.references import forget_jobs
@@ -189,6 +189,11 @@ def counted(session: Session) -> dict[str, int]:
     return dict(Counter(str(each) for each in session.scalars(select(Job.status).where(Job.parent.is_(None)))))
 
 
+def gangs(session: Session) -> dict[tuple[str, str], int]:
+    found = session.execute(select(Job.queue, Job.status).where(Job.kind != "array"))
+    return dict(Counter((queue, str(status)) for queue, status in found))
+
+
 def test_the_counts_follow_every_transaction_and_no_other(database: Database) -> None:
     fill(database, 50, ["a", "b"])
     database.counts.load(database.open())
@@ -205,12 +210,14 @@ def test_the_counts_follow_every_transaction_and_no_other(database: Database) ->
             pass
         with database.session() as session:
             assert database.counts.by_status() == counted(session), turn
+            assert database.counts.gangs() == gangs(session), turn
     again = JobCounts()
     with database.session() as session:
         again.load(session)
     assert again.by_status() == database.counts.by_status() and again.by_status(["b"]) == database.counts.by_status(
         {"b"}
     )
+    assert again.gangs() == database.counts.gangs()
     assert again.by_status(["a"]) != again.by_status() and again.by_status([]) == {}
 
 
@@ -221,7 +228,8 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
     match draw.randrange(6):
         case 0:
             name = f"t{turn}-{draw.randrange(10**9)}"
-            session.add_all([job(name, turn, draw.choice("ab")), job(f"{name}:0", turn, "a", parent=name)])
+            kind = draw.choice(["array", "container"])
+            session.add_all([job(name, turn, draw.choice("ab"), kind=kind), job(f"{name}:0", turn, "a", parent=name)])
         case 1:
             one.status = draw.choice(list(Status))
         case 2:
@@ -237,8 +245,9 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
             session.delete(one)
         case 5:
             session.flush()
-            rows = session.execute(select(Job.parent, Job.queue, Job.status).where(Job.id == one.id)).all()
-            note_deleted(session, [(parent, queue, status) for parent, queue, status in rows])
+            rows = session.execute(select(Job.parent, Job.kind, Job.queue, Job.status).where(Job.id == one.id)).all()
+            for parent, kind, queue, status in rows:
+                note_rows(session, queue, status, Place.of(parent, kind), -1)
             session.expunge(one)
             session.execute(delete(Job).where(Job.id == one.id))
 
