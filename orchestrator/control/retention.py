@@ -165,6 +165,8 @@ class Retention:
                 break
             place = following
             self._is_closing.wait(_REST * (machine.processor_time() - began))
+        with self._writing, self._database.session() as session:
+            rows.forget_usage(session, self._steady())
         if totals.jobs or totals.runs:
             log.info(
                 "retention took %s; %d runs are kept that are old enough, see `muster gc --dry-run`",

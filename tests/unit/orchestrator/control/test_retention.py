@@ -28,7 +28,7 @@ from orchestrator.persistence.models import (
     RunRecord,
     now,
 )
-from orchestrator.persistence.own_models import RetentionStart, RunUse
+from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
 from shared_store import contents, trash
 from shared_store.files import sync_directory
 from shared_store.layout import Store
@@ -165,6 +165,15 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
         before = counts.by_status()
         counts.load(session)
     assert before == counts.by_status() == {"SUCCEEDED": 5}, "each was counted off once"
+
+
+def test_the_use_of_shares_is_forgotten_once_nothing_is_left_of_it(world: World) -> None:
+    with world.database.session() as session:
+        for share, as_of in (("old", 1), ("new", now() - 80 * A_DAY)):
+            session.add(ShareUsage(queue="default", share=share, seconds=9.0, as_of=as_of))
+    world.retention().take_all()
+    with world.database.session() as session:
+        assert {each.share for each in session.scalars(select(ShareUsage))} == {"new"}
 
 
 class Killed(BaseException):
