@@ -36,8 +36,8 @@ _SILENT = f"the store or the database has not answered for {_PATIENCE:.0f} s; th
 _LONGEST = 300.0
 """Seconds after which a stream ends; the browser reconnects at once, and is admitted again or refused."""
 _MOST_KEPT = 64
-_REST = 4.0
-"""Times as long as a value took to compute it is kept, where that is longer than its time."""
+_REST, _LONGEST_REST = 4.0, 5.0
+"""Times as long as a value took to compute it is kept, where that is longer than its time; and the limit of that [s]."""
 _Value = TypeVar("_Value")
 
 
@@ -204,7 +204,7 @@ class Recent:
             if not kept or now >= kept[0][0]:
                 value = compute()
                 done = time.monotonic()
-                kept[:] = [(max(now + self._seconds, done + _REST * (done - now)), value)]
+                kept[:] = [(max(now + self._seconds, done + min(_REST * (done - now), _LONGEST_REST)), value)]
                 return value
             known: _Value = kept[0][1]
             return known

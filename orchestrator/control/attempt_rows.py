@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import TypeVar
 
-from sqlalchemy import select
+from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import options_of
@@ -20,6 +21,8 @@ from orchestrator.persistence.models import (
     RunRecord,
     SchedulingPolicy,
 )
+
+_Row = TypeVar("_Row")
 
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
@@ -77,19 +80,23 @@ class SharedRows:
     def __init__(self, session: Session, jobs: Sequence[Job]) -> None:
         self._session, self._jobs = session, jobs
 
+    def _read(self, wanted: Select[_Row]) -> Iterable[_Row]:
+        """Rows as they are now: the session may have some of before, which requests have changed since."""
+        return self._session.scalars(wanted, execution_options={"populate_existing": True})
+
     @cached_property
     def queues(self) -> dict[str, JobQueue]:
         """By name."""
         wanted = select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs}))
-        return {each.name: each for each in self._session.scalars(wanted)}
+        return {each.name: each for each in self._read(wanted)}
 
     @cached_property
     def _environments(self) -> dict[str, ComputeEnvironment]:
-        return {each.name: each for each in self._session.scalars(select(ComputeEnvironment))}
+        return {each.name: each for each in self._read(select(ComputeEnvironment))}
 
     @cached_property
     def _policies(self) -> dict[str, SchedulingPolicy]:
-        return {each.name: each for each in self._session.scalars(select(SchedulingPolicy))}
+        return {each.name: each for each in self._read(select(SchedulingPolicy))}
 
     def policy(self, queue: str) -> SchedulingPolicy | None:
         """The scheduling policy of a queue; None where it has none."""

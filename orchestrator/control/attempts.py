@@ -7,7 +7,7 @@ its ending before the gang is stopped. A controller that starts on the database 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
@@ -392,14 +392,26 @@ class Attempts:
         self._errands.forget(key, job.run, release, attempt.epoch if attempt.epoch != NO_EPOCH else None)
         self._observer.forget(key)
 
+    def _leave(self, job: Job, attempt: Attempt, opened: _Open) -> None:
+        """The attempt is closed."""
+        self._forget(job, attempt, opened)
+        self.bus.forget(*opened.key)
+        self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
+
+    def leave_closed(self, session: Session, open_ones: Collection[Key]) -> None:
+        """Only these attempts are open: others were closed by a commit of which this controller did not hear that it was made."""
+        for opened in [each for each in self._open.values() if each.key not in open_ones]:
+            if (attempt := session.get(Attempt, opened.key)) is not None and attempt.nodes:
+                self._leave(attempt.job, attempt, opened)
+            else:
+                self._open.pop(opened.key[0])
+
     def _close(self, session: Session, job: Job, attempt: Attempt, opened: _Open, close: Close) -> Callable[[], None]:
         """Record the end; returns what follows the commit."""
 
         def closed() -> None:
             opened.committed()
-            self._forget(job, attempt, opened)
-            self.bus.forget(*opened.key)
-            self.engine.forget(attempt.nodes[0].host, _name(attempt), attempt.handle)
+            self._leave(job, attempt, opened)
 
         ran = close.moment - (attempt.running_since or close.moment)
         attempt.started_at = attempt.started_at or now()

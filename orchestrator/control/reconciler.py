@@ -285,6 +285,7 @@ class Reconciler:
         self.database.counts.load(session)
         found = {(job.id, attempt.number): attempt for job, attempt in open_attempts(session, self.work_queue.active())}
         expected = self.bus.presence.expected()
+        self.attempts.leave_closed(session, found.keys())
         for closed in expected - found.keys():
             self.bus.forget(*closed)
         for key in found.keys() - expected:

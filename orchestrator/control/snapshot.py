@@ -62,11 +62,14 @@ def take_snapshot(
         unknown: Why an engine has not told what it has, by name; asked for before ``capacities``, which count.
     """
     unknown = {name: why for name, why in (unknown or {}).items() if name not in capacities}
-    policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
-    queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
+    anew = {"populate_existing": True}  # a session of the loop may have rows that requests have changed since
+    policies = {each.name: each for each in session.scalars(select(SchedulingPolicy), execution_options=anew)}
+    queues = {
+        each.name: read_queue(each, policies) for each in session.scalars(select(JobQueue), execution_options=anew)
+    }
     ces = {
         each.name: read_compute_environment(each, first, unknown)
-        for each in session.scalars(select(models.ComputeEnvironment))
+        for each in session.scalars(select(models.ComputeEnvironment), execution_options=anew)
     }
     # what runs on an engine that queues by itself takes nothing away from what is handed to it
     queueing = {name for name, capacity in capacities.items() if isinstance(capacity, Queued)}

@@ -71,6 +71,9 @@ def resource_seconds(attempt: Attempt, moment: int) -> float:
 def add_usage(session: Session, queue: str, share: str, seconds: float, decay: int, moment: int) -> None:
     """Add resource-seconds that a share has used of a queue until ``moment`` (steady time [ms])."""
     usage = session.get(ShareUsage, (queue, share))
+    if usage is None:  # it may be another job's, which ends at the same commit
+        added = (each for each in session.new if isinstance(each, ShareUsage))
+        usage = next((each for each in added if (each.queue, each.share) == (queue, share)), None)
     if usage is None:
         usage = ShareUsage(queue=queue, share=share, seconds=0.0, as_of=moment)
         session.add(usage)

@@ -115,13 +115,22 @@ class Runner:
     @property
     def silence(self) -> str | None:
         """That the engine does not answer, and since when; None while it does."""
-        since = self._thread.busy_since
+        return self._silence_of(self._thread, "silence")
+
+    @property
+    def _launch_silence(self) -> str | None:
+        """The same of its launches, where these have threads of their own."""
+        return None if self._launching is self._thread else self._silence_of(self._launching, "launches")
+
+    def _silence_of(self, pool: machine.Pool, subject: str) -> str | None:
+        since = pool.busy_since
         if since is None or (passed := machine.monotonic() - since) < OVERDUE:
             return None
-        if (silence := self._backoff.failure("silence")) is None:
+        if (silence := self._backoff.failure(subject)) is None:
             began = machine.Moment(since, machine.wall() - passed)
-            silence = f"the {self.engine.name} engine has not answered since {began}"
-            self._backoff.failed("silence", silence)
+            what = "" if pool is self._thread else " a launch"
+            silence = f"the {self.engine.name} engine has not answered{what} since {began}"
+            self._backoff.failed(subject, silence)
         return silence
 
     @property
@@ -134,7 +143,7 @@ class Runner:
     @property
     def health(self) -> Health:
         """The engine's answers just now."""
-        problem = self.silence or self._backoff.failure("hosts") or self.unknown
+        problem = self.silence or self._launch_silence or self._backoff.failure("hosts") or self.unknown
         pauses = self._backoff.pauses()
         gangs = {subject[1]: pause for subject, pause in pauses.items() if isinstance(subject, tuple)}
         if _LOOKS in pauses:
@@ -167,7 +176,7 @@ class Runner:
     def launch(self, gang: str, plan: Callable[[], Plan[Any]], again: bool = True) -> Handle:
         """The handle of the gang of that name once it is started. Raises :class:`Underway` until then, NotYet and EngineError.
 
-        ``plan`` is called, on the caller's thread, where the gang's launch is not under way. One thread launches.
+        ``plan`` is called, on the caller's thread, where the gang's launch is not under way.
         ``again``: whether to try again where the last try has left nothing of the gang.
         """
         launch = self._launches.get(gang)
@@ -185,7 +194,7 @@ class Runner:
             launch = self._launches[gang] = self._submit(lambda: self._start(planned), self._launching)
             launch.add_done_callback(lambda _: self._changed(gang))
         if not launch.done():
-            raise Underway(self.silence or "")
+            raise Underway(self.silence or self._launch_silence or "")
         try:
             return launch.result()  # again and again: the caller may not be able to record it
         except EngineError as error:
@@ -222,7 +231,8 @@ class Runner:
 
         Reports, too, that the engine has begun or ceased to be silent: its gangs look different then.
         """
-        if self._was_silent != (self.silence is not None):
+        silence = self.silence or self._launch_silence
+        if self._was_silent != (silence is not None):
             self._was_silent = not self._was_silent
             for gang in {*self._launches, *(handle.gang for handle in self._observed)}:
                 self._changed(gang)
@@ -271,6 +281,8 @@ class Runner:
     # -- on the engine's threads --------------------------------------------------------------------------------------
 
     def _submit(self, body: Callable[[], T], pool: machine.Pool | None = None) -> Future[T]:
+        subject = "silence" if pool in (None, self._thread) else "launches"
+
         def call() -> T:
             try:
                 return body()
@@ -280,7 +292,7 @@ class Runner:
                 log.exception("a call of the %s engine failed", self.engine.name)
                 raise
             finally:
-                if self._backoff.worked("silence"):
+                if self._backoff.worked(subject):
                     log.warning("the %s engine answers again", self.engine.name)
 
         return (pool or self._thread).submit(call)
@@ -363,6 +375,8 @@ class Runner:
             try:
                 self._call("look at the gang", partial(_raise, look))
             except EngineError as error:
+                if handle not in self._observed:
+                    return False  # it was forgotten meanwhile
                 before = self._backoff.failure(subject)
                 self._failed(subject, error)
                 return before != self._backoff.failure(subject)

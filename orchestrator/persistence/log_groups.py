@@ -33,7 +33,8 @@ def add_missing(session: Session, names: Collection[str], owner: str | None) -> 
 def _missing(session: Session, names: Collection[str]) -> set[str]:
     if not names:
         return set()
-    return set(names) - set(session.scalars(select(LogGroup.name).where(LogGroup.name.in_(names))))
+    added = {each.name for each in session.new if isinstance(each, LogGroup)}
+    return set(names) - added - set(session.scalars(select(LogGroup.name).where(LogGroup.name.in_(names))))
 
 
 def record_logs(session: Session, job: Job, nodes: Sequence[Node]) -> None:

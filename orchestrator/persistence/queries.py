@@ -96,10 +96,9 @@ def find_job(session: Session, reference: str, queues: Collection[str] | None = 
         return named
     if len(reference) < 4:
         return None
-    within = and_(
-        Job.id >= reference, Job.id < f"{reference}g"
-    )  # by the index, which LIKE does not use: ids are hexadecimal
-    starts = among.where(within, Job.id.startswith(reference, autoescape=True), ~Job.id.contains(":"))
+    start = reference.lower()
+    within = and_(Job.id >= start, Job.id < f"{start}g")  # by the index, which LIKE does not use: ids are hexadecimal
+    starts = among.where(within, Job.id.startswith(start, autoescape=True), ~Job.id.contains(":"))
     prefixed = session.scalars(starts.order_by(Job.id).limit(_NAMED + 1)).all()
     if len(prefixed) > 1:
         shown = ", ".join(f"{each.id} ({each.name})" for each in prefixed[:_NAMED])

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import boto3
 from botocore.config import Config
@@ -143,6 +144,8 @@ class AwsBatchEngine:
         )
         self._gangs: dict[str, _Watched] = {}
         self._lock = threading.Lock()
+        self._defining = WeakValueDictionary[str, threading.Lock]()
+        """By name of a definition: held where a revision is looked for and registered."""
         self._check_queue()
 
     def capacity(self) -> Queued:
@@ -271,12 +274,15 @@ class AwsBatchEngine:
     def _definition(self, requests: Requests) -> str:
         """The ARN of an active definition that says just that; a new revision where there is none."""
         name = requests.definition["jobDefinitionName"]
-        pages = self._batch.get_paginator("describe_job_definitions")
-        for page in pages.paginate(jobDefinitionName=name, status="ACTIVE"):
-            for each in page["jobDefinitions"]:
-                if (each.get("tags") or {}).get(DIGEST) == requests.digest:
-                    return str(each["jobDefinitionArn"])
-        return str(self._batch.register_job_definition(**requests.definition)["jobDefinitionArn"])
+        with self._lock:
+            alone = self._defining.setdefault(name, threading.Lock())
+        with alone:  # several gangs of one definition may be launched at once
+            pages = self._batch.get_paginator("describe_job_definitions")
+            for page in pages.paginate(jobDefinitionName=name, status="ACTIVE"):
+                for each in page["jobDefinitions"]:
+                    if (each.get("tags") or {}).get(DIGEST) == requests.digest:
+                        return str(each["jobDefinitionArn"])
+            return str(self._batch.register_job_definition(**requests.definition)["jobDefinitionArn"])
 
     # -- watching -----------------------------------------------------------------------------------------------------
 

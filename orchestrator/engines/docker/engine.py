@@ -108,6 +108,8 @@ class DockerEngine:
         self.address = self._gateway()
         self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
         self._pulls: dict[str, Future[Image]] = {}
+        self._pulling = threading.Lock()
+        """Held where a pull is looked for and begun: several gangs may be launched at once."""
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
         self._copies: dict[str, FollowedLog] = {}
         self._copying = threading.Lock()
@@ -223,9 +225,11 @@ class DockerEngine:
             if isinstance(error, APIError) and error.is_server_error():
                 raise
             raise CannotStart(f"CannotInspectContainerError: image {name!r}: {error}") from error
-        pull = self._pulls.pop(name, None) or self._puller.submit(self._client.images.pull, name)
-        if not pull.done():
-            self._pulls[name] = pull
+        with self._pulling:
+            pull = self._pulls.pop(name, None) or self._puller.submit(self._client.images.pull, name)
+            if not (done := pull.done()):
+                self._pulls[name] = pull
+        if not done:
             raise NotYet(f"pulling image {name}")
         try:
             return pull.result()
