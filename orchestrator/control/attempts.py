@@ -149,7 +149,7 @@ class Attempts:
         )
         attempt.held_since = self.clock.now()
         record_logs(session, job, nodes)
-        opened = self._open[job.id] = _Open((job.id, number), replace(state_of(job, attempt), started=False))
+        opened = self._open[job.id] = _Open((job.id, number), state_of(job, attempt))
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {opened.state.terms.size}")
         yield opened.committed

@@ -1,0 +1,126 @@
+"""Attempts that are worked on together: rows that they share, and commits whose answer is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from orchestrator.control.isolation import Isolation
+from orchestrator.domain.hosts import Host, Hosts
+from orchestrator.domain.job import Status
+from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.models import Job, JobQueue, SchedulingPolicy
+from orchestrator.persistence.own_models import ShareUsage
+from orchestrator.persistence.session import Database, DatabaseError
+from tests.support.orchestrator.fake_controller import FakeController, properties
+from tests.support.waiting import wait_for
+
+Bench = FakeController[FakeEngine]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with ExitStack() as stack:
+        yield FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)])), stack)
+
+
+def ticks(bench: Bench, condition: Callable[[], bool]) -> None:
+    """Make passes until the condition holds."""
+
+    def there() -> bool:
+        bench.reconciler.tick()
+        return condition()
+
+    wait_for(there, 30, "the state")
+
+
+def are(bench: Bench, status: Status, *names: str) -> Callable[[], bool]:
+    return lambda: all(bench.job(name).status == status for name in names)
+
+
+def test_what_a_request_changes_of_a_queue_counts_at_the_next_pass(bench: Bench) -> None:
+    queue, passes = bench.reconciler.work_queue, bench.reconciler.admission
+
+    def pass_of_now() -> bool:
+        return bool(passes._passed[0] == queue.version)
+
+    bench.submit("waits", queue="urgent", node_properties=properties(10))
+    bench.submit("ends", queue="urgent", node_properties=properties(6))
+    ticks(bench, are(bench, Status.RUNNING, "ends"))
+    bench.engine.cluster.end("ends/1/1", 0, 0)
+    ticks(bench, are(bench, Status.SUCCEEDED, "ends"))  # the loop has read the queue, to charge the share
+    with bench.database.session() as session:
+        session.get_one(JobQueue, "urgent").compute_environments = []
+    bench.engine.offered = Hosts([Host("fake/host", 16.0, (), 16384)])
+    bench.reconciler.engine.capacity(patience=10.0)
+    queue.version += 1
+    ticks(bench, pass_of_now)
+    assert bench.job("waits").status == Status.RUNNABLE
+    with bench.database.session() as session:
+        session.get_one(JobQueue, "urgent").compute_environments = ["fake"]
+    queue.version += 1
+    ticks(bench, are(bench, Status.RUNNING, "waits"))
+
+
+def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench.database.session() as session:
+        session.add(SchedulingPolicy(name="fair", fairshare={"shareDecaySeconds": 3600}))
+        session.get_one(JobQueue, "urgent").policy = "fair"
+    names = ["one", "two", "three"]
+    bench.submit(*names, queue="urgent", share="team", node_properties=properties(1))
+    ticks(bench, are(bench, Status.RUNNING, *names))
+    jobs, again, depth = Isolation.jobs, list[Sequence[str]](), [0]
+
+    def noted(self: Isolation, what: str, ids: Sequence[str], body: Any) -> Sequence[str]:
+        if depth[0]:
+            again.append(ids)
+        depth[0] += 1
+        try:
+            return jobs(self, what, ids, body)
+        finally:
+            depth[0] -= 1
+
+    monkeypatch.setattr(Isolation, "jobs", noted)
+    for name in names:
+        bench.engine.cluster.end(f"{name}/1/1", 0, 0)
+    ticks(bench, are(bench, Status.SUCCEEDED, *names))
+    assert again == [], "done again, each by itself, since all of them together failed"
+    with bench.database.session() as session:
+        assert [(each.queue, each.share) for each in session.scalars(select(ShareUsage))] == [("urgent", "team")]
+
+
+def test_an_attempt_whose_end_was_committed_without_an_answer_is_forgotten(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.submit("one", "two", node_properties=properties(1))
+    ticks(bench, are(bench, Status.RUNNING, "one", "two"))
+    check, lost = Database.check, list[str]()
+
+    def checked(self: Database) -> None:
+        check(self)
+        if not lost and self.counts.by_status().get(Status.SUCCEEDED):
+            lost.append("the answer to a commit")
+            raise DatabaseError("the database does not answer")
+
+    monkeypatch.setattr(Database, "check", checked)
+    bench.engine.cluster.end("one/1/1", 0, 0)
+
+    def passed() -> bool:
+        try:
+            bench.reconciler.tick()
+        except DatabaseError as error:
+            bench.reconciler._isolation.trouble = str(error)
+        with bench.database.session() as session:
+            return bool(lost) and session.get_one(Job, "one").status == Status.SUCCEEDED
+
+    wait_for(passed, 30, "the end")
+    bench.reconciler.tick()
+    attempts = bench.reconciler.attempts
+    assert list(attempts._open) == ["two"]
+    [runner] = attempts.engine._runners.values()
+    assert [handle.gang for handle in runner._observed] == ["two/1/1"]
