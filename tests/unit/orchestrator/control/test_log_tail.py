@@ -35,6 +35,7 @@ class Followed:
         self.written = 0
         self.logs.note(1, 1)
         self.logs.look()
+        self.view.poll()
 
     def write(self, *texts: str, push: bool = True, visible: bool = True) -> None:
         data = "".join(format_line(1_800_000_000.0 + self.written, 0, "o", text) for text in texts).encode()
