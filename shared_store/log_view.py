@@ -112,11 +112,13 @@ class NodeLog:
         if chunk.left_out or chunk.replaced:
             first = next(lines_in(chunk.data, self.key, 0, 0, whole), None)
             self._explain(chunk, first[1].time if first else timestamp(time.time()))
+        newest, read = self.newest, self.read
         for _, line in lines_in(chunk.data, self.key, chunk.start, 0, whole):
-            if line.time > self.newest:
-                self.newest = line.time
+            if line.time > newest:
+                newest = line.time
             if rank is None or line.rank == rank:
-                self.read.append((self.newest, line))
+                read.append((newest, line))
+        self.newest = newest
         self.more = chunk.more and bool(whole)
         self.position, self.identity = chunk.start + whole, chunk.identity
 
