@@ -48,6 +48,18 @@ class Segment(NamedTuple):
     path: Path
 
 
+class Identity(NamedTuple):
+    """The beginning of one file: a line with its time, so another file of the same name begins differently."""
+
+    start: int = 0
+    """Position of the file's first byte."""
+    head: bytes = b""
+    """Its first bytes; empty: unknown."""
+
+
+UNKNOWN = Identity()
+
+
 class Chunk(NamedTuple):
     """A part of a log that was read."""
 
@@ -58,8 +70,8 @@ class Chunk(NamedTuple):
     """Whether more may follow already."""
     left_out: tuple[int | None, int] | None = None
     """Lines (None: unknown) and bytes that were deleted before the reader reached them."""
-    identity: bytes = b""
-    """The beginning of the file: a line with its time, so another file of the same name begins differently."""
+    identity: Identity = UNKNOWN
+    """Of the file that was read."""
     replaced: bool = False
     """The file was truncated or replaced: ``data`` is from its new beginning."""
 
@@ -92,7 +104,12 @@ def segments_of(path: Path) -> list[Segment]:
 
 
 def read_log(
-    segments: Sequence[Segment], position: int, most: int, identity: bytes = b"", inside: bool = False
+    segments: Sequence[Segment],
+    position: int,
+    most: int,
+    identity: Identity = UNKNOWN,
+    inside: bool = False,
+    ahead: bool = False,
 ) -> Chunk:
     """Up to ``most`` bytes of one file, from ``position`` on. Raises OSError, also if the file was deleted meanwhile.
 
@@ -100,8 +117,9 @@ def read_log(
         segments: The log's files, not empty.
         position: The end of the previous chunk; 0 at first.
         most: Bytes.
-        identity: Identity of the previous chunk; empty if unknown.
+        identity: Identity of the previous chunk.
         inside: Whether ``position`` is inside a line rather than at its beginning.
+        ahead: Whether the file may end before ``position`` and be the same: a network volume shows it late.
     """
     place = max((place for place, segment in enumerate(segments) if segment.start <= position), default=0)
     start, _, path = segments[place]
@@ -115,16 +133,20 @@ def read_log(
             return Chunk(position, b"", False, None, identity)
         offset = max(0, position - start)
         first = file.read(_IDENTITY)
+        head = identity.head if identity.start == start else b""
+        if ahead and position > end and (first.startswith(head) or head.startswith(first)):
+            return Chunk(position, b"", False, None, identity)
         file.seek(max(0, offset - 1))
         before, data = file.read(min(offset, 1)), file.read(most)
-        other = offset > 0 and not first.startswith(identity)
+        other = offset > 0 and not first.startswith(head)
         replaced = other or position > end or not (inside or before in (b"", b"\n"))
         if replaced:
             file.seek(0)
             offset, data = 0, file.read(most)
     position = start + offset
     known = first[: offset + data.rfind(b"\n") + 1]  # half a line may be taken back
-    return Chunk(position, data, not last or position + len(data) < end, None, known, replaced)
+    more = not last or position + len(data) < end
+    return Chunk(position, data, more, None, Identity(start, known), replaced)
 
 
 def left_out(lines: int | None, size: int, why: str) -> str:

@@ -11,14 +11,14 @@ import os
 import re
 import time
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Protocol
 
 from shared_store.files import DamagedFile, open_regular, refuse_links
 from shared_store.layout import Run
-from shared_store.log_files import Chunk, Segment, left_out, log_segments, read_log
+from shared_store.log_files import UNKNOWN, Chunk, Identity, Segment, left_out, log_segments, read_log
 from shared_store.logs import LIMIT_REACHED, REPLACED, LogLine, lines_in, timestamp
 
 Places = dict[str, int]
@@ -37,8 +37,8 @@ WHOLE = 512 << 10
 class Memory(Protocol):
     """The newest part of a job's logs, in memory."""
 
-    def logs(self) -> Iterable[Key]:
-        """The logs that can get more lines, or got some since the reader began."""
+    def changed(self, since: int) -> tuple[int, Sequence[Key]]:
+        """The version now, and the logs that have changed since that version; 0: all that have ever changed."""
         ...
 
     def read(self, log: Key, position: int, most: int) -> bytes | None:
@@ -56,8 +56,8 @@ class NodeLog:
     """Position up to which it was read."""
     returned: int = 0
     """Position up to which lines were returned."""
-    identity: bytes = b""
-    """Beginning of the file that was read last."""
+    identity: Identity = UNKNOWN
+    """Of the file that was read last."""
     inside: bool = False
     """Whether ``position`` is inside a line that is longer than any line of Muster's."""
     newest: str = ""
@@ -78,17 +78,14 @@ class NodeLog:
         if self.read:
             return
         try:
-            if self.fed and segments[-1].start + os.stat(segments[-1].path).st_size < self.position:
-                self.more = False
-                return
-            chunk = read_log(segments, self.position, most, self.identity, self.inside)
+            chunk = read_log(segments, self.position, most, self.identity, self.inside, self.fed)
             if len(chunk.data) == most < CHUNK and b"\n" not in chunk.data:
                 most = CHUNK
-                chunk = read_log(segments, self.position, most, self.identity, self.inside)
+                chunk = read_log(segments, self.position, most, self.identity, self.inside, self.fed)
         except OSError:  # deleted meanwhile, ESTALE, or not yet visible on NFS: the next poll opens it again
             self.more = False
             return
-        self.fed = False
+        self.fed = self.fed and not chunk.data
         self._take_up(chunk, most, rank)
 
     def feed(self, memory: Memory, most: int, rank: int | None = None) -> bool:
@@ -115,11 +112,13 @@ class NodeLog:
         if chunk.left_out or chunk.replaced:
             first = next(lines_in(chunk.data, self.key, 0, 0, whole), None)
             self._explain(chunk, first[1].time if first else timestamp(time.time()))
+        newest, read = self.newest, self.read
         for _, line in lines_in(chunk.data, self.key, chunk.start, 0, whole):
-            if line.time > self.newest:
-                self.newest = line.time
+            if line.time > newest:
+                newest = line.time
             if rank is None or line.rank == rank:
-                self.read.append((self.newest, line))
+                read.append((newest, line))
+        self.newest = newest
         self.more = chunk.more and bool(whole)
         self.position, self.identity = chunk.start + whole, chunk.identity
 
@@ -196,7 +195,13 @@ class LogView:
     """Bytes that a poll reads of a log; more where no line ends in them."""
     behind: bool = False
     """Whether there was more than the last poll returned."""
+    in_files: bool = True
+    """Whether the files have, or may have, what memory has not: then :meth:`poll_memory` waits for :meth:`poll`."""
     _logs: dict[Key, NodeLog] = field(default_factory=dict)
+    _version: int = 0
+    """Of the memory, when it was asked last which logs have changed."""
+    _due: set[Key] = field(default_factory=set)
+    """Logs that have changed in memory and were not read to their ends."""
 
     @classmethod
     def of(cls, run: Run, job: str, offsets: Places | None = None, **which: int) -> LogView:
@@ -215,23 +220,32 @@ class LogView:
             lines += self._merged(logs)
             if self.behind:
                 break
+        self.in_files = self.behind
         return lines
 
     def poll_memory(self, memory: Memory, most: int) -> list[LogLine] | None:
-        """:meth:`poll` without a file, up to ``most`` bytes of each log; None where only the files have what follows."""
+        """:meth:`poll` without a file, up to ``most`` bytes of each log; None where only the files have what follows.
+
+        It visits the logs that have changed alone. A view has one memory.
+        """
+        if self.in_files:
+            return None
+        self._version, changed = memory.changed(self._version)
+        self._due.update(filter(self.chosen.has, changed))
         attempts: dict[int, list[NodeLog]] = {}
-        for key in sorted(memory.logs()):
-            if self.chosen.has(key):
-                log = self._log(key)
-                if not log.feed(memory, most, self.chosen.rank):
-                    return None
-                attempts.setdefault(key[0], []).append(log)
+        for key in sorted(self._due):
+            log = self._log(key)
+            if not log.feed(memory, most, self.chosen.rank):
+                self.in_files = True
+                return None
+            attempts.setdefault(key[0], []).append(log)
         lines: list[LogLine] = []
         self.behind = False
         for logs in attempts.values():
             lines += self._merged(logs)
             if self.behind:
                 break
+        self._due = {log.key for logs in attempts.values() for log in logs if log.more or log.read}
         return lines
 
     def drain(self) -> Iterator[LogLine]:

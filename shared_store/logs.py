@@ -91,5 +91,6 @@ def lines_in(
     attempt, node = log
     for match in _LINES.finditer(data, begin, len(data) if end is None else end):
         stamp, number, stream, text = match.groups()
-        origin = (stamp.decode(), attempt, node, None if number == b"-" else int(number), stream.decode())
-        yield start + match.start(), LogLine(*origin, text.decode(errors="replace"), start + match.end())
+        rank, words = None if number == b"-" else int(number), text.decode("utf-8", "replace")
+        line = LogLine(stamp.decode(), attempt, node, rank, stream.decode(), words, start + match.end())
+        yield start + match.start(), line

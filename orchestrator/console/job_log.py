@@ -104,7 +104,7 @@ class LiveLog(AbstractContextManager["LiveLog"]):
     def __init__(self, hub: LogHub, chosen: Chosen, places: Places) -> None:
         """``places``: the positions up to which the page has the lines."""
         self.chosen, self.places = chosen, places
-        self._view, self._in_files = LogView(chosen, dict(places), PIECE), True
+        self._view = LogView(chosen, dict(places), PIECE)
         self._following = hub.follow(chosen.run, chosen.job, self)
 
     def __enter__(self) -> LiveLog:
@@ -122,7 +122,7 @@ class LiveLog(AbstractContextManager["LiveLog"]):
 
         ``window``: the page has missed so much that it gets the last lines alone; ``skipped`` are the bytes before them. Raises OSError.
         """
-        lines = None if is_last or self._in_files else self._view.poll_memory(self._logs, PIECE)
+        lines = None if is_last else self._view.poll_memory(self._logs, PIECE)
         if lines is None:
             end = self.chosen.end()
             lag = sum(max(0, position - self.places.get(key, 0)) for key, position in end.items())
@@ -132,6 +132,5 @@ class LiveLog(AbstractContextManager["LiveLog"]):
                 self._view, self.places = LogView(self.chosen, dict(end), PIECE), dict(end)
                 return Event("window", {**_written(last), "skipped": begun}), False
             lines = self._view.poll()
-            self._in_files = self._view.behind
         self.places = dict(self._view.offsets)
         return Event("lines", {"lines": written(lines), "last": self.places}) if lines else None, self._view.behind

@@ -333,7 +333,7 @@ class Bus:
         ):
             return
         data, (proof, _, text) = sample.payload.to_bytes(), sample.attachment.to_bytes().partition(b" ")
-        if len(data) > LARGEST_PUSH or len(text) > _DIGITS or not text.isdigit():
+        if not 0 < len(data) <= LARGEST_PUSH or len(text) > _DIGITS or not text.isdigit():
             return
         position = int(text)
         expected = push_proof(self._credential(*node[:2]), key, position, data)

@@ -28,8 +28,8 @@ from shared_store.layout import Run
 
 _MEMORY = 32 << 20
 """Bytes that all tails together keep, with what came too early, whatever their number."""
-_LOOK = 0.05
-"""Seconds between two looks at the files of a job whose nodes do not push."""
+_LOOK, _LOOK_SELDOM = 0.05, 1.0
+"""Seconds between two looks at the files of a job whose nodes do not push: after a change, and at last while looks find nothing."""
 _SHARE = 0.005
 """Seconds between two looks, for each job that is looked at: all of them together are looked at 200 times a second."""
 _AGAIN = 1.0
@@ -93,12 +93,20 @@ class _Followed:
         """Whether its row has to be read."""
         self.is_looked_at = False
         """Whether a look is under way."""
-        self.next_look = self.next_ask = 0.0
+        self.looked = float("-inf")
+        """When the last look ended [s]."""
+        self.pause = 0.0
+        """Seconds from then to the next one."""
+        self.next_ask = 0.0
         self.asking = _ASK
 
     def wake(self) -> None:
         for each in list(self.wakers):
             each.wake()
+
+    def look_soon(self) -> None:
+        """Something has happened to the logs."""
+        self.pause = min(self.pause, _LOOK)
 
 
 class LogHub:
@@ -166,6 +174,7 @@ class LogHub:
 
     def _pushed(self, node: Address, position: int, data: bytes) -> None:
         if (followed := self._followed.get(node[0])) is not None:
+            followed.look_soon()
             if followed.logs.push(node[1:], position, data):
                 followed.wake()
             else:  # something before it is missing
@@ -173,6 +182,7 @@ class LogHub:
 
     def _stated(self, node: Address, end: int | None, is_whole: bool) -> None:
         if (followed := self._followed.get(node[0])) is not None and followed.logs.state(node[1:], end, is_whole):
+            followed.look_soon()
             self._hurry_locked()
 
     # the hub's thread
@@ -219,10 +229,10 @@ class LogHub:
         for each in looking:
             if each.is_looked_at:
                 continue
-            if now >= each.next_look:
-                self._look(each, max(_LOOK, _SHARE * len(looking)))
+            if now >= (next_look := each.looked + max(each.pause, _SHARE * len(looking))):
+                self._look(each)
             else:
-                due = min(due, each.next_look)
+                due = min(due, next_look)
         return max(0.0, due - now)
 
     def _read_rows(self, changed: Collection[_Followed]) -> None:
@@ -242,7 +252,7 @@ class LogHub:
             status, attempt, nodes = found.get(job, (Status.FAILED, None, 0))
             is_over = status.is_terminal
             if each.logs.note(attempt, nodes) or is_over:
-                each.next_ask, each.next_look, each.asking = 0.0, 0.0, _ASK
+                each.next_ask, each.pause, each.asking = 0.0, 0.0, _ASK
                 each.logs.is_over = is_over
                 each.wake()
 
@@ -252,20 +262,22 @@ class LogHub:
         each.next_ask = now + each.asking
         self._bus.ask_for_logs(each.logs.job, attempt)
 
-    def _look(self, each: _Followed, pause: float) -> None:
+    def _look(self, each: _Followed) -> None:
         def look() -> None:
-            seconds = pause
+            pause = _AGAIN
             try:
-                if each.logs.look():
+                is_new = each.logs.look()
+                pause = _LOOK if is_new else min(max(_LOOK, 2 * each.pause), _LOOK_SELDOM)
+                if is_new:
                     each.wake()
             except OSError:
-                seconds = _AGAIN
+                pass
             finally:
-                each.next_look, each.is_looked_at = machine.monotonic() + seconds, False
+                each.looked, each.pause, each.is_looked_at = machine.monotonic(), pause, False
                 self._hurry_locked()
 
         each.is_looked_at = True
         try:
             self._calls.submit(look)
         except StoreSilent:
-            each.next_look, each.is_looked_at = machine.monotonic() + _AGAIN, False
+            each.looked, each.pause, each.is_looked_at = machine.monotonic(), _AGAIN, False

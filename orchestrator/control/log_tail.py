@@ -6,21 +6,24 @@ where something before it is missing, and dropped where too much is missing. The
 
 from __future__ import annotations
 
-import os
 import threading
-from collections.abc import Iterable, Sequence
+from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import NamedTuple
 
 from orchestrator import machine
 from shared_store.layout import Run
-from shared_store.log_files import Chunk, Segment, read_log
+from shared_store.log_files import UNKNOWN, Chunk, Identity, Segment, read_log
 from shared_store.log_view import Key, log_end, logs_of
 
 MOST = 256 << 10
 """Bytes that are kept of a log, and of the pushes to it that came too early, for each."""
 FRESH = 3.5
 """Seconds for which a node's word counts about the end of its log: it repeats it every second."""
+_EARLY = 64
+"""Pushes to a log that came too early and are kept: a few are overtaken, and a hostile node sends any number."""
 _READ = 1 << 20
 """Bytes that one look reads of a log: more than the longest line. Of a log that grew by more, followers read the files themselves."""
 
@@ -52,7 +55,7 @@ class Tail:
     """Whether the last bytes were pushed: a network volume may not show them in the file yet."""
     replaced: int = 0
     """Position up to which the log had been read when it was truncated or replaced."""
-    identity: bytes = b""
+    identity: Identity = UNKNOWN
     inside: bool = False
     """These two as :func:`shared_store.log_files.read_log` has them."""
 
@@ -82,21 +85,21 @@ class Tail:
             self.early[position] = data
             self.trim(most)
             return False
-        self._add(data[before - position :], most)
-        while nexts := [at for at in self.early if at <= self.end]:
-            early = self.early.pop(at := min(nexts))
-            self._add(early[self.end - at :], most)
+        self.data += data[before - position :]
+        for at in sorted(self.early):
+            if at > self.end:
+                break
+            self.data += self.early.pop(at)[self.end - at :]
+        self.trim(most)
         if self.end > before:
             self.fed = True
             self.stated = None if self.stated is None else max(self.stated, self.end)
         return self.end > before
 
-    def missing(self, segments: Sequence[Segment]) -> Found | None:
-        """What the file has after the end; None where it is not visible here yet. Raises OSError."""
-        size = segments[-1].start + os.stat(segments[-1].path).st_size
-        if self.fed and size < self.end and (self.stated is None or self.stated >= self.end):
-            return None
-        chunk = read_log(segments, self.end, _READ, self.identity, self.inside)
+    def missing(self, segments: Sequence[Segment]) -> Found:
+        """What the file has after the end; nothing where that is not visible here yet. Raises OSError."""
+        is_ahead = self.fed and (self.stated is None or self.stated >= self.end)
+        chunk = read_log(segments, self.end, _READ, self.identity, self.inside, is_ahead)
         return Found(None, log_end(segments)) if len(chunk.data) == _READ and chunk.more else Found(chunk, 0)
 
     def take(self, found: Found, most: int) -> bool:
@@ -113,22 +116,18 @@ class Tail:
         self.inside = not whole and len(chunk.data) == _READ
         self.identity = chunk.identity
         changed = self.push(chunk.start, chunk.data if self.inside else chunk.data[:whole], most)
-        self.fed = self.fed and self.end > chunk.start + whole
+        self.fed = self.fed and (not chunk.data or self.end > chunk.start + whole)
         return changed or chunk.replaced
 
     def restart(self, position: int) -> None:
         """Keep nothing, and go on at ``position``."""
-        self.start, self.identity, self.inside, self.fed = position, b"", False, False
+        self.start, self.identity, self.inside, self.fed = position, UNKNOWN, False, False
         self.data.clear()
         self.early = {at: data for at, data in self.early.items() if at >= position}
 
-    def _add(self, data: bytes, most: int) -> None:
-        self.data += data
-        self.trim(most)
-
     def trim(self, most: int) -> None:
         """Keep no more than a quarter above ``most`` bytes, and as many that came too early."""
-        if sum(map(len, self.early.values())) > most:
+        if len(self.early) > _EARLY or sum(map(len, self.early.values())) > most:
             self.early.clear()
         if (excess := len(self.data) - most) > most // 4:  # seldom: it moves what is kept
             del self.data[:excess]
@@ -149,16 +148,21 @@ class JobLogs:
         self._most = MOST
         self._lock = threading.Lock()
         self._tails: dict[Key, Tail] = {}
+        self._version = 0
+        """Number of changes that readers have to see."""
+        self._changes = OrderedDict[Key, int]()
+        """The version of each log's last change, the newest one last."""
         self._has_looked = False
         self._former: set[int] = set()
         """Attempts that were open, and whose logs were not looked at since."""
 
     # what followers read
 
-    def logs(self) -> Iterable[Key]:
-        """The logs that have a tail."""
+    def changed(self, since: int) -> tuple[int, list[Key]]:
+        """The version now, and the logs that have changed since that version; 0: all that have ever changed."""
         with self._lock:
-            return list(self._tails)
+            newer = takewhile(lambda change: change[1] > since, reversed(self._changes.items()))
+            return self._version, [log for log, _ in newer]
 
     def read(self, log: Key, position: int, most: int) -> bytes | None:
         """Up to ``most`` bytes of a log; empty at the end, None where only the files have them."""
@@ -183,7 +187,16 @@ class JobLogs:
     def push(self, log: Key, position: int, data: bytes) -> bool:
         """A node has pushed a part of its log; whether something is new."""
         with self._lock:
-            return self._has_looked and self._tails.setdefault(log, Tail(0)).push(position, data, self._most)
+            is_new = self._has_looked and self._tails.setdefault(log, Tail(0)).push(position, data, self._most)
+            return self._noted(log, is_new)
+
+    def _noted(self, log: Key, is_changed: bool) -> bool:
+        """Note that a log has changed; returns whether it has. The lock is held."""
+        if is_changed:
+            self._version += 1
+            self._changes[log] = self._version
+            self._changes.move_to_end(log)
+        return is_changed
 
     def state(self, log: Key, end: int | None, is_whole: bool) -> bool:
         """A node has stated where its log ends (None: it does not push it); whether something is missing here."""
@@ -209,20 +222,23 @@ class JobLogs:
 
     def delivers(self) -> bool:
         """Whether every node of the open attempt tells of each change of its log, and nothing is missing."""
-        now = machine.monotonic()
         with self._lock:
             if not self._has_looked or self._former:
                 return False
-            tails = [tail for (attempt, _), tail in self._tails.items() if attempt == self.attempt]
-            heard = sum(tail.delivers(now) for tail in tails) >= self.nodes
-            return self.attempt is None or (heard and not any(tail.has_gap for tail in tails))
+            return self.attempt is None or (self._is_heard() and not any(tail.has_gap for tail in self._open()))
 
     def is_heard(self) -> bool:
         """Whether every node of the open attempt tells of its log."""
-        now = machine.monotonic()
         with self._lock:
-            heard = [tail.delivers(now) for (attempt, _), tail in self._tails.items() if attempt == self.attempt]
-            return sum(heard) >= self.nodes
+            return self._is_heard()
+
+    def _is_heard(self) -> bool:
+        now = machine.monotonic()
+        return sum(tail.delivers(now) for tail in self._open()) >= self.nodes
+
+    def _open(self) -> list[Tail]:
+        """The tails of the open attempt."""
+        return [tail for (attempt, _), tail in self._tails.items() if attempt == self.attempt]
 
     def look(self) -> bool:
         """Read in the files what is missing in memory; whether something is new. Raises OSError."""
@@ -245,4 +261,4 @@ class JobLogs:
             known = replace(tail, data=bytearray(), start=tail.end)
         found = Found(None, log_end(segments)) if is_first else known.missing(segments)
         with self._lock:
-            return found is not None and tail.take(found, self._most)
+            return self._noted(log, tail.take(found, self._most))

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shared_store.files import DamagedFile, open_regular
-from shared_store.log_files import Segment, left_out, read_log, segments_of
+from shared_store.log_files import UNKNOWN, Segment, left_out, read_log, segments_of
 from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
 
 _BLOCK = 32 << 10
@@ -102,7 +102,7 @@ class LogFile:
         """End of the head, and the greatest time up to there; None while there is no tail."""
         self._end = 0
         self._top = 0
-        self._identity, self._inside = b"", False
+        self._identity, self._inside = UNKNOWN, False
         self._begun += 1
 
     def _extend(self, segments: Sequence[Segment]) -> bool:

@@ -9,7 +9,6 @@ import threading
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,10 +51,9 @@ class _Job:
     """A job that a session follows."""
 
     view: LogView
-    logs: JobLogs
-    following: AbstractContextManager[JobLogs]
-    needs_files: bool = True
-    """Whether the files have what memory has not, or may have it."""
+    logs: JobLogs | None = None
+    """None: it is not followed yet, or not any more."""
+    following: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     streams: dict[Key, Stream] = field(default_factory=dict)
     """Those of its logs that are asked for."""
     newest: dict[Key, int] = field(default_factory=dict)
@@ -77,7 +75,10 @@ class _Job:
 
 
 class LiveTail:
-    """Follows streams from the moment of its beginning. Not for more than one thread at a time."""
+    """The lines of streams from the moment of its making on, while its block runs.
+
+    One thread at a time polls; the block may end meanwhile.
+    """
 
     def __init__(
         self, reconciler: Reconciler, groups: Collection[str], wanted: Callable[[str], bool], matches: Matcher
@@ -99,31 +100,42 @@ class LiveTail:
         self._jobs: dict[str, _Job] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(reconciler.logs.watch(self))
-            stack.callback(lambda: self._leave(list(self._jobs)))
-            self._refresh(from_now=True)
-            self._entered = stack.pop_all()
+        self._lock, self._is_open = threading.Lock(), False
+        """Whether its block runs: only then are jobs followed, though a late poll finds new ones."""
+        self._watching = contextlib.ExitStack()
+        self._refresh(from_now=True)
+
+    def __enter__(self) -> LiveTail:
+        """Follow the jobs; waits for nothing."""
+        with self._lock:
+            self._is_open = True
+            self._watching.enter_context(self._reconciler.logs.watch(self))
+            for job in self._jobs.values():
+                self._attend(job)
+        self._is_asked.set()  # nobody told of what has changed since the first look
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._is_open = False
+            self._watching.close()
+            for job in self._jobs.values():
+                job.following.close()
 
     def wake(self) -> None:
         """Some job has changed: there may be new streams."""
         self._is_asked.set()
         self.waker.wake()
 
-    def close(self) -> None:
-        """Follow nothing any more."""
-        self._entered.close()
-
     def poll_memory(self) -> list[Event] | None:
         """The events since the last call, in order; None where only the files, or the database, have them."""
         is_due = self._is_asked.is_set() and time.monotonic() >= self._next_refresh
-        if is_due or any(job.needs_files for job in self._jobs.values()):
+        if is_due or any(job.view.in_files for job in self._jobs.values()):
             return None
         events = list[Event]()
         for job in self._jobs.values():
-            lines = job.view.poll_memory(job.logs, MEMORY_PIECE)
-            job.needs_files = lines is None
-            events += job.events(lines or ())
+            if job.logs is not None:
+                events += job.events(job.view.poll_memory(job.logs, MEMORY_PIECE) or ())
         return self._chosen(events)
 
     def poll(self) -> list[Event]:
@@ -132,16 +144,15 @@ class LiveTail:
             self._refresh(from_now=False)
         events = list[Event]()
         for job in self._jobs.values():
-            if job.needs_files:
+            if job.view.in_files:
                 events += job.events(job.view.poll())
-                job.needs_files = job.view.behind
-        self._leave([name for name, job in self._jobs.items() if job.is_over and not job.needs_files])
+        self._leave([name for name, job in self._jobs.items() if job.is_over and not job.view.in_files])
         return self._chosen(events)
 
     @property
     def is_behind(self) -> bool:
         """Whether there is more already."""
-        return any(job.needs_files or job.view.behind for job in self._jobs.values())
+        return any(job.view.in_files or job.view.behind for job in self._jobs.values())
 
     def _chosen(self, events: Iterable[Event]) -> list[Event]:
         return sorted(event for event in events if self._matches(event.text))
@@ -158,21 +169,28 @@ class LiveTail:
             if stream.run is not None and stream.name not in self._over and self._wanted(stream.name):
                 job = self._follow(stream.run, stream.job, from_now)
                 job.streams[stream.attempt, stream.node] = stream
-                job.needs_files = job.needs_files or job.is_over
+                job.view.in_files = job.view.in_files or job.is_over
                 self.group_of[stream.name] = stream.group
 
     def _follow(self, run: Run, job: str, from_now: bool) -> _Job:
         if job not in self._jobs:
             chosen = Chosen(run, job)
             places = chosen.end() if from_now else {}
-            following = self._reconciler.logs.follow(run, job, self.waker)
-            self._jobs[job] = _Job(LogView(chosen, places), following.__enter__(), following)
+            with self._lock:
+                self._jobs[job] = _Job(LogView(chosen, places))
+                if self._is_open:
+                    self._attend(self._jobs[job])
         return self._jobs[job]
+
+    def _attend(self, job: _Job) -> None:
+        chosen = job.view.chosen
+        job.logs = job.following.enter_context(self._reconciler.logs.follow(chosen.run, chosen.job, self.waker))
 
     def _leave(self, jobs: Iterable[str]) -> None:
         for name in jobs:
-            job = self._jobs.pop(name)
-            job.following.__exit__(None, None, None)
+            with self._lock:
+                job = self._jobs.pop(name)
+                job.following.close()
             self._over.update(stream.name for stream in job.streams.values())
 
 

@@ -12,7 +12,6 @@ import re
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import closing
 from functools import partial
 from itertools import chain, islice
 from typing import Any
@@ -278,7 +277,7 @@ class _Session(Following):
         self._tail = tail
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        with closing(self._tail):  # which follows already
+        with self._tail:
             await super().__call__(scope, receive, send)
 
     def refusal(self, message: str) -> Response:

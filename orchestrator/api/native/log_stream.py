@@ -67,9 +67,9 @@ async def _lines(
     view: LogView, logs: JobLogs, waker: Waker, calls: StoreCalls, closing: threading.Event
 ) -> AsyncIterator[str]:
     """The lines until the job is over or the server ends, and an empty one now and then."""
-    spoken, in_files = time.monotonic(), True
+    spoken = time.monotonic()
     while not closing.is_set() and not logs.is_over:
-        found = None if in_files else view.poll_memory(logs, MEMORY_PIECE)
+        found = view.poll_memory(logs, MEMORY_PIECE)
         lines = _json_lines(found or ())
         if found is None:
             try:
@@ -77,8 +77,7 @@ async def _lines(
                     if read is None:
                         yield "\n"
                     lines = read or ""
-                in_files = view.behind
-                if not lines and not in_files:
+                if not lines and not view.behind:
                     await asyncio.sleep(_LATER)
             except StoreSilent:  # it may come back, and nothing is lost
                 await asyncio.sleep(_AGAIN)

@@ -219,6 +219,7 @@ def test_a_node_pushes_into_no_other_s_log_and_makes_none_push(
     assert pushed == [] and not victim.node.is_followed
     bus.ask_for_logs("victim", 1)
     wait_for(lambda: victim.node.is_followed, 10, "the command")
+    victim.node.push_log(7, b"")  # counts for nothing: it would cost a place in memory
     victim.node.push_log(7, b"true\n")
     wait_for(lambda: pushed == [(VICTIM, 7, b"true\n")], 10, "the victim's own line")
 

@@ -297,6 +297,40 @@ def test_all_followed_logs_share_a_bounded_memory(world: World, monkeypatch: pyt
         wait_for(lambda: len(logs) == 40 and kept() < bound, what="that older parts are dropped")
 
 
+def test_looks_become_rare_while_they_find_nothing_and_frequent_again_with_a_change_or_a_push(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = 1000.0
+    monkeypatch.setattr(log_hub, "machine", SimpleNamespace(monotonic=lambda: clock))
+    job, looks = log_hub._Followed(world.run, "job"), 0
+    genuine = job.logs.look
+
+    def look() -> bool:
+        nonlocal looks
+        looks += 1
+        return genuine()
+
+    monkeypatch.setattr(job.logs, "look", look)
+
+    def looks_in(seconds: float) -> int:
+        nonlocal clock
+        before = looks
+        for _ in range(round(seconds / 0.05)):
+            clock += 0.05001
+            world.hub._round([job])
+            wait_for(lambda: not job.is_looked_at)
+        return looks - before
+
+    assert looks_in(2.0) >= 4
+    assert looks_in(20.0) <= 22, "about one a second"
+    world.write("new", push=False)
+    assert looks_in(2.0) >= 5, "the next look found it, and others follow soon"
+    assert looks_in(20.0) <= 22
+    world.hub._followed["job"] = job
+    world.write("pushed")
+    assert looks_in(0.1) >= 1
+
+
 def test_an_idle_hub_has_no_thread_and_the_next_follower_starts_it_again(world: World) -> None:
     for _ in range(2):
         with world.hub.follow(world.run, "job", Waker()):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -35,6 +37,7 @@ class Followed:
         self.written = 0
         self.logs.note(1, 1)
         self.logs.look()
+        self.view.poll()
 
     def write(self, *texts: str, push: bool = True, visible: bool = True) -> None:
         data = "".join(format_line(1_800_000_000.0 + self.written, 0, "o", text) for text in texts).encode()
@@ -198,6 +201,86 @@ def test_a_reader_that_comes_too_late_hears_what_was_left_out(tmp_path: Path) ->
     texts = job.read()
     assert texts[0].startswith("0 ") and texts[-1].startswith("1499 ")
     assert sum("left out: the log reached its limit" in text for text in texts) == 1
+
+
+def test_pushes_that_come_too_early_are_few_whatever_a_node_sends(job: Followed) -> None:
+    for position in range(1, 4000):
+        job.logs.push(LOG, 2 * position, b"")
+    assert len(job.logs._tails[LOG].early) <= log_tail._EARLY
+    for position in range(1, 4000):
+        job.logs.push(LOG, position, b"x")
+        assert len(job.logs._tails[LOG].early) <= log_tail._EARLY
+
+
+@pytest.fixture
+def cached_size(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The volume is NFS: it has cached the log's size of now, and only who opens the file learns the true one."""
+    genuine, size = os.stat, job.path.stat().st_size
+
+    def stat(path: Any, *given: Any, **named: Any) -> os.stat_result:
+        found = genuine(path, *given, **named)
+        is_log = isinstance(path, Path) and path == job.path
+        return os.stat_result((*found[:6], size, *found[7:])) if is_log else found
+
+    monkeypatch.setattr(os, "stat", stat)
+
+
+@pytest.mark.parametrize("reader", ["the hub", "the last look of a follower"])
+def test_a_last_burst_that_was_not_pushed_is_read_though_the_volume_s_cached_size_is_old(
+    job: Followed, cached_size: None, reader: str
+) -> None:
+    job.write("pushed")
+    assert job.read(memory_alone=True) == ["pushed"]
+    job.write("burst", push=False)
+    if reader == "the hub":
+        assert job.logs.look() and job.read(memory_alone=True) == ["pushed", "burst"]
+    else:
+        assert [line.text for line in job.view.drain()] == ["burst"]
+
+
+def test_the_last_look_gives_no_line_twice_where_the_volume_shows_the_log_late_or_in_another_file(
+    tmp_path: Path,
+) -> None:
+    job = Followed(tmp_path / "run", LEAST_LIMIT)
+    job.write("in the first file", push=False)
+    job.logs.look()
+    assert [line.text for line in job.view.poll()] == ["in the first file"]
+    for number in range(300):
+        job.write(f"{number} " + "x" * 2000)
+        job.read(memory_alone=True)
+    assert len(list(job.path.parent.iterdir())) > 1, "the log has gone on in another file"
+    job.write("late", visible=False)
+    assert job.read(memory_alone=True)[-1] == "late"
+    assert list(job.view.drain()) == []
+    job.show()
+    job.write("last", push=False)
+    assert [line.text for line in job.view.drain()] == ["last"]
+
+
+def test_a_reader_visits_the_logs_that_have_changed_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    logs, nodes = JobLogs(Run(tmp_path), "job"), 1000
+    view = LogView.of(logs.run, "job")
+    logs.note(1, nodes)
+    logs.look()
+    view.poll()
+    data = format_line(1_800_000_000.0, 0, "o", "text").encode()
+    for node in range(nodes):
+        logs.push((1, node), 0, data)
+    lines = view.poll_memory(logs, 1 << 14)
+    assert lines is not None and len(lines) == nodes == len(view.offsets)
+    visited = list[tuple[int, int]]()
+    genuine = logs.read
+    monkeypatch.setattr(logs, "read", lambda log, *given: (visited.append(log), genuine(log, *given))[1])
+    assert view.poll_memory(logs, 1 << 14) == [] and not visited
+    logs.push((1, 7), len(data), data)
+    lines = view.poll_memory(logs, 1 << 14)
+    assert lines is not None and [line.node for line in lines] == [7] and set(visited) == {(1, 7)}
+    logs.push((1, 8), len(data), data * 1000)
+    lines = view.poll_memory(logs, len(data) * 10)
+    assert lines is not None and len(lines) == 10 and view.behind
+    while view.behind:
+        lines += view.poll_memory(logs, len(data) * 10) or []
+    assert len(lines) == 1000 and set(visited) == {(1, 7), (1, 8)}
 
 
 ACTIONS = st.one_of(
