@@ -21,7 +21,8 @@ from shared_store.layout import Run
 ARCHIVED = "archived.json"
 OF_JOBS = ("logs", "outcomes")
 """Directories with a directory for each job."""
-_RECORDS = re.compile(r"run\.json|EPOCH|EPOCH\.[0-9]{1,15}|texts|\..*\.tmp|" + re.escape(ARCHIVED))
+_CLAIM = re.compile(r"EPOCH\.([0-9]{1,15})")
+_RECORDS = re.compile(r"run\.json|EPOCH|texts|\..*\.tmp|" + re.escape(ARCHIVED))
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Contents:
     """Names of files and of directories with something in them, sorted."""
     logged: frozenset[str]
     """Jobs that have left logs or outcomes."""
+    epoch: int
+    """The highest that a controller has claimed, whether it is published yet or not; 0 before the first."""
 
 
 def contents(run: Run) -> Contents:
@@ -39,16 +42,18 @@ def contents(run: Run) -> Contents:
     run.check_links()
     if run.path.is_symlink():
         raise DamagedFile(f"{run.path}: a link, and links inside a run are not followed")
-    results = []
+    results, epoch = [], 0
     logged: set[str] = set()
     for entry in sorted(os.scandir(run.path), key=lambda entry: entry.name):
-        if entry.name in OF_JOBS:
+        if claim := _CLAIM.fullmatch(entry.name):
+            epoch = max(epoch, int(claim[1]))
+        elif entry.name in OF_JOBS:
             jobs, others = _jobs_in(Path(entry.path))
             logged |= jobs
             results += [f"{entry.name}/{name}" for name in others]
         elif not _RECORDS.fullmatch(entry.name) and (not entry.is_dir(follow_symlinks=False) or _has_files(entry.path)):
             results.append(entry.name)
-    return Contents(tuple(results), frozenset(logged))
+    return Contents(tuple(results), frozenset(logged), epoch)
 
 
 def _jobs_in(directory: Path) -> tuple[set[str], list[str]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,21 +16,24 @@ from shared_store.files import refuse_links, sync_directory
 from shared_store.layout import Store
 
 
-def throw_away(store: Store, *paths: Path) -> list[Path]:
+def throw_away(store: Store, paths: Iterable[Path]) -> list[Path]:
     """Move directories of the store into the trash, durably; returns where those are now that were there.
+
+    Args:
+        store: The shared volume.
+        paths: Of the directories. Each is moved before the next one is asked for, so that an iterator may look at it right before.
 
     Raises:
         DamagedFile: A directory on the way is a link, which leads out of the store.
         OSError: The volume can't be written, or is gone. Of the directories, some may be in the trash.
     """
     trash = store.path / "trash"
-    for path in paths:
-        refuse_links(path, len(path.relative_to(store.path).parts))
     refuse_links(trash, 1)
     trash.mkdir(exist_ok=True)
     thrown, changed = [], {trash}
     try:
         for path in paths:
+            refuse_links(path, len(path.relative_to(store.path).parts))
             there = trash / f"{uuid.uuid4().hex}.{path.name[:100]}"
             with suppress(FileNotFoundError):
                 os.rename(path, there)

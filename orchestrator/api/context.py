@@ -184,7 +184,7 @@ def using(reconciler: Reconciler, *runs: str, cites: bool = True) -> Iterator[No
     """A block in which nobody deletes these runs; ``cites``: afterwards something in the store may need them. Raises RunInUse."""
     with ExitStack() as stack:
         if cites:
-            stack.callback(reconciler.retention.look_again)
+            stack.callback(reconciler.retention.stored.look_again)
         for run in runs:
             stack.enter_context(reconciler.run_users.using(run))
         yield

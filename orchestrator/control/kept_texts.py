@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from sqlalchemy import String, and_, cast, func, not_, select, update
+from sqlalchemy import String, cast, func, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
@@ -24,6 +24,7 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL
 from orchestrator.persistence.models import Job, JobDefinition, now
 from orchestrator.persistence.own_models import KeptText
+from orchestrator.persistence.references import is_of_submission
 from orchestrator.persistence.session import Database, DatabaseError
 from shared_store import texts
 from shared_store.layout import Store
@@ -35,8 +36,6 @@ DAYS = 7
 """For which a text is kept that nothing names."""
 A_DAY = 32 << 20
 """Bytes of texts that one key may upload in 24 hours."""
-OF_SUBMISSION = "MUSTER_DIRECTORY"
-"""Variable that only the definitions have which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""
 _SWEEP_INTERVAL, _FIRST_SWEEP = 3600.0, 60.0
 """Seconds between two looks for texts that nothing needs, and until the first one."""
 _MS_A_DAY = 24 * 3600 * 1000
@@ -186,16 +185,14 @@ def _forget_unneeded(session: Session, moment: int) -> list[tuple[str, str]]:
 
 def _named(session: Session) -> set[str]:
     """The digests in active definitions of Batch clients and in jobs that have not ended."""
-    submitted = cast(JobDefinition.document, String).contains(OF_SUBMISSION, autoescape=True)
-    columns = (
-        (JobDefinition.document, and_(JobDefinition.status == "ACTIVE", not_(submitted))),
-        (Job.own_node_properties, Job.status.not_in(TERMINAL)),
-    )
     found: set[str] = set()
-    for column, is_open in columns:
+    for column, is_open in (
+        (JobDefinition.document, JobDefinition.status == "ACTIVE"),
+        (Job.own_node_properties, Job.status.not_in(TERMINAL)),
+    ):
         text = cast(column, String)
-        for each in session.scalars(
-            select(text).where(is_open, text.contains("sha256")).execution_options(yield_per=100)
-        ):
-            found.update(re.findall(r"[0-9a-f]{64}", each))
+        query = select(column, text.label("text")).where(is_open, text.contains("sha256"))
+        for document, written in session.execute(query.execution_options(yield_per=100)):
+            if column is Job.own_node_properties or not is_of_submission(document):
+                found.update(re.findall(r"[0-9a-f]{64}", written))
     return found

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -23,20 +23,19 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.peers import Peers
-from orchestrator.control.retention_looks import CONTROLLER, Look, Place, Totals, Whose
+from orchestrator.control.retention_looks import CONTROLLER, Look, Place, Step, Totals, Whose
 from orchestrator.control.run_users import RunUsers
+from orchestrator.control.stored_runs import StoredRuns
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import JobFacts, References, Rules, RunFacts, decide, still_needed
+from orchestrator.domain.retention import Decision, JobFacts, References, Rules, RunFacts, decide, still_needed
 from orchestrator.persistence import references as rows
 from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart
 from orchestrator.persistence.session import Database
 from shared_store import contents, trash
-from shared_store.files import DamagedFile
-from shared_store.layout import NAME, Run, Store
-from shared_store.references import references as stored_references
+from shared_store.layout import NAME, Store
 
 log = logging.getLogger("muster.retention")
 
@@ -60,17 +59,6 @@ class RunNeeded(RequestError):
     """A run is not deleted; one line that says why."""
 
     status = 409
-
-
-@dataclass
-class _Stored:
-    """What in the store needs runs, as it was found."""
-
-    references: References = field(default_factory=References)
-    found_at: float | None = None
-    """Monotonic [s]; None before it was looked for."""
-    version: int = 0
-    """:attr:`Retention._version` before it was looked for."""
 
 
 class Retention:
@@ -101,13 +89,12 @@ class Retention:
             default: Seconds for which jobs of queues without a rule are kept; None: as :class:`Rules` says. Infinity: without end,
                 and nothing goes by itself.
         """
-        self._database, self._store, self._peers, self._users = database, store, peers, users
-        self._beginning, self._writing, self._check, self._steady = beginning, writing, check, steady
+        self._database, self._store, self._users = database, store, users
+        self._beginning, self._writing, self._steady = beginning, writing, steady
+        self.stored = StoredRuns(store, peers, check)
         self._is_on = default != inf
         self._default = int(default * 1000) if default is not None and self._is_on else None
         self._removing = machine.pool("emptying the trash", _REMOVERS)
-        self._stored, self._version = _Stored(), 0
-        self._scanning = threading.Lock()
         self._next, self._next_report = machine.monotonic() + _FIRST, machine.monotonic()
         self._is_under_way = False
         self._is_closing, self._passing = threading.Event(), threading.Lock()
@@ -147,24 +134,14 @@ class Retention:
         if self._is_closing.is_set():
             return
         self._empty_trash()
-        with self._database.session() as session:
-            rules = self.rules(session)
-        if rules.is_trial(self._moment()):
+        if self.rules().is_trial(self._moment()):
             self._report()
         else:
             self.take_all()
 
     def take_all(self) -> Totals:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
-        totals, place = Totals(), Place()
-        while not self._is_closing.is_set():
-            began = machine.processor_time()
-            looks, following = self.step(place, take=True)
-            totals.add(looks)
-            if following is None:
-                break
-            place = following
-            self._is_closing.wait(_REST * (machine.processor_time() - began))
+        totals = self._all(lambda rules, place: self.step(place, rules, take=True))
         with self._writing, self._database.session() as session:
             rows.forget_usage(session, self._steady())
         if totals.jobs or totals.runs:
@@ -180,13 +157,7 @@ class Retention:
         if machine.monotonic() < self._next_report:
             return
         self._next_report = machine.monotonic() + _LOGGED
-        totals, place = Totals(), Place()
-        while not self._is_closing.is_set():
-            looks, following = self.step(place, take=False, as_if_new=True)
-            totals.add(looks)
-            if following is None:
-                break
-            place = following
+        totals = self._all(lambda rules, place: self.step(place, replace(rules, since=0), take=False))
         log.warning(
             "retention has taken nothing yet: in the first %d days after the upgrade it only counts, and %s are old enough. "
             "`muster gc --dry-run` lists them, `muster runs archive RUN` keeps a run, `muster serve --retention off` keeps everything",
@@ -194,41 +165,54 @@ class Retention:
             totals,
         )
 
+    def _all(self, step: Callable[[Rules, Place], Step]) -> Totals:
+        """Step by step with the rules of each moment, and a rest after each."""
+        totals, place = Totals(), Place()
+        while not self._is_closing.is_set():
+            began = machine.processor_time()
+            looks, following = step(self.rules(), place)
+            totals.add(looks)
+            if following is None:
+                break
+            place = following
+            self._is_closing.wait(_REST * (machine.processor_time() - began))
+        return totals
+
     def _empty_trash(self) -> None:
         try:
-            self._check()
+            self.stored.check()
             trash.empty(self._store)
         except (OSError, Unavailable) as error:
             log.warning("the store's trash can't be emptied now (%s)", error)
 
     # -- one step -------------------------------------------------------------------------------------------------------
 
-    def rules(self, session: Session) -> Rules:
+    def rules(self) -> Rules:
         """The rules as they are now."""
-        start = session.get(RetentionStart, 1)
-        tagged = [(queue.name, queue.tags.get(retention.TAG)) for queue in session.scalars(select(JobQueue))]
-        queues = {name: _age_of(tag) for name, tag in tagged if tag is not None}
-        return Rules(self._default, queues, start.since if start else 0, batch=self._is_on)
+        with self._database.session() as session:
+            start = session.get(RetentionStart, 1)
+            tags = {queue.name: queue.tags.get(retention.TAG) for queue in session.scalars(select(JobQueue))}
+        queues = {name: _age_of(tag) for name, tag in tags.items() if tag is not None}
+        others = [name for name, tag in tags.items() if tag is None]
+        return Rules(queues, others, self._default, start.since if start else 0, batch=self._is_on)
 
     def step(
         self,
         after: Place,
+        rules: Rules,
         *,
         take: bool,
         whose: Whose = CONTROLLER,
-        older: int | None = None,
         most: int = A_STEP,
-        as_if_new: bool = False,
-    ) -> tuple[list[dict[str, Any]], Place | None]:
+    ) -> Step:
         """Look at the next jobs that are old enough, and take what may go.
 
         Args:
             after: Where the step before ended.
+            rules: As :meth:`rules` answers, or changed.
             take: Take it; else only look.
             whose: Who asks.
-            older: Milliseconds for which jobs of queues without a rule are kept, in place of what the rules say.
             most: Number of jobs.
-            as_if_new: As in a database that was never upgraded.
 
         Returns:
             What went, or would go, and what is kept; where the next step begins, None after the last one.
@@ -238,9 +222,6 @@ class Retention:
         """
         moment = self._moment()
         with self._database.session() as session:
-            rules = self.rules(session)
-            rules = replace(rules, since=0) if as_if_new else rules
-            rules = rules if older is None else replace(rules, default=older)
             query = select(Job.id, Job.run, Job.stopped_at).where(rows.due(rules, moment))
             behind = or_(
                 Job.stopped_at > after.stopped_at, and_(Job.stopped_at == after.stopped_at, Job.id < after.job)
@@ -258,7 +239,7 @@ class Retention:
             try:
                 again = self._looks(taken, rules, moment, whose)
                 described |= {look.run: look.described() for look in again}
-                self._carry_out(again)
+                described |= {look.run: look.described() for look in self._carry_out(again)}
             finally:
                 for run in taken:
                     self._users.let_go(run)
@@ -274,17 +255,19 @@ class Retention:
         """What may go of these runs and their jobs. Raises Unavailable, OSError."""
         if not runs:
             return []
-        stored = self._stored_references(_FRESH)
-        facts = self.facts(runs)
+        stored = self.stored.references(_FRESH)
+        facts = self.stored.facts(runs)
         with self._database.session() as session:  # after the store: what was submitted meanwhile counts
-            jobs = self._jobs(session, runs, rules, whose)
+            jobs = self._jobs(session, runs, rules, moment, whose)
             needed = References.of(rows.references(session, runs, rules, moment)) | stored
         needed = needed if whose.queues is None else needed.unnamed()
-        return [self._look(run, facts[run], jobs[run], needed, moment) for run in sorted(runs)]
+        return [self._look(run, facts[run], jobs[run], needed) for run in sorted(runs)]
 
-    def _jobs(self, session: Session, runs: Collection[str], rules: Rules, whose: Whose) -> dict[str, list[JobFacts]]:
+    def _jobs(
+        self, session: Session, runs: Collection[str], rules: Rules, moment: int, whose: Whose
+    ) -> dict[str, list[JobFacts]]:
         """The jobs of the runs; those of others, and all of a run that is another's, never go."""
-        jobs = rows.jobs_of_runs(session, runs, rules)
+        jobs = rows.jobs_of_runs(session, runs, rules, moment)
         if whose.queues is None:
             return jobs
         owners = session.execute(select(Job.id, Job.owner, Job.queue).where(Job.run.in_(runs)))
@@ -292,88 +275,65 @@ class Retention:
         records = session.scalars(select(RunRecord).where(RunRecord.name.in_(runs)))
         others = {record.name for record in records if not whose.owns(record.owner, record.queue)}
         return {
-            run: [each if each.id in own and run not in others else replace(each, due_at=None) for each in of_run]
+            run: [each if each.id in own and run not in others else replace(each, is_due=False) for each in of_run]
             for run, of_run in jobs.items()
         }
 
-    def _look(
-        self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References, moment: int
-    ) -> Look:
-        decision = decide(facts, jobs, needed, moment)
-        if facts is None:
-            return Look(name, decision, is_missing=True)
-        run = self._store.run(name)
+    def _look(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> Look:
+        decision, run = decide(facts, jobs, needed), self._store.run(name)
         if decision.run:
-            return Look(name, decision, (run.path,))
-        return Look(name, decision, tuple(path for job in decision.jobs for path in contents.job_directories(run, job)))
+            return Look(name, decision, facts, (run.path,))
+        return Look(
+            name, decision, facts, tuple(path for job in decision.jobs for path in contents.job_directories(run, job))
+        )
 
-    def _carry_out(self, looks: Sequence[Look]) -> None:
-        """Move into the trash what goes, delete the rows, and empty the trash. Raises Unavailable, OSError."""
-        self._check()
-        thrown = trash.throw_away(self._store, *(path for look in looks for path in look.directories))
-        self._check()
+    def _carry_out(self, looks: Sequence[Look]) -> list[Look]:
+        """Move into the trash what goes, delete the rows, and empty the trash; returns what stays, since it has changed.
+
+        Raises Unavailable, OSError.
+        """
+        gone, stay = list[Look](), list[Look]()
+        self.stored.check()
+        thrown = trash.throw_away(self._store, self._directories(looks, gone, stay))
+        self.stored.check()
         if self._is_closing.is_set():
-            return  # the next controller deletes the rows
+            return stay  # the next controller deletes the rows
         # an array behind its children
-        jobs = sorted((job for look in looks for job in look.decision.jobs), key=lambda job: ":" not in job)
-        gone = [look.run for look in looks if look.decision.run or look.is_missing]
+        jobs = sorted((job for look in gone for job in look.decision.jobs), key=lambda job: ":" not in job)
+        runs = [look.run for look in gone if look.decision.run or look.facts is None]
         for start in range(0, len(jobs), A_TRANSACTION):
             with self._writing, self._database.session() as session:
                 rows.forget_jobs(session, jobs[start : start + A_TRANSACTION])
                 if start + A_TRANSACTION >= len(jobs):
-                    rows.forget_owners(session, gone)
+                    rows.forget_owners(session, runs)
         self._remove(thrown)
+        return stay
+
+    def _directories(self, looks: Sequence[Look], gone: list[Look], stay: list[Look]) -> Iterator[Path]:
+        """The directories that go. Each run is read again right before: since it was looked at, another controller may have begun an
+        attempt of it, which no lock of this one keeps out.
+        """
+        for look in looks:
+            if not look.decision.jobs:
+                continue
+            if self.stored.is_unchanged(look.run, look.facts):
+                gone.append(look)
+                yield from look.directories
+            else:
+                stay.append(Look(look.run, Decision(False, (), ("it has just changed",)), look.facts, ()))
 
     def _remove(self, thrown: Sequence[Path]) -> None:
         """Remove what was thrown away, several at once: each waits for the file system's journal."""
         wait([self._removing.submit(partial(trash.remove, path)) for path in thrown])
 
-    # -- what is in the store -------------------------------------------------------------------------------------------
-
-    def facts(self, runs: Collection[str]) -> dict[str, RunFacts | None]:
-        """Each run as the store has it now; None where there is none. Raises Unavailable, OSError."""
-        self._check()
-        found = {name: self._facts(self._store.run(name)) for name in runs}
-        self._check()
-        return found
-
-    def _facts(self, run: Run) -> RunFacts | None:
-        try:
-            inside = contents.contents(run)
-            archived = contents.archived(run)
-            writer = self._peers.writer(run)
-        except FileNotFoundError:
-            return None
-        except (DamagedFile, ValueError) as error:
-            return RunFacts(run.name, damage=str(error))
-        return RunFacts(run.name, inside.results, inside.logged, _by_whom(archived), writer)
-
-    def _stored_references(self, fresh: float) -> References:
-        """What in the store needs runs, as it was at most so many seconds ago. Raises Unavailable, OSError."""
-        with self._scanning:
-            stored, version = self._stored, self._version
-            is_old = stored.found_at is None or machine.monotonic() - stored.found_at > fresh
-            if is_old or stored.version != version:
-                began = machine.monotonic()
-                self._check()
-                needed, unreadable = stored_references(self._store)
-                self._check()
-                references = References.of((retention.Reference(*each) for each in needed), unreadable)
-                self._stored = _Stored(references, began, version)
-            return self._stored.references
-
-    def look_again(self) -> None:
-        """Something in the store needs other runs than before. Waits for nothing."""
-        self._version += 1
-
     # -- one run, as a person asks --------------------------------------------------------------------------------------
 
-    def needs(self, name: str, whose: Whose = CONTROLLER) -> tuple[RunFacts | None, list[str]]:
+    def _needs(self, name: str, whose: Whose) -> tuple[RunFacts | None, list[str]]:
         """A run as the store has it, and why it may not be deleted, in words for who asks. Raises Unavailable, OSError."""
-        stored, facts, moment = self._stored_references(0.0), self.facts([name])[name], self._moment()
+        stored, facts = self.stored.references(0.0), self.stored.facts([name])[name]
+        rules, moment = self.rules(), self._moment()
         with self._database.session() as session:
-            rules = self.rules(session)
-            jobs = rows.jobs_of_runs(session, [name], rules)[name]
+            jobs = rows.jobs_of_runs(session, [name], rules, moment)[name]
             needed = References.of(rows.references(session, [name], rules, moment)) | stored
         needed = needed if whose.queues is None else needed.unnamed()
         return facts, [] if facts is None else still_needed(facts, jobs, needed)
@@ -392,12 +352,14 @@ class Retention:
             Unavailable, OSError: The store or the database can't be used.
         """
         with self.alone(name):
-            facts, reasons = self.needs(name, whose)
+            facts, reasons = self._needs(name, whose)
             if reasons:
                 raise RunNeeded(f"run {name} is kept: {'; '.join(reasons)}")
             path = self._store.run(name).path
             size, files = (0, 0) if facts is None else trash.size_of(path)
-            thrown = trash.throw_away(self._store, path)
+            if not self.stored.is_unchanged(name, facts):
+                raise RunNeeded(f"run {name} has just changed, and nothing of it is deleted; try again in a moment")
+            thrown = trash.throw_away(self._store, [path])
             with self._writing, self._database.session() as session:
                 if (record := session.get(RunRecord, name)) is not None:
                     session.delete(record)
@@ -423,7 +385,3 @@ def _age_of(tag: str) -> int | None:
         return retention.age_of(tag)
     except ValueError:  # an older Muster took any text
         return None
-
-
-def _by_whom(archived: Mapping[str, Any] | None) -> str | None:
-    return None if archived is None else f"by {archived.get('by', 'an unknown key')}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from orchestrator.domain.retention import Decision
+from orchestrator.domain.retention import Decision, RunFacts
 from shared_store import trash
 
 
@@ -33,10 +33,10 @@ class Look:
 
     run: str
     decision: Decision
-    directories: tuple[Path, ...] = ()
+    facts: RunFacts | None
+    """The run as it was; None where the store has no such run."""
+    directories: tuple[Path, ...]
     """That go."""
-    is_missing: bool = False
-    """Whether the store has no such run."""
 
     def described(self) -> dict[str, Any]:
         """For the API; sizes in bytes."""
@@ -87,3 +87,7 @@ class Place:
         if not dot or not moment.isdecimal() or len(moment) > 16:
             raise ValueError(f"{text[:100]!r} is no place of a pass")
         return cls(int(moment), job)
+
+
+Step = tuple[list[dict[str, Any]], Place | None]
+"""What a step has found, as :meth:`Look.described`, and where the next one begins."""

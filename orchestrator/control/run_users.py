@@ -7,15 +7,15 @@ submitted needs no entry: its row is what keeps its runs (:mod:`orchestrator.per
 from __future__ import annotations
 
 import threading
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from orchestrator import machine
 from orchestrator.domain.errors import RequestError
 
-_REMEMBERED = 900.0
-"""Seconds for which a deletion is remembered: longer than any request takes that has read the store before."""
+_VERSIONS = 4096
+"""Runs share so many versions, so that deletions leave nothing in memory: another run's change costs a request a second look at the store."""
 
 
 class RunInUse(RequestError):
@@ -31,9 +31,7 @@ class RunUsers:
         self._lock = threading.Lock()
         self._users = Counter[str]()
         self._taken: set[str] = set()
-        self._changed: dict[str, tuple[int, float]] = {}
-        """By run: its version, and when it got that (monotonic [s]); in the order of these moments."""
-        self._version = 0
+        self._versions = array("Q", bytes(8 * _VERSIONS))
 
     @contextmanager
     def using(self, run: str) -> Iterator[None]:
@@ -57,23 +55,15 @@ class RunUsers:
     def version(self, run: str) -> int:
         """Another number after each deletion of the run: what was read of the store before counts no more."""
         with self._lock:
-            return self._changed.get(run, (0, 0.0))[0]
+            return self._versions[hash(run) % _VERSIONS]
 
     def take(self, run: str) -> bool:
         """Have the run for oneself until :meth:`let_go`; False where somebody uses it."""
-        moment = machine.monotonic()
         with self._lock:
             if run in self._users or run in self._taken:
                 return False
             self._taken.add(run)
-            self._version += 1
-            self._changed.pop(run, None)
-            self._changed[run] = self._version, moment
-            while self._changed:
-                oldest = next(iter(self._changed))
-                if moment - self._changed[oldest][1] < _REMEMBERED or oldest in self._taken:
-                    break
-                del self._changed[oldest]
+            self._versions[hash(run) % _VERSIONS] += 1
             return True
 
     def let_go(self, run: str) -> None:

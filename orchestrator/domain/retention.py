@@ -83,6 +83,8 @@ class RunFacts:
     """A run, as the store has it."""
 
     name: str
+    epoch: int = 0
+    """The highest that a controller has claimed: another one tells that an attempt has begun since."""
     results: tuple[str, ...] = ()
     """Files and directories that are neither Muster's records of the run nor its logs and outcomes."""
     logged: frozenset[str] = frozenset()
@@ -101,8 +103,8 @@ class JobFacts:
 
     id: str
     is_open: bool = False
-    due_at: int | None = None
-    """From when its rule lets it go (Unix time [ms]); None: never."""
+    is_due: bool = False
+    """Whether its rule lets it go; never while it is open."""
 
 
 @dataclass(frozen=True)
@@ -122,29 +124,21 @@ class Rules:
     """How long jobs are kept. Times are Unix milliseconds.
 
     Attributes:
-        default: Of queues without a rule: for so many milliseconds; None: jobs of the Batch API for :data:`BATCH_DAYS`, where
-            ``batch`` says so, and all others without end.
         queues: The rule of each queue that has one; None: without end.
+        others: Queues without a rule. Jobs of any further queue are kept: with a queue that was deleted its rule went, which may have
+            been to keep them.
+        default: Of ``others``: for so many milliseconds; None: jobs of the Batch API for :data:`BATCH_DAYS`, where ``batch`` says so,
+            and all others without end.
         since: When this database was upgraded to a Muster with these rules; 0 where it was made by one. Of jobs without a rule the time
             counts from then on.
         batch: Whether jobs of the Batch API go without a rule.
     """
 
-    default: int | None = None
     queues: Mapping[str, int | None] = field(default_factory=dict)
+    others: Collection[str] = ()
+    default: int | None = None
     since: int = 0
     batch: bool = True
-
-    def due_at(self, queue: str, from_yaml: bool, ended_at: int | None) -> int | None:
-        """From when a job may go; None where it may never, or has not ended."""
-        if ended_at is None:
-            return None
-        age = self.queues.get(queue, self.default)
-        if age is not None:
-            return ended_at + age
-        if queue in self.queues or from_yaml or not self.batch:
-            return None
-        return max(ended_at, self.since) + BATCH_DAYS * A_DAY
 
     def batch_limit(self, moment: int) -> int | None:
         """Before when a job of the Batch API without a rule must have ended to go at ``moment``; None where none may go yet."""
@@ -172,16 +166,15 @@ def still_needed(run: RunFacts, jobs: Collection[JobFacts], references: Referenc
     return list(dict.fromkeys(reasons))
 
 
-def decide(run: RunFacts | None, jobs: Sequence[JobFacts], references: References, moment: int) -> Decision:
-    """What goes of a run and its jobs at a moment (Unix time [ms]) by the rules.
+def decide(run: RunFacts | None, jobs: Sequence[JobFacts], references: References) -> Decision:
+    """What goes of a run and its jobs by the rules.
 
     Args:
         run: None where the store has no such run, because its jobs never started or it was deleted.
         jobs: All of its jobs that the database has.
         references: What needs them.
-        moment: Now.
     """
-    due = tuple(each.id for each in jobs if not each.is_open and each.due_at is not None and each.due_at <= moment)
+    due = tuple(each.id for each in jobs if each.is_due and not each.is_open)
     if not due:
         return Decision(False, ())
     if run is None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
 
-from sqlalchemy import ColumnElement, and_, delete, false, not_, or_, select
+from sqlalchemy import ColumnElement, and_, case, delete, false, not_, or_, select
 from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.job import TERMINAL
@@ -13,20 +14,20 @@ from orchestrator.persistence.job_counts import Place, note_rows
 from orchestrator.persistence.models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
 from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, ShareUsage, WebhookDelivery
 
-_SUBMITTED = "MUSTER_DIRECTORY"
-"""Variable that only definitions have which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""
+_SUBMITTED = {"MUSTER_DIRECTORY", "MUSTER_SPEC"}
+"""Variables of a definition which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""
 
 _UNUSED = 90 * A_DAY
 """Milliseconds after which the use of a share is forgotten."""
 
 
-def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules) -> dict[str, list[JobFacts]]:
-    """All jobs of these runs, by run."""
+def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules, moment: int) -> dict[str, list[JobFacts]]:
+    """All jobs of these runs, by run, as they are at a moment (Unix time [ms])."""
     found: dict[str, list[JobFacts]] = {run: [] for run in runs}
-    query = select(Job.id, Job.run, Job.status, Job.queue, Job.from_yaml, Job.stopped_at).where(Job.run.in_(runs))
-    for job, run, status, queue, from_yaml, stopped_at in session.execute(query.order_by(Job.created_at, Job.id)):
-        due_at = rules.due_at(queue, from_yaml, stopped_at)
-        found[run].append(JobFacts(job, status not in TERMINAL, due_at))
+    is_due = case((due(rules, moment), True), else_=False)  # where the time is missing, neither is known
+    query = select(Job.id, Job.run, Job.status, is_due).where(Job.run.in_(runs))
+    for job, run, status, due_now in session.execute(query.order_by(Job.created_at, Job.id)):
+        found[run].append(JobFacts(job, status not in TERMINAL, due_now))
     return found
 
 
@@ -56,12 +57,13 @@ def references(session: Session, runs: Collection[str], rules: Rules, moment: in
 
 def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
     """Which jobs may go at a moment (Unix time [ms]), as far as rules and times tell."""
+    queue_of = job.queue.concat("")  # so that SQLite uses the index by time, which has the queue, and no index by queue
     each = [
-        and_(job.queue == queue, job.stopped_at <= moment - age)
+        and_(queue_of == queue, job.stopped_at <= moment - age)
         for queue, age in rules.queues.items()
         if age is not None
     ]
-    others = job.queue.not_in(list(rules.queues))
+    others = queue_of.in_(rules.others)
     if rules.default is not None:
         each.append(and_(others, job.stopped_at <= moment - rules.default))
     elif (limit := rules.batch_limit(moment)) is not None:
@@ -126,13 +128,13 @@ def _forget_definitions(session: Session, arns: Collection[str]) -> None:
             continue
         newest = select(JobDefinition.revision).where(JobDefinition.name == name)
         is_newest = session.scalar(newest.order_by(JobDefinition.revision.desc()).limit(1)) == found.revision
-        if _is_of_submission(found) or (found.status == "INACTIVE" and not is_newest):
+        if is_of_submission(found.document) or (found.status == "INACTIVE" and not is_newest):
             session.delete(found)
 
 
-def _is_of_submission(definition: JobDefinition) -> bool:
+def is_of_submission(definition: Mapping[str, Any]) -> bool:
     """Whether `muster submit`, `run` or the like has made it."""
-    ranges = (definition.document.get("nodeProperties") or {}).get("nodeRangeProperties") or []
+    ranges = (definition.get("nodeProperties") or {}).get("nodeRangeProperties") or []
     environments = ((each.get("container") or {}).get("environment") or [] for each in ranges)
     names = {pair.get("name") for environment in environments for pair in environment}
-    return {_SUBMITTED, "MUSTER_SPEC"} <= names
+    return names >= _SUBMITTED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
 from fastapi import APIRouter, Query, Request
@@ -72,8 +73,7 @@ def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, 
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.ARCHIVE_RUN)
     with reconciler.retention.alone(run.name):
-        facts, _ = reconciler.retention.needs(run.name)
-        if facts is None:
+        if reconciler.retention.stored.facts([run.name])[run.name] is None:
             raise ClientError(f"run {run.name} was deleted a moment ago", 404)
         if body.archived and (job := reconciler.retention.open_job(run.name)):
             raise RunNeeded(
@@ -111,7 +111,9 @@ def _part(reconciler: Reconciler, after: str, older_than: str, *, take: bool) ->
     found: list[dict[str, Any]] = []
     deadline = time.monotonic() + _A_PART
     while True:
-        looks, following = reconciler.retention.step(place, take=take, whose=whose, older=older)
+        rules = reconciler.retention.rules()
+        rules = rules if older is None else replace(rules, default=older)
+        looks, following = reconciler.retention.step(place, rules, take=take, whose=whose)
         found += looks
         if following is None or time.monotonic() > deadline:
             return {"runs": found, "next": None if following is None else str(following)}

@@ -266,6 +266,17 @@ def test_while_a_run_is_deleted_requests_about_it_are_refused(inside: Server, ht
     assert http.get(f"/api/runs/{trained}").status_code == 200
 
 
+def test_archiving_a_run_reads_that_run_alone(
+    inside: Server, http: httpx.Client, trained: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def scan(_fresh: float) -> None:
+        raise AssertionError("what needs runs is looked for in the whole store")
+
+    monkeypatch.setattr(inside.reconciler.retention.stored, "references", scan)
+    assert http.post(f"/api/runs/{trained}/archive", json={}).json() == {"run": trained, "archived": True}
+    http.post(f"/api/runs/{trained}/archive", json={"archived": False}).raise_for_status()
+
+
 def test_a_run_of_a_model_is_not_deleted(inside: Server, http: httpx.Client, trained: str) -> None:
     run = inside.store.run(trained)
     checkpoint = list_checkpoints(run)[-1]

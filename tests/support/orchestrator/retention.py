@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from sqlalchemy import func, select, update
 
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention
+from orchestrator.control.retention_looks import CONTROLLER, Place, Step, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS
 from orchestrator.persistence.models import Attempt, Base, Dependency, Job, Node, RunRecord, now
@@ -47,6 +49,13 @@ class World:
             now,
             default,
         )
+
+    def step(
+        self, after: Place = Place(), *, take: bool, whose: Whose = CONTROLLER, most: int = 100, **rules: Any
+    ) -> Step:
+        """A step, with other rules."""
+        retention = self.retention()
+        return retention.step(after, replace(retention.rules(), **rules), take=take, whose=whose, most=most)
 
     def ended(self, name: str, *, run: str | None = None, directory: bool = True, **facts: Any) -> None:
         """A job with an attempt, a node, an owner and a run with a log."""

@@ -57,6 +57,7 @@ def test_everything_but_muster_s_records_and_logs_is_a_result(
     make(run)
     found = contents.contents(run)
     assert found.results == results and found.logged == {"j1"}
+    assert found.epoch == (12 if (run.path / "EPOCH.12").exists() else 0)
 
 
 def test_a_run_that_is_a_link_or_is_missing_is_not_looked_into(store: Store) -> None:
@@ -91,13 +92,13 @@ def test_a_directory_is_moved_whole_and_what_a_killed_controller_left_is_swept(s
     run = logged(store, "r")
     assert trash.size_of(run.path)[1] == 3
     other = logged(store, "other")
-    [thrown, _] = trash.throw_away(store, run.path, store.run("none").path, other.path)
+    [thrown, _] = trash.throw_away(store, [run.path, store.run("none").path, other.path])
     assert not run.path.exists() and not other.path.exists() and (thrown / "run.json").is_file()
-    assert trash.throw_away(store, run.path) == []
+    assert trash.throw_away(store, [run.path]) == []
     logged(store, "r2")
     assert trash.empty(store) == 2 and os.listdir(store.path / "trash") == []
     assert store.run("r2").path.is_dir() and trash.empty(store) == 0
-    trash.throw_away(store, store.run("r2").path)
+    trash.throw_away(store, [store.run("r2").path])
     (store.path / "trash" / "stray").write_text("x")
     os.symlink(store.path / "runs", store.path / "trash" / "out")
     assert trash.empty(store) == 3 and (store.path / "runs").is_dir(), "links in the trash lead nowhere"
@@ -110,12 +111,13 @@ def test_nothing_outside_of_the_store_is_thrown_away(store: Store, tmp_path: Pat
     os.rename(run.path / "logs", run.path / "kept")
     os.symlink(outside / "logs", run.path / "logs")
     with pytest.raises(DamagedFile):
-        trash.throw_away(store, run.path / "logs" / "j1")
+        trash.throw_away(store, [run.path / "logs" / "j1"])
     with pytest.raises(ValueError):
-        trash.throw_away(store, outside)
+        trash.throw_away(store, [outside])
+    (store.path / "trash").rmdir()
     os.symlink(outside, store.path / "trash")
     with pytest.raises(DamagedFile):
-        trash.throw_away(store, run.path)
+        trash.throw_away(store, [run.path])
     assert trash.empty(store) == 0 and (outside / "logs" / "j1" / "a").is_file()
 
 

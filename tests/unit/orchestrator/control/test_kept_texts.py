@@ -93,8 +93,9 @@ def test_a_text_stays_while_an_active_definition_or_a_job_that_has_not_ended_nam
     active, inactive, running, ended = digests
     with database.session() as session:
         for name, digest, status in (("active", active, "ACTIVE"), ("inactive", inactive, "INACTIVE")):
+            container = {**naming(digest), "command": ["sh", "-c", "cd $MUSTER_DIRECTORY"]}
             session.add(
-                JobDefinition(name=name, revision=1, document={"containerProperties": naming(digest)}, status=status)
+                JobDefinition(name=name, revision=1, document={"containerProperties": container}, status=status)
             )
         for name, digest, state in (("running", running, Status.RUNNING), ("ended", ended, Status.FAILED)):
             properties = {"nodeRangeProperties": [{"container": naming(digest)}]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ import pytest
 from sqlalchemy import select
 
 from orchestrator.control import retention as module
-from orchestrator.control.retention import Retention, RunNeeded
+from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
-from orchestrator.control.run_users import RunInUse, RunUsers
+from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY
 from orchestrator.persistence import references
 from orchestrator.persistence.models import (
@@ -45,9 +45,9 @@ def world(tmp_path: Path) -> Iterator[World]:
     world.database.close()
 
 
-def reasons(world: World, **options: Any) -> dict[str, str]:
+def reasons(world: World) -> dict[str, str]:
     """Of each run that is kept, why."""
-    looks, _ = world.retention().step(Place(), take=False, **options)
+    looks, _ = world.step(take=False)
     return {each["run"]: "; ".join(each["kept"]) for each in looks if each["kept"]}
 
 
@@ -70,7 +70,7 @@ def test_a_dry_run_tells_what_would_go_and_how_much_and_takes_nothing(world: Wor
     world.ended("old")
     world.ended("kept")
     contents.archive(world.store.run("kept"), "key a")
-    looks, following = world.retention().step(Place(), take=False)
+    looks, following = world.step(take=False)
     assert following is None and world.jobs() == ["kept", "old"] and world.runs() == ["kept", "old"]
     found = {each["run"]: each for each in looks}
     assert (found["old"]["jobs"], found["old"]["whole"], found["old"]["files"]) == (["old"], True, 3)
@@ -152,13 +152,13 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
     place: Place | None = Place()
     seen: list[str] = []
     while place is not None:
-        looks, place = world.retention().step(place, take=False, most=3)
+        looks, place = world.step(place, take=False, most=3)
         place = None if place is None else Place.of(str(place))
         seen += [each["run"] for each in looks]
     assert sorted(seen) == [f"j{number:02}" for number in range(17)]
     place = Place()
     while place is not None:
-        _, place = world.retention().step(place, take=True, most=3)
+        _, place = world.step(place, take=True, most=3)
     assert world.jobs() == world.runs() == [f"j{number:02}" for number in range(0, 17, 4)]
     counts = world.database.counts
     with world.database.session() as session:
@@ -237,9 +237,9 @@ def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
     world.ended("old")
     ending, throw = world.retention(), trash.throw_away
 
-    def late(store: Store, *paths: Path) -> list[Path]:
+    def late(store: Store, paths: Iterable[Path]) -> list[Path]:
         ending._is_closing.set()
-        return throw(store, *paths)
+        return throw(store, paths)
 
     with monkeypatch.context() as patched:
         patched.setattr(trash, "throw_away", late)
@@ -276,62 +276,6 @@ def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
     assert world.jobs() == ["old"]
 
 
-# -- races ---------------------------------------------------------------------------------------------------------------
-
-
-def test_a_run_that_a_request_uses_is_not_taken_and_one_that_is_taken_is_not_used(world: World) -> None:
-    world.ended("old")
-    with world.users.using("old"):
-        assert world.retention().take_all().jobs == 0
-        with pytest.raises(RunNeeded, match="used by another request"):
-            world.retention().delete("old")
-    version = world.users.version("old")
-    with world.retention().alone("old"):
-        with pytest.raises(RunInUse), world.users.using("old"):
-            pass
-        with pytest.raises(RunInUse):
-            world.users.check("old")
-        assert world.retention().take_all().jobs == 0
-    assert world.users.version("old") != version, "what was read before counts no more"
-    world.users.check("old")
-    world.beginning["old"] = object()
-    assert world.retention().take_all().jobs == 0
-    del world.beginning["old"]
-    assert world.retention().take_all().jobs == 1
-
-
-def test_a_job_that_is_submitted_between_look_and_take_keeps_its_run(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world.ended("old")
-    world.ended("other")
-    take = Retention._take
-
-    def late(self: Retention, runs: Any) -> Any:
-        assert sorted(runs) == ["old", "other"]
-        world.add(job("resumes", run="old", status="RUNNABLE"))
-        return take(self, runs)
-
-    monkeypatch.setattr(Retention, "_take", late)
-    world.retention().take_all()
-    assert world.jobs() == ["old", "resumes"] and world.runs() == ["old"]
-
-
-def test_a_job_that_begins_to_wait_for_one_that_is_being_taken_keeps_its_row(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world.ended("old")
-    throw = trash.throw_away
-
-    def late(store: Store, *paths: Path) -> list[Path]:
-        world.add(job("waits", status="PENDING"), Dependency(job_id="waits", on_id="old"))
-        return throw(store, *paths)
-
-    monkeypatch.setattr(trash, "throw_away", late)
-    world.retention().take_all()
-    assert world.jobs() == ["old", "waits"]
-
-
 # -- rules, owners, definitions -----------------------------------------------------------------------------------------
 
 
@@ -343,14 +287,17 @@ def test_rules_of_queues_and_of_the_controller(world: World) -> None:
         ("bad", {"muster:retention": "x"}),
     ):
         world.add(JobQueue(name=queue, compute_environments=["local"], tags=tags))
-    for queue in ("default", "short", "kept", "bad"):
+    # with a queue that was deleted its rule went, which may have been to keep its jobs
+    for queue in ("default", "short", "kept", "bad", "deleted"):
         world.ended(queue, queue=queue, stopped_at=day, from_yaml=True)
-    assert world.retention(default=inf).take_all().jobs == 1 and world.jobs() == ["bad", "default", "kept"]
+    assert world.retention(default=inf).take_all().jobs == 1 and world.jobs() == ["bad", "default", "deleted", "kept"]
     assert world.retention(default=2 * 86_400).take_all().jobs == 0
-    looks, _ = world.retention().step(Place(), take=True, older=A_DAY // 2)
+    looks, _ = world.step(take=True, default=A_DAY // 2)
     assert [each["jobs"] for each in looks] == [["default"]]
     world.ended("default", stopped_at=day, from_yaml=True)
-    assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "kept"]
+    assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "deleted", "kept"]
+    world.add(JobQueue(name="deleted", compute_environments=["local"], tags={"muster:retention": "0m"}))
+    assert world.retention().take_all().jobs == 1 and world.jobs() == ["bad", "kept"], "created again, with a rule"
 
 
 def test_a_switch_turns_it_off(world: World) -> None:
@@ -397,7 +344,7 @@ def test_a_key_with_some_queues_takes_only_what_is_its_own(world: World) -> None
     with world.database.session() as session:
         session.get_one(RunRecord, "shared").owner = "key a"
         session.get_one(RunRecord, "of-b").owner = "key b"
-    looks, _ = world.retention().step(Place(), take=True, whose=mine)
+    looks, _ = world.step(take=True, whose=mine)
     gone = sorted(name for each in looks for name in each["jobs"])
     assert gone == ["own", "shared"]
     assert world.runs() == ["elsewhere", "of-b", "others", "shared"]

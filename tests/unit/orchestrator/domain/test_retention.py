@@ -24,14 +24,14 @@ from orchestrator.domain.retention import (
 )
 
 NOW = 1_000 * A_DAY
-OLD = JobFacts("old", due_at=NOW - 1)
+OLD = JobFacts("old", is_due=True)
 RUN = RunFacts("r", logged=frozenset({"old"}))
 NOTHING = References()
 
 
 def test_an_old_run_that_holds_nothing_but_logs_goes_with_its_job() -> None:
-    assert decide(RUN, [OLD], NOTHING, NOW) == Decision(True, ("old",))
-    assert decide(None, [OLD], NOTHING, NOW) == Decision(False, ("old",)), "a job that never started"
+    assert decide(RUN, [OLD], NOTHING) == Decision(True, ("old",))
+    assert decide(None, [OLD], NOTHING) == Decision(False, ("old",)), "a job that never started"
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_nothing_of_a_run_goes_while_something_needs_it(
     facts: dict[str, Any], jobs: list[JobFacts], references: References, reason: str
 ) -> None:
     run = RunFacts(**{"name": "r", "logged": RUN.logged, **facts})
-    decision = decide(run, [OLD, *jobs], references, NOW)
+    decision = decide(run, [OLD, *jobs], references)
     assert (decision.run, decision.jobs) == (False, ())
     assert reason in " ".join(decision.reasons)
     assert list(decision.reasons) == still_needed(run, [OLD, *jobs], references)
@@ -61,50 +61,38 @@ def test_nothing_of_a_run_goes_while_something_needs_it(
     [
         ({"results": ("checkpoints", "a.csv", "b.csv", "c.csv")}, [], "it holds checkpoints, a.csv, b.csv, …"),
         ({"logged": frozenset({"old", "strange"})}, [], "logs of job strange"),
-        ({}, [JobFacts("young", due_at=NOW + 1)], "job young of it is kept longer"),
-        ({}, [JobFacts("kept", due_at=None)], "job kept of it is kept longer"),
+        ({}, [JobFacts("young")], "job young of it is kept longer"),
     ],
 )
 def test_old_jobs_go_without_their_run_where_that_holds_more(
     facts: dict[str, Any], jobs: list[JobFacts], reason: str
 ) -> None:
-    decision = decide(RunFacts(**{"name": "r", "logged": RUN.logged, **facts}), [OLD, *jobs], NOTHING, NOW)
+    decision = decide(RunFacts(**{"name": "r", "logged": RUN.logged, **facts}), [OLD, *jobs], NOTHING)
     assert (decision.run, decision.jobs) == (False, ("old",))
     assert reason in " ".join(decision.reasons)
 
 
 def test_who_may_not_see_everything_is_not_told_what_needs_a_run() -> None:
     references = References.of([Reference("run", "r", "run secret is a clone of it")], ["model hidden can't be read"])
-    for run in (RUN, RunFacts("r2", ("checkpoints",))):
+    for run in (RUN, RunFacts("r2", results=("checkpoints",))):
         [reason] = still_needed(run, [OLD], references.unnamed())
         assert "something" in reason and "secret" not in reason and "hidden" not in reason
 
 
 def test_of_a_run_of_which_no_job_is_due_nothing_is_told() -> None:
-    assert decide(RUN, [JobFacts("old", due_at=NOW + 1)], NOTHING, NOW) == Decision(False, ())
-    assert decide(RUN, [], NOTHING, NOW) == Decision(False, ()), "a run of another controller, or of a lost database"
+    assert decide(RUN, [JobFacts("old")], NOTHING) == Decision(False, ())
+    assert decide(RUN, [], NOTHING) == Decision(False, ()), "a run of another controller, or of a lost database"
 
 
-def test_a_rule_of_a_queue_goes_before_that_of_the_controller_which_goes_before_the_batch_api_s() -> None:
-    ended = NOW - 10 * A_DAY
-    rules = Rules(default=A_DAY, queues={"short": A_DAY // 2, "kept": None})
-    assert rules.due_at("short", True, ended) == ended + A_DAY // 2
-    assert rules.due_at("kept", False, ended) is None
-    assert rules.due_at("other", True, ended) == rules.due_at("other", False, ended) == ended + A_DAY
-    assert Rules().due_at("other", True, ended) is None, "a job from YAML is kept without a rule"
-    assert Rules().due_at("other", False, ended) == ended + BATCH_DAYS * A_DAY
-    assert Rules(batch=False).due_at("other", False, ended) is None
-    assert Rules().due_at("other", False, None) is None
-
-
-def test_without_a_rule_the_time_counts_from_the_upgrade_on_and_nothing_goes_in_the_first_days() -> None:
+def test_after_an_upgrade_nothing_goes_in_the_first_days_and_without_a_rule_nothing_that_ended_before_the_time_began() -> (
+    None
+):
     upgraded = NOW - 5 * A_DAY
     rules = Rules(since=upgraded)
-    assert rules.due_at("q", False, NOW - 400 * A_DAY) == upgraded + BATCH_DAYS * A_DAY
     assert rules.batch_limit(NOW) is None
     assert rules.is_trial(NOW) and not rules.is_trial(upgraded + 7 * A_DAY) and not Rules().is_trial(NOW)
-    later = upgraded + BATCH_DAYS * A_DAY
-    assert rules.batch_limit(later) == upgraded
+    assert rules.batch_limit(upgraded + BATCH_DAYS * A_DAY) == upgraded
+    assert Rules(batch=False).batch_limit(NOW) is None
 
 
 @pytest.mark.parametrize(
@@ -127,34 +115,20 @@ class World:
         self.draw = draw
         self.runs = {f"r{number}" for number in range(draw.randint(1, 6))}
         self.jobs = {
-            f"j{number}": (draw.choice(sorted(self.runs)), draw.choice(["open", "ended"]), draw.randint(0, 100) * A_DAY)
+            f"j{number}": (draw.choice(sorted(self.runs)), draw.choice(["open", "ended"]))
             for number in range(draw.randint(0, 12))
         }
-        self.from_yaml = {job: draw.random() < 0.5 for job in self.jobs}
-        self.queue = {job: draw.choice("abc") for job in self.jobs}
         self.results = {run for run in self.runs if draw.random() < 0.4}
         self.archived = {run for run in self.runs if draw.random() < 0.2}
         self.needed_runs = {run for run in self.runs if draw.random() < 0.3}
         self.needed_jobs = {job for job in self.jobs if draw.random() < 0.2}
         self.strange = {run for run in self.runs if draw.random() < 0.1}
 
-    def rules(self) -> Rules:
-        queues = {queue: self._age() for queue in "abc" if self.draw.random() < 0.5}
-        return Rules(
-            self._age(), queues, self.draw.choice([0, self.draw.randint(0, 1000) * A_DAY]), self.draw.random() < 0.5
-        )
-
-    def _age(self) -> int | None:
-        return self.draw.choice([None, self.draw.randint(0, 120) * A_DAY])
-
-    def jobs_of(self, run: str, rules: Rules) -> list[JobFacts]:
+    def jobs_of(self, run: str) -> list[JobFacts]:
+        """Any rule may let any of them go."""
         return [
-            JobFacts(
-                job,
-                state == "open",
-                rules.due_at(self.queue[job], self.from_yaml[job], None if state == "open" else ended),
-            )
-            for job, (of, state, ended) in self.jobs.items()
+            JobFacts(job, state == "open", self.draw.random() < 0.5)
+            for job, (of, state) in self.jobs.items()
             if of == run
         ]
 
@@ -168,33 +142,32 @@ class World:
 
     def must_stay(self) -> tuple[set[str], set[str]]:
         """Runs and jobs that no rule may take, by another road than the product's."""
-        open_runs = {of for of, state, _ in self.jobs.values() if state == "open"}
+        open_runs = {of for of, state in self.jobs.values() if state == "open"}
         cited = {self.jobs[job][0] for job in self.needed_jobs & self.jobs.keys()}
         whole = (self.archived | self.needed_runs | open_runs | cited) & self.runs
-        jobs = {job for job, (of, state, _) in self.jobs.items() if of in whole or state == "open"}
+        jobs = {job for job, (of, state) in self.jobs.items() if of in whole or state == "open"}
         return whole | (self.runs & (self.results | self.strange)), jobs | (self.needed_jobs & self.jobs.keys())
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.randoms(use_true_random=False))
-def test_whatever_the_sequence_of_rules_nothing_that_is_needed_is_taken(draw: random.Random) -> None:
+def test_whatever_rules_let_go_nothing_that_is_needed_is_taken(draw: random.Random) -> None:
     world = World(draw)
     runs, jobs = world.must_stay()
     for _ in range(6):
-        rules, moment = world.rules(), draw.randint(0, 1200) * A_DAY
         for run in draw.sample(sorted(world.runs), len(world.runs)):
-            of_run = world.jobs_of(run, rules)
+            of_run = world.jobs_of(run)
             logged = {each.id for each in of_run} | ({"strange"} if run in world.strange else set())
             facts = RunFacts(
                 run,
-                ("checkpoints",) if run in world.results else (),
-                frozenset(logged),
-                "by key a" if run in world.archived else None,
+                results=("checkpoints",) if run in world.results else (),
+                logged=frozenset(logged),
+                archived="by key a" if run in world.archived else None,
             )
-            decision = decide(facts, of_run, world.references(), moment)
+            decision = decide(facts, of_run, world.references())
             left = {each.id for each in of_run} - set(decision.jobs)
             assert not (decision.run and left), "a run never goes without all of its jobs"
-            assert all(each.due_at is not None and each.due_at <= moment for each in of_run if each.id in decision.jobs)
+            assert set(decision.jobs) <= {each.id for each in of_run if each.is_due}
             for job in decision.jobs:
                 del world.jobs[job]
             if decision.run:
