@@ -52,7 +52,7 @@ class _Job:
 
     view: LogView
     logs: JobLogs | None = None
-    """None: it is not followed yet, or not any more."""
+    """None before it is followed."""
     following: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     streams: dict[Key, Stream] = field(default_factory=dict)
     """Those of its logs that are asked for."""
@@ -200,7 +200,7 @@ async def messages(
     """The session as event-stream messages, until ``closing``, or three hours are over.
 
     Args:
-        tail: The session, which has begun already: the client may write as soon as it sees the first message.
+        tail: The session, whose block runs. It was made before: the client may write as soon as it sees the first message.
         start: The request, which ``sessionStart`` repeats.
         account: Of the log groups.
         closing: Set when the server ends.
