@@ -25,7 +25,9 @@ def throw_away(store: Store, paths: Iterable[Path]) -> list[Path]:
 
     Raises:
         DamagedFile: A directory on the way is a link, which leads out of the store.
-        OSError: The volume can't be written, or is gone. Of the directories, some may be in the trash.
+        OSError: The volume can't be written, or is gone.
+
+    After an error, some of the directories may be in the trash.
     """
     trash = store.path / "trash"
     refuse_links(trash, 1)
