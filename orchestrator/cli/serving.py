@@ -264,9 +264,10 @@ def controller(store: str | None, cpus: float | None, engines: Sequence[str] = (
     with contextlib.ExitStack() as stack:
 
         def connect() -> Client:
+            was_temporary = is_temporary()  # it may go as soon as it was found
             client = stack.enter_context(_controller(store, cpus, engines))
             # a service comes back by itself, with its own options; none of this command's may take its place
-            client.successor = connect if is_temporary() else None
+            client.successor = connect if was_temporary or is_temporary() else None
             return client
 
         yield connect
@@ -295,20 +296,22 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
     """A client of the controller that serves this home directory, or of a new one in this process."""
     url = os.environ.get("MUSTER_URL") or local_url()
     if url:
-        try:
-            with Client.connect(serving=True) as client:
+        with contextlib.ExitStack() as stack:
+            try:
+                client = stack.enter_context(Client.connect(serving=True))
                 there = client.get("/api/capacity")["store"]
+            except NotServing:
+                raise
+            except Unreachable:
+                if os.environ.get("MUSTER_URL"):
+                    raise
+            else:
                 if store is not None and str(Path(store).expanduser().absolute()) != there:
                     raise ServerError(
                         f"--store {store}: the controller at {url} keeps {there}; leave --store out, or stop it"
                     )
                 yield client
-            return
-        except NotServing:
-            raise
-        except Unreachable:
-            if os.environ.get("MUSTER_URL"):
-                raise
+                return
     from orchestrator.server import Server
 
     try:

@@ -72,7 +72,7 @@ def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_
         gc.collect()
         return [each for each in gc.get_objects() if isinstance(each, State | Handle) and id(each) not in before]
 
-    wait_for(lambda: not kept() and not attempts._memories, 10, "that nothing is kept")
+    wait_for(lambda: not kept() and not attempts._open, 10, "that nothing is kept")
 
 
 def test_series_of_a_queue_end_with_it(bench: Bench) -> None:
