@@ -105,6 +105,7 @@ def test_a_session_that_is_closed_while_it_takes_up_a_job_does_not_follow_it(
     with tail:
         world.begin("new")
         monkeypatch.setattr(live_tail, "newest_streams", slow)
+        tail.wake()
         thread = threading.Thread(target=tail.poll, daemon=True)
         thread.start()
         assert is_asking.wait(60)
