@@ -22,7 +22,7 @@ T = TypeVar("T")
 _IDLE = 60.0
 """Seconds after which a thread of a pool ends that has nothing to do."""
 _AS_PYTHON = gc.get_threshold()
-_GARBAGE = 50_000
+_GARBAGE = 20_000
 """Objects, some MB, that may be garbage before it is looked for."""
 
 
@@ -32,7 +32,7 @@ def collect_seldom() -> None:
     """
     gc.collect()
     gc.freeze()
-    gc.set_threshold(_GARBAGE, 20, 50)
+    gc.set_threshold(_GARBAGE, 5, 3)
 
 
 def collect_all() -> None:

@@ -62,7 +62,11 @@ class LoadedJobs:
     def keep(self, ids: Collection[str]) -> None:
         """Forget all but these jobs."""
         for job_id in self._jobs.keys() - ids:
-            del self._jobs[job_id]
+            job = self._jobs.pop(job_id)
+            if self._session is not None and job in self._session:
+                self._session.expire(
+                    job
+                )  # it and its attempts refer to one another: so they go at once, without a search for garbage
 
     def forget(self) -> None:
         """Read everything anew."""
