@@ -81,10 +81,16 @@ def test_a_prefix_without_a_group_stays_in_the_usual_one(batch: Batch, logs: Any
     assert messages(logs.get_log_events(logGroupName=GROUP, logStreamName=name)) == ["here"]
 
 
-def test_nodes_of_different_groups_and_a_job_grown_by_an_override(batch: Batch, logs: Any, own: str) -> None:
+def test_nodes_of_different_groups_and_a_job_grown_by_an_override(
+    batch: Batch, logs: Any, own: str, tmp_path: Path
+) -> None:
+    said = "echo node $AWS_BATCH_JOB_NODE_INDEX"
+    last = f"until [ -e {tmp_path}/1 ] && [ -e {tmp_path}/2 ]; do sleep 0.1; done; {said}"  # its end ends the others
+
     def part(target: str, group: str | None) -> dict[str, Any]:
         changes = {"container": {"logConfiguration": logging_to(group)} if group else {}}
-        return {"targetNodes": target, "container": container("echo node $AWS_BATCH_JOB_NODE_INDEX", changes)}
+        command = f"{said}; touch {tmp_path}/$AWS_BATCH_JOB_NODE_INDEX" if group else last
+        return {"targetNodes": target, "container": container(command, changes)}
 
     definition = batch.multinode("split", "", nodes=2, ranges=[part("0", None), part("1:", own)])
     job = batch.submit(definition, nodeOverrides={"numNodes": 3})
