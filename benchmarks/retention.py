@@ -12,30 +12,21 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
-import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import quantiles
 
 from sqlalchemy import func, insert, select
 
+from benchmarks.kept import resident
 from benchmarks.load import Watch, add_option
-from benchmarks.scale import Bench, ShortEngine, large
-from orchestrator.control.bus import Bus
-from orchestrator.control.compute_environments import ensure_compute_environments
-from orchestrator.control.peers import Peers
-from orchestrator.control.reconciler import Reconciler
+from benchmarks.scale import Bench, ShortEngine, controller, large
+from orchestrator.control.run_store import RunStore
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.api import Gang, Handle, Plan
-from orchestrator.engines.registry import EngineSet
-from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.persistence.models import Attempt, Job, Node, RunRecord
-from orchestrator.persistence.session import Database
 from shared_store.layout import Store
 
 _TABLES = (Job, Attempt, Node, RunRecord)
@@ -75,34 +66,15 @@ class Size:
         return f"{self.jobs:7,} jobs {self.rows:7,} rows {self.files:7,} files {database:7.1f} MiB database {memory:5.0f} MiB memory"
 
 
-@contextmanager
-def controller(home: Path, watch: Watch) -> Iterator[Bench[FakeEngine]]:
-    """A controller that runs, and takes jobs as soon as they have ended."""
-    with ExitStack() as stack:
-        (home / "store").mkdir()
-        engine = LoggingEngine(capacity=large(2000))
-        store, engines = Store(home / "store").open(), EngineSet([engine])
-        stack.callback(engines.close)
-        database = Database.at(home)
-        stack.callback(database.close)
-        with database.session() as session:
-            ensure_compute_environments(session, engines.names)
-        reconciler = Reconciler(database, engines, store, Bus(home), Peers(store, home), retention=0.0)
-        stack.callback(reconciler.close)
-        reconciler.start()
-        yield Bench(reconciler, database, engine, watch)
-
-
-def size(bench: Bench[FakeEngine], home: Path) -> Size:
+def size(bench: Bench[LoggingEngine]) -> Size:
     with bench.database.session() as session:
         counts = [session.scalar(select(func.count()).select_from(table)) or 0 for table in _TABLES]
-    database = sum(path.stat().st_size for path in home.glob("muster.db*"))
-    files = sum(len(names) for _, _, names in os.walk(home / "store"))
-    memory = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    return Size(counts[0], sum(counts), files, database, memory)
+    database = sum(path.stat().st_size for path in bench.home.glob("muster.db*"))
+    files = sum(len(names) for _, _, names in os.walk(bench.home / "store"))
+    return Size(counts[0], sum(counts), files, database, 1024 * resident())
 
 
-def rounds(bench: Bench[FakeEngine], home: Path, jobs: int, count: int, takes: bool = True) -> list[Size]:
+def rounds(bench: Bench[LoggingEngine], jobs: int, count: int, takes: bool = True) -> list[Size]:
     """Jobs through the controller, in so many rounds; what there is after each, and after the last pass."""
     found: list[Size] = []
     loop: list[float] = []
@@ -121,7 +93,7 @@ def rounds(bench: Bench[FakeEngine], home: Path, jobs: int, count: int, takes: b
             bench.reconciler.retention.take_all()
 
     taking = threading.Thread(target=passes, daemon=True)
-    trash = home / "store" / "trash"
+    trash = bench.home / "store" / "trash"
     if takes:
         taking.start()
     for number in range(count):
@@ -136,7 +108,7 @@ def rounds(bench: Bench[FakeEngine], home: Path, jobs: int, count: int, takes: b
             )
         left = time.monotonic() - began - seconds
         forget_ended(bench)
-        found.append(size(bench, home))
+        found.append(size(bench))
         slowest = quantiles(loop, n=100)[98] if len(loop) > 1 else 0.0
         print(
             f"{(number + 1) * each:7,} through: {found[-1]}; {each / seconds:4.0f} jobs/s, the last taken {left:4.1f} s later, {time.process_time() - used:5.1f} s of CPU, "
@@ -149,8 +121,8 @@ def rounds(bench: Bench[FakeEngine], home: Path, jobs: int, count: int, takes: b
     return found
 
 
-def rows_alone(bench: Bench[FakeEngine], home: Path, jobs: int, count: int) -> list[Size]:
-    """Rows of ended jobs, in so many portions, each of which is taken at once."""
+def rows_alone(bench: Bench[LoggingEngine], jobs: int, count: int) -> list[Size]:
+    """Insert rows of ended jobs in ``count`` portions; retention takes each portion before the next one."""
     found, each = [], jobs // count
     for number in range(count):
         names = [f"row-{index:07d}" for index in range(number * each, (number + 1) * each)]
@@ -171,12 +143,12 @@ def rows_alone(bench: Bench[FakeEngine], home: Path, jobs: int, count: int) -> l
         used = time.process_time()
         bench.reconciler.retention.take_all()
         milliseconds = 1000 * (time.process_time() - used) / each
-        found.append(size(bench, home))
+        found.append(size(bench))
         print(f"{(number + 1) * each:7,} through: {found[-1]}; {milliseconds:.2f} ms of CPU a job", flush=True)
     return found
 
 
-def forget_ended(bench: Bench[FakeEngine]) -> None:
+def forget_ended(bench: Bench[LoggingEngine]) -> None:
     """The fake cluster keeps every gang that it had."""
     with suppress(RuntimeError):
         bench.engine.cluster.gangs.clear()
@@ -192,11 +164,11 @@ def main() -> None:
     add_option(parser)
     options = parser.parse_args()
     watch = Watch(options.loaded_anyway)
-    with tempfile.TemporaryDirectory() as folder, controller(Path(folder), watch) as bench:
+    with controller(LoggingEngine(capacity=large(2000)), RunStore, watch, retention=0.0) as bench:
         if options.rows:
-            rows_alone(bench, Path(folder), options.jobs, options.rounds)
+            rows_alone(bench, options.jobs, options.rounds)
         else:
-            rounds(bench, Path(folder), options.jobs, options.rounds, not options.off)
+            rounds(bench, options.jobs, options.rounds, not options.off)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from orchestrator.engines.api import Engine, Gang, Handle, Plan, Traits
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.models import Job, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 from shared_store.epoch import Claim
@@ -104,6 +104,7 @@ class ShortEngine(FakeEngine):
 class Bench(Generic[E]):
     """A controller, and what it works with."""
 
+    home: Path
     reconciler: Reconciler
     database: Database
     engine: E
@@ -143,7 +144,7 @@ class Bench(Generic[E]):
             status=Status.RUNNABLE,
             own_node_properties=document,
             attempts_allowed=attempts,
-            queued_since=self_now(),
+            queued_since=now(),
         )
 
     def have(self, count: int, *states: str) -> bool:
@@ -166,14 +167,11 @@ class Bench(Generic[E]):
         return (time.process_time() - used) / (time.monotonic() - began)
 
 
-def self_now() -> int:
-    """Steady time [ms], as good as the controller's own."""
-    return int(time.time() * 1000)
-
-
 @contextmanager
-def controller(engine: E, store_type: type[RunStore], watch: Watch) -> Iterator[Bench[E]]:
-    """A controller that runs, on a database in a folder of its own."""
+def controller(
+    engine: E, store_type: type[RunStore], watch: Watch, retention: float | None = None
+) -> Iterator[Bench[E]]:
+    """A controller that runs, on a database in a folder of its own; ``retention``: seconds for which jobs are kept."""
     MemoryStore.epochs.clear()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         home = Path(folder)
@@ -189,10 +187,11 @@ def controller(engine: E, store_type: type[RunStore], watch: Watch) -> Iterator[
         if isinstance(engine, LocalEngine):
             bus.open()
             stack.callback(bus.close)
-        reconciler = Reconciler(database, engines, store, bus, peers, runs=store_type(store, peers))
+        runs = store_type(store, peers)
+        reconciler = Reconciler(database, engines, store, bus, peers, runs=runs, retention=retention)
         stack.callback(reconciler.close)
         reconciler.start()
-        yield Bench(reconciler, database, engine, watch)
+        yield Bench(home, reconciler, database, engine, watch)
 
 
 def is_stopped(engine: FakeEngine, gang: str) -> bool:

@@ -27,9 +27,7 @@ _GARBAGE = 20_000
 
 
 def collect_seldom() -> None:
-    """Look for cyclic garbage seldom, and not in what is loaded now: else that takes a third of the controller's time at 10,000 jobs, and
-    holds up requests.
-    """
+    """Look for cyclic garbage seldom, and not in what is loaded now: a search through all that holds up requests."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(_GARBAGE, 5, 3)
