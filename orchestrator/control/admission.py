@@ -12,7 +12,7 @@ from orchestrator import machine
 from orchestrator.control.attempts import Attempts, Steps
 from orchestrator.control.clock import Clock
 from orchestrator.control.disk import Disk
-from orchestrator.control.isolation import AT_ONCE, Isolation
+from orchestrator.control.isolation import Isolation
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.snapshot import holding_of, take_snapshot
@@ -109,8 +109,7 @@ class Admission:
 
     def _do(self, what: str, bodies: Mapping[str, Callable[[Session, Job], Steps | None]]) -> None:
         due = [job_id for job_id in bodies if not self._backoff.waits((what, job_id))]
-        for start in range(0, len(due), AT_ONCE):
-            self._isolation.jobs(what, due[start : start + AT_ONCE], lambda session, job: bodies[job.id](session, job))
+        self._isolation.jobs(what, due, lambda session, job: bodies[job.id](session, job))
 
     @staticmethod
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:

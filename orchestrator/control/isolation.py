@@ -18,7 +18,7 @@ from orchestrator.persistence.columns import storable
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 
-AT_ONCE = 200
+_AT_ONCE = 200
 """Jobs that share their commits, at most: one that fails has all of them done again, each by itself."""
 
 log = logging.getLogger("muster.controller")
@@ -51,11 +51,15 @@ class Isolation:
             self.backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
     def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
-        """Do something to these jobs, with commits that they share; where that fails, to each by itself. Returns those for which it failed.
+        """Do something to these jobs, with commits that some share; where that fails, to each by itself. Returns those for which it failed.
 
         They are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
         """
+        portions = (ids[start : start + _AT_ONCE] for start in range(0, len(ids), _AT_ONCE))
+        return [failed for portion in portions for failed in self._together(what, portion, body)]
+
+    def _together(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
         self._heartbeat.beat()
         try:
             with self._loaded.session() as session:
@@ -67,7 +71,7 @@ class Isolation:
             raise
         except Exception as error:
             if len(ids) > 1:
-                return [failed for job_id in ids for failed in self.jobs(what, [job_id], body)]
+                return [failed for job_id in ids for failed in self._together(what, [job_id], body)]
             self._failed(what, ids[0], error)
             return ids
         for job_id in ids:

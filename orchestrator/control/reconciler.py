@@ -20,7 +20,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.heartbeat import Heartbeat
-from orchestrator.control.isolation import AT_ONCE, Isolation
+from orchestrator.control.isolation import Isolation
 from orchestrator.control.kept_texts import KeptTexts
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.log_hub import LogHub
@@ -238,8 +238,7 @@ class Reconciler:
         self.work_queue.look_again(job_id for job_id in taken if self._backoff.waits(("settle", job_id)))
         if due and len(taken) == _SETTLED_A_TICK:
             self.wake()  # the rest comes after a look at the gangs that run
-        for start in range(0, len(due), AT_ONCE):
-            self.work_queue.look_again(self._isolation.jobs("settle", due[start : start + AT_ONCE], self._settle))
+        self.work_queue.look_again(self._isolation.jobs("settle", due, self._settle))
         if self._kept_version != self.work_queue.version:
             self._kept_version = self.work_queue.version
             self._loaded.keep(self.work_queue.active())
@@ -253,8 +252,7 @@ class Reconciler:
         active = self.work_queue.take_active(machine.monotonic())
         try:
             due = [job_id for job_id in active if not self._backoff.waits(("advance", job_id))]
-            for start in range(0, len(due), AT_ONCE):
-                self._isolation.jobs("advance", due[start : start + AT_ONCE], self._advance)
+            self._isolation.jobs("advance", due, self._advance)
         finally:
             for job_id in active:
                 self.work_queue.later(job_id, machine.monotonic() + _SOON)

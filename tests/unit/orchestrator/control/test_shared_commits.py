@@ -74,7 +74,7 @@ def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, m
     names = ["one", "two", "three"]
     bench.submit(*names, queue="urgent", share="team", node_properties=properties(1))
     ticks(bench, are(bench, Status.RUNNING, *names))
-    jobs, again, depth = Isolation.jobs, list[Sequence[str]](), [0]
+    jobs, again, depth = Isolation._together, list[Sequence[str]](), [0]
 
     def noted(self: Isolation, what: str, ids: Sequence[str], body: Any) -> Sequence[str]:
         if depth[0]:
@@ -85,7 +85,7 @@ def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, m
         finally:
             depth[0] -= 1
 
-    monkeypatch.setattr(Isolation, "jobs", noted)
+    monkeypatch.setattr(Isolation, "_together", noted)
     for name in names:
         bench.engine.cluster.end(f"{name}/1/1", 0, 0)
     ticks(bench, are(bench, Status.SUCCEEDED, *names))
