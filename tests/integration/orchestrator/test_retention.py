@@ -15,6 +15,7 @@ from benchmarks import retention as benchmark
 from benchmarks.load import Watch
 from orchestrator.client import Client
 from orchestrator.control.retention import RunNeeded
+from orchestrator.control.run_store import RunStore
 from orchestrator.domain.errors import ApiError
 from orchestrator.keys import KeyStore
 from orchestrator.server import Server
@@ -157,9 +158,10 @@ def test_a_run_is_archived_and_deleted_by_its_owner_and_keys_with_all_queues_alo
             each.close()
 
 
-def test_store_and_database_stay_as_large_as_they_are_while_jobs_go_through(tmp_path: Path) -> None:
-    with benchmark.controller(tmp_path, Watch(loaded_anyway=True)) as bench:
-        sizes = benchmark.rounds(bench, tmp_path, jobs=160, count=4)
+def test_store_and_database_stay_as_large_as_they_are_while_jobs_go_through() -> None:
+    engine = benchmark.LoggingEngine(capacity=benchmark.large(2000))
+    with benchmark.controller(engine, RunStore, Watch(loaded_anyway=True), retention=0.0) as bench:
+        sizes = benchmark.rounds(bench, jobs=160, count=4)
     assert [(each.jobs, each.rows) for each in sizes] == [(0, 0)] * 4
     assert len({each.files for each in sizes}) == 1, sizes
     assert sizes[-1].database == sizes[1].database, sizes
