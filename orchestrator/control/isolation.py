@@ -18,8 +18,8 @@ from orchestrator.persistence.columns import storable
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 
-_AT_ONCE = 200
-"""Jobs that share their commits, at most: one that fails has all of them done again, each by itself."""
+_AT_ONCE = 1000
+"""Jobs that share their commits, at most: one that fails has all of them done again, half of them at a time."""
 
 log = logging.getLogger("muster.controller")
 
@@ -51,7 +51,7 @@ class Isolation:
             self.backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
     def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
-        """Do something to these jobs, with commits that some share; where that fails, to each by itself. Returns those for which it failed.
+        """Do something to these jobs, with commits that some share; where that fails, to fewer at a time. Returns those for which it failed.
 
         They are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
@@ -71,7 +71,8 @@ class Isolation:
             raise
         except Exception as error:
             if len(ids) > 1:
-                return [failed for job_id in ids for failed in self._together(what, [job_id], body)]
+                halves = ids[: len(ids) // 2], ids[len(ids) // 2 :]
+                return [failed for half in halves for failed in self._together(what, half, body)]
             self._failed(what, ids[0], error)
             return ids
         for job_id in ids:

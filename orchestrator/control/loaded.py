@@ -64,9 +64,8 @@ class LoadedJobs:
         for job_id in self._jobs.keys() - ids:
             job = self._jobs.pop(job_id)
             if self._session is not None and job in self._session:
-                self._session.expire(
-                    job
-                )  # it and its attempts refer to one another: so they go at once, without a search for garbage
+                # it and its attempts refer to one another: so they go at once, without a search for garbage
+                self._session.expire(job, ["attempts"])
 
     def forget(self) -> None:
         """Read everything anew."""

@@ -30,6 +30,8 @@ _MEMORY = 32 << 20
 """Bytes that all tails together keep, with what came too early, whatever their number."""
 _LOOK, _LOOK_SELDOM = 0.05, 1.0
 """Seconds between two looks at the files of a job whose nodes do not push: after a change, and at last while looks find nothing."""
+_OF_SILENCE = 0.1
+"""In between, the part of the time since a look has found something: a line comes late by a tenth of the silence before it."""
 _SHARE = 0.005
 """Seconds between two looks, for each job that is looked at: all of them together are looked at 200 times a second."""
 _AGAIN = 1.0
@@ -38,7 +40,7 @@ _ROWS = 10.0
 """Seconds after which the rows of all followed jobs are read, whether a commit has told of a change or not."""
 _TICK = 1.0
 """Seconds between two rounds in which nothing happens."""
-_ASK, _ASK_SELDOM = 2.0, LOG_LEASE / 2
+_ASK, _ASK_SELDOM = 0.5, LOG_LEASE / 2
 """Seconds after which nodes are asked again to push that do not, at first and at last; the second also for those that do."""
 
 log = logging.getLogger("muster.controller")
@@ -95,8 +97,10 @@ class _Followed:
         """Whether a look is under way."""
         self.looked = float("-inf")
         """When the last look ended [s]."""
+        self.found = machine.monotonic()
+        """When a look has found something, or the last attempt has begun [s]."""
         self.pause = 0.0
-        """Seconds from then to the next one."""
+        """Seconds from the last look to the next one."""
         self.next_ask = 0.0
         self.asking = _ASK
 
@@ -252,7 +256,7 @@ class LogHub:
             status, attempt, nodes = found.get(job, (Status.FAILED, None, 0))
             is_over = status.is_terminal
             if each.logs.note(attempt, nodes) or is_over:
-                each.next_ask, each.pause, each.asking = 0.0, 0.0, _ASK
+                each.next_ask, each.pause, each.asking, each.found = 0.0, 0.0, _ASK, machine.monotonic()
                 each.logs.is_over = is_over
                 each.wake()
 
@@ -266,10 +270,11 @@ class LogHub:
         def look() -> None:
             pause = _AGAIN
             try:
-                is_new = each.logs.look()
-                pause = _LOOK if is_new else min(max(_LOOK, 2 * each.pause), _LOOK_SELDOM)
+                is_new, now = each.logs.look(), machine.monotonic()
                 if is_new:
+                    each.found = now
                     each.wake()
+                pause = min(max(_LOOK, _OF_SILENCE * (now - each.found)), _LOOK_SELDOM)
             except OSError:
                 pass
             finally:

@@ -184,7 +184,7 @@ def step(state: State, event: Event) -> Instructions:
         case Phase.LAUNCHING, Due():
             return (Launch(again=state.verdict is None and state.stop_reason is None),)
         case Phase.LAUNCHING, Launched(handle):
-            return Keep(handle), Save(), Observe()
+            return Keep(handle), Observe()
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
             return (WindUp(),)
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
@@ -251,7 +251,7 @@ def _judge(state: State, seen: Observed) -> Instructions:
     if verdict is None and state.stop_reason is not None:
         verdict = Verdict(Ending.STOPPED, state.stop_reason)
     verdict = verdict or _by_silence(state.terms, seen) or _by_time(state, seen.moment)
-    return waits if verdict is None else (*waits, Decide(verdict), Save())
+    return waits if verdict is None else (*waits, Decide(verdict))
 
 
 def _end(state: State, seen: Observed) -> Instructions:
@@ -263,9 +263,9 @@ def _end(state: State, seen: Observed) -> Instructions:
     if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
         since = seen.moment if state.done_since is None else state.done_since
         if seen.moment - since < FINISHING:
-            return explained, AwaitChildren(since)
+            return explained, Save(), AwaitChildren(since)
     is_broken = verdict.ending in (Ending.FAILED, Ending.FATAL)
-    return explained, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
+    return explained, Save(), Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
 
 
 def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:

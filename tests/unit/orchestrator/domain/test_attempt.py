@@ -110,7 +110,12 @@ def ends(verdict: Verdict, grace: float = 35.0, first: Instruction = SAYS_SO) ->
 
 
 def decided(verdict: Verdict, grace: float = 35.0) -> list[Instruction]:
-    return [Decide(verdict), Save(), ending_so(verdict.reason), Stop(grace)]
+    return [Decide(verdict), *stops(grace, verdict.reason)]
+
+
+def stops(grace: float = 35.0, why: str = "why") -> list[Instruction]:
+    """The end is saved before the gang is stopped."""
+    return [ending_so(why), Save(), Stop(grace)]
 
 
 def ending_so(reason: str = "why") -> Instruction:
@@ -142,7 +147,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         LaunchDelayed("pulling the image", False),
         [WindUp()],
     ),
-    "a handle is saved at once": (LAUNCHING, Launched("handle"), [Keep("handle"), Save(), Observe()]),
+    "a handle is saved with what the first look finds": (LAUNCHING, Launched("handle"), [Keep("handle"), Observe()]),
     "a launch that waits says why": (LAUNCHING, LaunchDelayed("no room", False), [Explain("no room")]),
     "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
     "one that is not needed is given up": (asked(LAUNCHING), LaunchDelayed("full", False), [Decide(STOPPED), WindUp()]),
@@ -240,7 +245,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "nor an end that is decided": (
         ending(Ending.PREEMPTED),
         seen(unread="the store is away"),
-        [ending_so(), Stop(35.0)],
+        stops(),
     ),
     "an engine that does not answer is named": (
         RUNNING,
@@ -256,33 +261,33 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "also before its launch": (LAUNCHING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     "not twice": (ending(Ending.FAILED), Preempted("for b"), []),
     # -- how it is ended
-    "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), [ending_so(), Stop(5.0)]),
-    "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), [ending_so(), Stop(35.0)]),
+    "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), stops(5.0)),
+    "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), stops()),
     "one that never ran is stopped, too": (
         ending(Ending.PREEMPTED, of=STARTING),
         seen(waits="queued"),
-        [Explain("queued"), ending_so(), Stop(35.0)],
+        [Explain("queued"), *stops()],
     ),
     "children of a main node that is done may end": (
         RUNNING,
         seen(end(0), None),
-        [SAYS_SO, Decide(DONE), Save(), ending_so(DONE.reason), AwaitChildren(T)],
+        [SAYS_SO, Decide(DONE), ending_so(DONE.reason), Save(), AwaitChildren(T)],
     ),
     "for a while": (
         replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING + 1),
         seen(end(0), None),
-        [ending_so(), AwaitChildren(T - FINISHING + 1)],
+        [ending_so(), Save(), AwaitChildren(T - FINISHING + 1)],
     ),
     "and no longer": (
         replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING),
         seen(end(0), None),
-        [ending_so(), Stop(35.0)],
+        stops(),
     ),
-    "on AWS not at all": (on_aws(ending(Ending.SUCCEEDED)), seen(end(0), None), [ending_so(), Stop(35.0)]),
+    "on AWS not at all": (on_aws(ending(Ending.SUCCEEDED)), seen(end(0), None), stops()),
     "an old picture is named": (
         ending(Ending.FAILED),
         seen(stale="Slurm to answer"),
-        [Explain("why; waits for Slurm to answer"), Stop(5.0)],
+        [Explain("why; waits for Slurm to answer"), Save(), Stop(5.0)],
     ),
     "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [Explain("not allowed")]),
     "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [Explain("the store is away")]),
