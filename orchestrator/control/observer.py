@@ -53,8 +53,7 @@ class Observer:
         status = self._engine.observe(attempt.handle)
         if status is None:
             return None  # the engine's first look is under way
-        silences = [self._silence(attempt, *each) for each in zip(attempt.nodes, status, strict=True)]
-        self._of(attempt).is_silent = any(silences)
+        silences = self._silences((job.id, attempt.number), attempt.handle, status)
         known = self.know_outcomes(job, attempt, status, silences)
         ends = self.ends(job, attempt, status)
         head, away = status[job.gang.main], (node.words for node in status if node.phase is NodePhase.UNREACHABLE)
@@ -74,15 +73,20 @@ class Observer:
         """Whether a node of the attempt was silent at the last look."""
         return key in self._seen and self._seen[key].is_silent
 
-    def _silence(self, attempt: Attempt, node: Node, status: NodeStatus) -> Silence | None:
-        """The silence of a node, by what its engine and the store say of it; None for one that has ended."""
-        if not status.running or self._bus.endpoint is None:
-            return None
-        assert attempt.handle is not None
-        checked, asked = self._of(attempt).checked, self._engine.asked(attempt.handle)
-        asked = None if asked is None or checked is None else max(asked, machine.monotonic() - checked)
-        runs = status.phase is not NodePhase.UNREACHABLE and not status.stale
-        return self._bus.presence.silence((attempt.job_id, attempt.number, node.index), asked, runs)
+    def _silences(self, key: Key, handle: str, status: GangStatus) -> Sequence[Silence | None]:
+        """The silence of each node, by what the engine and the store say of it; None for one that has ended."""
+        seen, asked = self._of(key), self._engine.asked(handle)
+        asked = None if asked is None or seen.checked is None else max(asked, machine.monotonic() - seen.checked)
+
+        def silence(index: int, node: NodeStatus) -> Silence | None:
+            if not node.running or self._bus.endpoint is None:
+                return None
+            runs = node.phase is not NodePhase.UNREACHABLE and not node.stale
+            return self._bus.presence.silence((*key, index), asked, runs)
+
+        silences = [silence(*each) for each in enumerate(status)]
+        seen.is_silent = any(silences)
+        return silences
 
     def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus, silences: Sequence[Silence | None]) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
@@ -96,7 +100,8 @@ class Observer:
         Returns:
             Whether those of the nodes that have ended are known.
         """
-        memory, moment = self._of(attempt), machine.monotonic()
+        key = job.id, attempt.number
+        memory, moment = self._of(key), machine.monotonic()
         ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
         hidden = [
             index
@@ -108,10 +113,8 @@ class Observer:
         if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < CHECK_INTERVAL)):
             return True
         missing = {index for index in range(len(status)) if memory.outcomes.get(index) is None}
-        reading = partial(
-            self._read, job.run, attempt.epoch, (job.id, attempt.number), [*ended, *hidden], frozenset(missing)
-        )
-        found = self._errands.result((job.id, attempt.number), "outcomes", lambda: (moment, ended, *reading()))
+        reading = partial(self._read, job.run, attempt.epoch, key, [*ended, *hidden], frozenset(missing))
+        found = self._errands.result(key, "outcomes", lambda: (moment, ended, *reading()))
         if found is None:
             return not ended
         # of the call that has returned: a node that has ended since may have left its outcome after it was looked for
@@ -132,27 +135,29 @@ class Observer:
 
     def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node, None while it is not known; noted in the attempt's record with the other facts about its nodes."""
-        outcomes, ends = self._of(attempt).outcomes, list[NodeEnd | None]()
-        for record, node in zip(attempt.nodes, status, strict=True):
-            end, key = None, (job.id, attempt.number, record.index)
-            outcome = outcomes.get(record.index)
-            if outcome is not None or (not node.running and record.index in outcomes):
+        key = job.id, attempt.number
+        outcomes, ends = self._of(key).outcomes, list[NodeEnd | None]()
+        for index, (record, node) in enumerate(zip(attempt.nodes, status, strict=True)):
+            end, outcome = None, outcomes.get(index)
+            if outcome is not None or (not node.running and index in outcomes):
                 end, stopped = node_end(outcome, node, job.gang.options.is_native, now())
                 _note(record, exit_code=end.exit_code, reason=end.reason, error=end.error)
                 if record.stopped_at is None:
                     record.stopped_at = stopped
                     if attempt.ending is None:  # by itself: no one ended the gang
                         record.status_reason = aws_ending(end, record.host)
-                self._bus.presence.ended(key)
-            elif self._bus.presence.met(key):
+                self._bus.presence.ended((*key, index))
+            elif self._bus.presence.met((*key, index)):
                 _note(record, met=True)
             ends.append(end)
             _note(record, devices=tuple(node.gpus) or record.devices, host=node.host or record.host)
             _note(record, address=node.address or record.address or "")  # of a node that can't be seen it stays known
         return ends
 
-    def _of(self, attempt: Attempt) -> _Seen:
-        return self._seen.setdefault((attempt.job_id, attempt.number), _Seen())
+    def _of(self, key: Key) -> _Seen:
+        if (seen := self._seen.get(key)) is None:
+            seen = self._seen[key] = _Seen()
+        return seen
 
 
 def _note(record: Node, **facts: object) -> None:
