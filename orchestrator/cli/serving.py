@@ -14,7 +14,6 @@ from typing import Annotated
 
 import typer
 
-from orchestrator import machine
 from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, store_here, submit_spec, tell
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
@@ -183,7 +182,6 @@ def serve(
     from orchestrator.server import Server  # imports dependencies of the controller only
     from orchestrator.service_manager import ServiceManager
 
-    machine.share_arenas()
     manager = ServiceManager()
     for name in engine or ():
         check_engine(name)
