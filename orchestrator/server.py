@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import uvicorn
 
-from orchestrator import machine
 from orchestrator.api import arns
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
@@ -113,7 +112,6 @@ class Server:
         exposed = not is_loopback(host) or bool(trusted_proxies)
         self.access = Access(KeyStore(home), token, exposed=exposed, reachable=exposed, user=os.geteuid())
         _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
-        machine.share_arenas()
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home, temporary)
             stack.callback(self._lock.release)
