@@ -43,9 +43,10 @@ def collect_all() -> None:
 
 
 def share_arenas() -> None:
-    """Let the threads of this process share two of glibc's arenas: each keeps what was freed in it, and else nearly every thread has one.
+    """Limit glibc to two arenas for all threads of this process.
 
-    To be called before threads are started; does nothing with another C library.
+    Each arena keeps the memory that was freed in it, and by default nearly every thread gets its own. A thread that has one keeps
+    it, so call this early. Does nothing with another C library.
     """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 2)

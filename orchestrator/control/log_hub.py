@@ -31,7 +31,7 @@ _MEMORY = 32 << 20
 _LOOK, _LOOK_SELDOM = 0.05, 1.0
 """Seconds between two looks at the files of a job whose nodes do not push: after a change, and at last while looks find nothing."""
 _OF_SILENCE = 0.1
-"""In between, the part of the time since a look has found something: a line comes late by a tenth of the silence before it."""
+"""In between: this part of the time since a look found something. So a line is late by at most a tenth of the silence before it."""
 _SHARE = 0.005
 """Seconds between two looks, for each job that is looked at: all of them together are looked at 200 times a second."""
 _AGAIN = 1.0

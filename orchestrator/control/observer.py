@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -41,7 +42,7 @@ class Observer:
 
     def __init__(self, engine: EngineSet, runs: RunStore, errands: Errands, bus: Bus, clock: Clock) -> None:
         self._engine, self._runs, self._errands, self._bus, self._clock = engine, runs, errands, bus, clock
-        self._seen: dict[Key, _Seen] = {}
+        self._seen = defaultdict[Key, _Seen](_Seen)
 
     def forget(self, key: Key) -> None:
         """The attempt is closed."""
@@ -50,10 +51,11 @@ class Observer:
     def observe(self, job: Job, attempt: Attempt) -> Observed | None:
         """A look at a gang that was launched; None before its engine's first look."""
         assert attempt.handle is not None
+        key = job.id, attempt.number
         status = self._engine.observe(attempt.handle)
         if status is None:
             return None  # the engine's first look is under way
-        silences = self._silences((job.id, attempt.number), attempt.handle, status)
+        silences = self._silences(key, attempt.handle, status)
         known = self.know_outcomes(job, attempt, status, silences)
         ends = self.ends(job, attempt, status)
         head, away = status[job.gang.main], (node.words for node in status if node.phase is NodePhase.UNREACHABLE)
@@ -61,7 +63,7 @@ class Observer:
             moment=self._clock.now(),
             ends=ends,
             silences=silences,
-            unread=None if known else self._errands.trouble((job.id, attempt.number)),
+            unread=None if known else self._errands.trouble(key),
             waits=head.words
             if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
             else ("" if known else next(away, "")),
@@ -75,7 +77,8 @@ class Observer:
 
     def _silences(self, key: Key, handle: str, status: GangStatus) -> Sequence[Silence | None]:
         """The silence of each node, by what the engine and the store say of it; None for one that has ended."""
-        seen, asked = self._of(key), self._engine.asked(handle)
+        seen = self._seen[key]
+        asked = self._engine.asked(handle)
         asked = None if asked is None or seen.checked is None else max(asked, machine.monotonic() - seen.checked)
 
         def silence(index: int, node: NodeStatus) -> Silence | None:
@@ -101,7 +104,7 @@ class Observer:
             Whether those of the nodes that have ended are known.
         """
         key = job.id, attempt.number
-        memory, moment = self._of(key), machine.monotonic()
+        memory, moment = self._seen[key], machine.monotonic()
         ended = [index for index, node in enumerate(status) if not node.running and index not in memory.outcomes]
         hidden = [
             index
@@ -136,7 +139,7 @@ class Observer:
     def ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """The end of each node, None while it is not known; noted in the attempt's record with the other facts about its nodes."""
         key = job.id, attempt.number
-        outcomes, ends = self._of(key).outcomes, list[NodeEnd | None]()
+        outcomes, ends = self._seen[key].outcomes, list[NodeEnd | None]()
         for index, (record, node) in enumerate(zip(attempt.nodes, status, strict=True)):
             end, outcome = None, outcomes.get(index)
             if outcome is not None or (not node.running and index in outcomes):
@@ -153,11 +156,6 @@ class Observer:
             _note(record, devices=tuple(node.gpus) or record.devices, host=node.host or record.host)
             _note(record, address=node.address or record.address or "")  # of a node that can't be seen it stays known
         return ends
-
-    def _of(self, key: Key) -> _Seen:
-        if (seen := self._seen.get(key)) is None:
-            seen = self._seen[key] = _Seen()
-        return seen
 
 
 def _note(record: Node, **facts: object) -> None:

@@ -79,7 +79,7 @@ class Reconciler:
         ``identity``: of the store; without it whatever is at its path is the store.
         ``min_free``: free space that the volumes of the store and the database need for something new to start.
         """
-        machine.share_arenas()
+        machine.share_arenas()  # before the bus starts its threads
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval = interval
         volumes = {"store": store.path, "database": database.volume}

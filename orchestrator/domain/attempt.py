@@ -184,7 +184,7 @@ def step(state: State, event: Event) -> Instructions:
         case Phase.LAUNCHING, Due():
             return (Launch(again=state.verdict is None and state.stop_reason is None),)
         case Phase.LAUNCHING, Launched(handle):
-            return Keep(handle), Observe()
+            return Keep(handle), Save(), Observe()
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
             return (WindUp(),)
         case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
@@ -259,13 +259,13 @@ def _end(state: State, seen: Observed) -> Instructions:
     if (verdict := state.verdict) is None:
         return ()
     waits = f"waits for {seen.stale}" if seen.stale else "its nodes are ending"
-    explained = Explain(f"{verdict.reason}; {waits}")
+    recorded = Explain(f"{verdict.reason}; {waits}"), Save()
     if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
         since = seen.moment if state.done_since is None else state.done_since
         if seen.moment - since < FINISHING:
-            return explained, Save(), AwaitChildren(since)
+            return *recorded, AwaitChildren(since)
     is_broken = verdict.ending in (Ending.FAILED, Ending.FATAL)
-    return explained, Save(), Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
+    return *recorded, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
 
 
 def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:

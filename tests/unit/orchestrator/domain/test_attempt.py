@@ -147,7 +147,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
         LaunchDelayed("pulling the image", False),
         [WindUp()],
     ),
-    "a handle is saved with what the first look finds": (LAUNCHING, Launched("handle"), [Keep("handle"), Observe()]),
+    "a handle is saved at once": (LAUNCHING, Launched("handle"), [Keep("handle"), Save(), Observe()]),
     "a launch that waits says why": (LAUNCHING, LaunchDelayed("no room", False), [Explain("no room")]),
     "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
     "one that is not needed is given up": (asked(LAUNCHING), LaunchDelayed("full", False), [Decide(STOPPED), WindUp()]),

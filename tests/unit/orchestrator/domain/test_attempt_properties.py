@@ -142,7 +142,7 @@ def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_sa
                 assert page.before.verdict is not None or attempt_instructions.Save() in page.instructions[:index], (
                     "a crash would forget it"
                 )
-            if isinstance(each, attempt_instructions.TakeEpoch):
+            if isinstance(each, attempt_instructions.Keep | attempt_instructions.TakeEpoch):
                 assert attempt_instructions.Save() in page.instructions[index:], "a crash would forget it"
             if isinstance(
                 each,
