@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from shared_store import leagues, models
 from shared_store.bundles import DamagedBundle
 from shared_store.files import DamagedFile, read_json
-from shared_store.layout import LARGEST_DESCRIPTION, NAME, Store, names_in
+from shared_store.layout import LARGEST_DESCRIPTION, Store, names_in
 from shared_store.leagues import LeagueError
-from shared_store.models import ModelError
+from shared_store.models import Model, ModelError
 
 
 class Needed(NamedTuple):
@@ -36,11 +37,11 @@ Found = Iterator[Needed | Unreadable]
 
 
 def references(store: Store) -> tuple[list[Needed], list[str]]:
-    """All that in the store needs a run or a job, and what could not be read. Raises OSError where the volume can't be read."""
+    """All that in the store needs a run or a job, and what could not be read."""
     needed: list[Needed] = []
     unreadable: list[str] = []
-    for referrer in REFERRERS:
-        for each in referrer(store):
+    for what, referrer in REFERRERS.items():
+        for each in _read(what, referrer, store):
             if isinstance(each, Needed):
                 needed.append(each)
             else:
@@ -48,85 +49,80 @@ def references(store: Store) -> tuple[list[Needed], list[str]]:
     return needed, unreadable
 
 
+def _read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
+    """What a referrer finds, with what it can't read."""
+    try:
+        yield from referrer(*arguments)
+    except (DamagedBundle, DamagedFile, LeagueError, ModelError, OSError) as error:
+        yield Unreadable(f"{what} can't be read ({error})")
+
+
 def _of_models(store: Store) -> Found:
     """Runs of models, with those from which their weights began."""
-    try:
-        names = names_in(store.models)
-    except DamagedFile as error:
-        yield Unreadable(f"{error}")
-        return
-    for name in names:
-        try:
-            found = models.versions(store, name)
-        except (ModelError, DamagedFile) as error:
-            yield Unreadable(f"model {name} can't be read ({error})")
-            continue
-        for model in found:
-            try:
-                facts = model.facts()
-            except DamagedBundle as error:
-                yield Unreadable(str(error))
-                continue
-            yield from _run(facts.get("run"), f"model {model.reference} is of it")
-            yield from _run(_part(facts.get("parent"), "run"), f"model {model.reference} began with its weights")
+    for name in names_in(store.models):
+        yield from _read(f"model {name}", _of_versions, store, name)
+
+
+def _of_versions(store: Store, name: str) -> Found:
+    for model in models.versions(store, name):
+        yield from _read(f"model {model.reference}", _of_model, model)
+
+
+def _of_model(model: Model) -> Found:
+    facts = model.facts()
+    yield from _run(facts.get("run"), f"model {model.reference} is of it")
+    yield from _run(_part(facts.get("parent"), "run"), f"model {model.reference} began with its weights")
 
 
 def _of_leagues(store: Store) -> Found:
     """Evaluations that entries of leagues cite, with the jobs that made them. Entries need not be sound to be kept."""
-    try:
-        found = leagues.names(store)
-    except LeagueError as error:
-        yield Unreadable(str(error))
+    for name in leagues.names(store):
+        yield from _read(f"league {name}", _of_entries, name, store.leagues / name / "entries")
+
+
+def _of_entries(league: str, folder: Path) -> Found:
+    for number in names_in(folder):
+        yield from _read(
+            f"entry {number} of league {league}", _of_entry, league, number, folder / number / "entry.json"
+        )
+
+
+def _of_entry(league: str, number: str, path: Path) -> Found:
+    entry = read_json(path)
+    if entry is None:
+        yield Unreadable(f"entry {number} of league {league} can't be read ({path} is missing)")
         return
-    for name in found:
-        folder = store.leagues / name / "entries"
-        try:
-            numbers = names_in(folder)
-        except DamagedFile as error:
-            yield Unreadable(str(error))
-            continue
-        for number in numbers:
-            path = folder / number / "entry.json"
-            try:
-                entry = read_json(path)
-            except (DamagedFile, NotADirectoryError) as error:
-                yield Unreadable(f"entry {number} of league {name} can't be read ({error})")
-                continue
-            if entry is None:
-                yield Unreadable(f"entry {number} of league {name} can't be read ({path} is missing)")
-                continue
-            evaluation, by = entry.get("evaluation"), f"entry {number} of league {name} cites it"
-            yield from _run(_part(evaluation, "run"), by)
-            if isinstance(job := _part(evaluation, "job"), str):
-                yield Needed("job", job, by)
+    evaluation, by = entry.get("evaluation"), f"entry {number} of league {league} cites it"
+    yield from _run(_part(evaluation, "run"), by)
+    if isinstance(job := _part(evaluation, "job"), str):
+        yield Needed("job", job, by)
 
 
 def _of_runs(store: Store) -> Found:
     """Runs that began with the weights of another, and those that hold the weights of a teacher."""
+    for name in names_in(store.path / "runs"):
+        yield from _read(f"run {name}", _of_run, name, store.path / "runs" / name)
+
+
+def _of_run(name: str, path: Path) -> Found:
+    if _is_there(path / "parent"):
+        described = read_json(path / "run.json", LARGEST_DESCRIPTION) or {}
+        yield from _run(_part(described.get("parent"), "run"), f"run {name} is a clone of it")
+    if _is_there(path / "teachers"):
+        for teacher in names_in(path / "teachers"):
+            yield from _run(teacher, f"it is the teacher of run {name}")
+
+
+REFERRERS: dict[str, Callable[[Store], Found]] = {"models": _of_models, "leagues": _of_leagues, "runs": _of_runs}
+
+
+def _is_there(path: Path) -> bool:
+    """Raises OSError where that can't be seen."""
     try:
-        entries = [entry.name for entry in os.scandir(store.path / "runs") if NAME.fullmatch(entry.name)]
-    except FileNotFoundError:
-        return
-    for name in entries:
-        path = store.path / "runs" / name
-        if os.path.lexists(path / "parent"):
-            try:
-                described = read_json(path / "run.json", LARGEST_DESCRIPTION) or {}
-            except DamagedFile as error:
-                yield Unreadable(f"run {name} can't be read ({error})")
-            else:
-                yield from _run(_part(described.get("parent"), "run"), f"run {name} is a clone of it")
-        if os.path.lexists(path / "teachers"):
-            try:
-                taught = names_in(path / "teachers")
-            except (DamagedFile, NotADirectoryError) as error:
-                yield Unreadable(f"run {name}: its teachers can't be read ({error})")
-            else:
-                for teacher in taught:
-                    yield from _run(teacher, f"it is the teacher of run {name}")
-
-
-REFERRERS: tuple[Callable[[Store], Found], ...] = (_of_models, _of_leagues, _of_runs)
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 def _part(value: Any, key: str) -> Any:

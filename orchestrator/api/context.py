@@ -183,10 +183,10 @@ def find_run(reconciler: Reconciler, name: str) -> Run:
 def using(reconciler: Reconciler, *runs: str, cites: bool = True) -> Iterator[None]:
     """A block in which nobody deletes these runs; ``cites``: afterwards something in the store may need them. Raises RunInUse."""
     with ExitStack() as stack:
-        if cites:
-            stack.callback(reconciler.retention.stored.look_again)
         for run in runs:
             stack.enter_context(reconciler.run_users.using(run))
+        if cites:  # before they are let go: whoever takes one then looks again
+            stack.callback(reconciler.retention.stored.look_again)
         yield
 
 

@@ -1,4 +1,4 @@
-"""``muster gc``: what retention would take, and takes."""
+"""``muster gc``: what retention would delete, and deletes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def register(app: typer.Typer) -> None:
 
 def gc(
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Take nothing: print what would go, how much, and why the rest is kept.")
+        bool, typer.Option("--dry-run", help="Delete nothing: print what would go, how much, and why the rest is kept.")
     ] = False,
     older_than: Annotated[
         str | None,
         typer.Option(
-            help="Take what ended longer ago, such as 30d, in queues without a rule. By default: as `muster serve --retention` says.",
+            help="Delete what ended longer ago, such as 30d, in queues without a rule. By default: as `muster serve --retention` says.",
             show_default=False,
         ),
     ] = None,
@@ -37,9 +37,9 @@ def gc(
     """Delete old jobs, their logs and their runs, where nothing needs them any more.
 
     A job goes by the rule of its queue (tag muster:retention, such as 30d), else by `muster serve --retention`; of queues without a rule
-    only jobs of the Batch API go, 90 days after their end. Never taken: runs with checkpoints or any other results, parents of clones,
+    only jobs of the Batch API go, 90 days after their end. Never deleted: runs with checkpoints or any other results, parents of clones,
     teachers, runs of models and of entries of leagues, runs that an unfinished job uses, and archived runs (`muster runs archive`). Your
-    key takes what is yours; a key with all queues takes everything.
+    key deletes what is yours; a key with all queues deletes everything.
     """
     with Client.connect() as client:
         found = [each for part in _parts(client, dry_run, older_than or "") for each in part]
@@ -55,7 +55,7 @@ def gc(
     size = sum(each["bytes"] for each in gone)
     files = counted(sum(each["files"] for each in gone), "file")
     what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {files}, {size / 2**20:.1f} MiB"
-    echo(f"would take {what}" if dry_run else f"took {what}")
+    echo(f"would delete {what}" if dry_run else f"deleted {what}")
 
 
 def _parts(client: Client, dry_run: bool, older_than: str) -> Iterator[list[dict[str, Any]]]:

@@ -20,7 +20,7 @@ from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable
-from orchestrator.domain.retention import age_of
+from orchestrator.domain.retention import rule_of
 from orchestrator.home import ControllerRuns, is_temporary, local_url, muster_home
 from orchestrator.spec import file as specfile
 from orchestrator.spec.values import seconds_of
@@ -109,7 +109,7 @@ def serve(
         str | None,
         typer.Option(
             help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By "
-            "default jobs of the Batch API are kept for 90d, others without end; the tag muster:retention of a queue goes first.",
+            "default jobs of the Batch API are kept for 90d, others without end; the tag muster:retention of a queue takes precedence.",
             show_default=False,
         ),
     ] = None,
@@ -339,7 +339,7 @@ def _retention(text: str | None) -> float | None:
     if text is None:
         return None
     try:
-        age = age_of(text)
+        age = rule_of(text)
     except ValueError as error:
         raise SpecError(f"--retention: {error}") from None
     return inf if age is None else age / 1000

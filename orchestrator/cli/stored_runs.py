@@ -109,6 +109,8 @@ def delete(
         echo_json(deleted)
     else:
         echo(f"deleted run {run}: {counted(deleted['files'], 'file')}, {deleted['bytes'] / 2**20:.1f} MiB")
+        if left := deleted["left"]:
+            echo(f"not all of them can be removed; remove the rest by hand: {left}")
 
 
 def _confirm(client: Client, run: str) -> None:

@@ -173,7 +173,7 @@ class Attempts:
             pause = (state.done_since + FINISHING - self.clock.now()) / 1000
         elif state.verdict is not None:
             pause = self._stops.pause(key)
-        elif state.cause_since is not None or self._observer.has_silent(key):
+        elif state.cause_since is not None or self._observer.has_hidden(key):
             pause = CHECK_INTERVAL
         elif job.timeout is not None and attempt.running_since is not None:
             pause = attempt.running_since / 1000 + job.timeout - self.clock.now() / 1000

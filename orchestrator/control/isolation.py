@@ -66,7 +66,7 @@ class Isolation:
                 jobs = self._loaded.jobs(session, ids)
                 self.before(session, list(jobs.values()))
                 begun = [body(session, job) for job in jobs.values()]
-                _finish(session, [steps for steps in begun if steps is not None])
+                self._finish(session, [steps for steps in begun if steps is not None])
         except DatabaseError:
             raise
         except Exception as error:
@@ -79,6 +79,17 @@ class Isolation:
             self.backoff.worked((what, job_id), lasting=True)
         return []
 
+    def _finish(self, session: Session, steps: Sequence[Steps]) -> None:
+        """Carry all of them out, up to the next commit of each in turn."""
+        while steps:
+            with session.no_autoflush:  # none reads what another one has changed
+                reached = [(each, then) for each in steps if (then := next(each, None)) is not None]
+            session.commit()
+            for _, then in reached:
+                then()
+            steps = [each for each, _ in reached]
+            self._heartbeat.beat()
+
     def _failed(self, what: str, job_id: str, error: Exception) -> None:
         """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""
         reason = f"the controller failed on this job ({_words(error)}); trying again"
@@ -90,17 +101,6 @@ class Isolation:
                 )
                 session.execute(explained)
             self._loaded.changed([job_id])
-
-
-def _finish(session: Session, steps: Sequence[Steps]) -> None:
-    """Carry all of them out, up to the next commit of each in turn."""
-    while steps:
-        with session.no_autoflush:  # none reads what another one has changed
-            reached = [(each, then) for each in steps if (then := next(each, None)) is not None]
-        session.commit()
-        for _, then in reached:
-            then()
-        steps = [each for each, _ in reached]
 
 
 def _words(error: Exception) -> str:

@@ -278,10 +278,11 @@ class LogHub:
             except OSError:
                 pass
             finally:
-                each.looked, each.pause, each.is_looked_at = machine.monotonic(), pause, False
+                # what has happened meanwhile may have asked for an earlier one
+                each.looked, each.pause, each.is_looked_at = machine.monotonic(), min(each.pause, pause), False
                 self._hurry_locked()
 
-        each.is_looked_at = True
+        each.is_looked_at, each.pause = True, _LOOK_SELDOM
         try:
             self._calls.submit(look)
         except StoreSilent:

@@ -33,8 +33,8 @@ class _Seen:
     """When they were read last (monotonic [s])."""
     progress: Progress | None = None
     """What the run holds, read after the last of them was found."""
-    is_silent: bool = False
-    """Whether a node was silent at the last look."""
+    has_hidden: bool = False
+    """Whether a node could not be seen or heard at the last look."""
 
 
 class Observer:
@@ -71,9 +71,9 @@ class Observer:
             stale=next((node.stale for node in status if node.stale), ""),
         )
 
-    def has_silent(self, key: Key) -> bool:
-        """Whether a node of the attempt was silent at the last look."""
-        return key in self._seen and self._seen[key].is_silent
+    def has_hidden(self, key: Key) -> bool:
+        """Whether a node of the attempt could not be seen or heard at the last look, and has left no outcome."""
+        return key in self._seen and self._seen[key].has_hidden
 
     def _silences(self, key: Key, handle: str, status: GangStatus) -> Sequence[Silence | None]:
         """The silence of each node, by what the engine and the store say of it; None for one that has ended."""
@@ -87,9 +87,7 @@ class Observer:
             runs = node.phase is not NodePhase.UNREACHABLE and not node.stale
             return self._bus.presence.silence((*key, index), asked, runs)
 
-        silences = [silence(*each) for each in enumerate(status)]
-        seen.is_silent = any(silences)
-        return silences
+        return [silence(*each) for each in enumerate(status)]
 
     def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus, silences: Sequence[Silence | None]) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
@@ -113,6 +111,7 @@ class Observer:
             and memory.outcomes.get(index) is None
             and (node.phase is NodePhase.UNREACHABLE or node.stale or silence)
         ]
+        memory.has_hidden = bool(hidden)
         if not ended and (not hidden or (memory.checked is not None and moment - memory.checked < CHECK_INTERVAL)):
             return True
         missing = {index for index in range(len(status)) if memory.outcomes.get(index) is None}

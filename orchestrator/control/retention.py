@@ -35,7 +35,9 @@ from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart
 from orchestrator.persistence.session import Database
 from shared_store import contents, trash
+from shared_store.files import DamagedFile
 from shared_store.layout import NAME, Store
+from shared_store.wording import counted
 
 log = logging.getLogger("muster.retention")
 
@@ -114,7 +116,7 @@ class Retention:
 
     def when_due(self, later: Callable[[Callable[[], object]], None]) -> None:
         """Have ``later`` carry out a pass once in a while; returns at once."""
-        if self._is_on and not self._is_under_way and machine.monotonic() > self._next:
+        if not self._is_under_way and machine.monotonic() > self._next:
             self._is_under_way = True
             later(self._pass)
 
@@ -122,7 +124,7 @@ class Retention:
         try:
             with self._passing:
                 self._take_or_report()
-        except (OSError, Unavailable) as error:
+        except (DamagedFile, OSError, Unavailable) as error:
             log.warning("old jobs and runs can't be taken now (%s); trying again later", " ".join(str(error).split()))
         except Exception:
             log.exception("old jobs and runs can't be taken now; trying again later")
@@ -134,6 +136,10 @@ class Retention:
         if self._is_closing.is_set():
             return
         self._empty_trash()
+        with self._writing, self._database.session() as session:
+            rows.forget_usage(session, self._steady())
+        if not self._is_on:
+            return
         if self.rules().is_trial(self._moment()):
             self._report()
         else:
@@ -142,8 +148,6 @@ class Retention:
     def take_all(self) -> Totals:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
         totals = self._all(lambda rules, place: self.step(place, rules, take=True))
-        with self._writing, self._database.session() as session:
-            rows.forget_usage(session, self._steady())
         if totals.jobs or totals.runs:
             log.info(
                 "retention took %s; %d runs are kept that are old enough, see `muster gc --dry-run`",
@@ -181,7 +185,9 @@ class Retention:
     def _empty_trash(self) -> None:
         try:
             self.stored.check()
-            trash.empty(self._store)
+            if left := trash.empty(self._store):
+                things = counted(len(left), "thing")
+                log.warning("%s in the store's trash can't be removed, such as %s; remove by hand", things, left[0])
         except (OSError, Unavailable) as error:
             log.warning("the store's trash can't be emptied now (%s)", error)
 
@@ -294,8 +300,12 @@ class Retention:
         """
         gone, stay = list[Look](), list[Look]()
         self.stored.check()
-        thrown = trash.throw_away(self._store, self._directories(looks, gone, stay))
+        thrown, fixed = trash.throw_away(self._store, self._directories(looks, gone, stay))
         self.stored.check()
+        for look in list(gone):
+            if errors := [fixed[path] for path in look.directories if path in fixed]:
+                gone.remove(look)
+                stay.append(_staying(look, _unmoved(errors[0])))
         if self._is_closing.is_set():
             return stay  # the next controller deletes the rows
         # an array behind its children
@@ -320,7 +330,7 @@ class Retention:
                 gone.append(look)
                 yield from look.directories
             else:
-                stay.append(Look(look.run, Decision(False, (), ("it has just changed",)), look.facts, ()))
+                stay.append(_staying(look, "it has just changed"))
 
     def _remove(self, thrown: Sequence[Path]) -> None:
         """Remove what was thrown away, several at once: each waits for the file system's journal."""
@@ -345,10 +355,13 @@ class Retention:
             return session.scalars(query.limit(1)).first()
 
     def delete(self, name: str, whose: Whose = CONTROLLER) -> dict[str, Any]:
-        """Delete a run with all that it holds, for who asks; its jobs stay in the history. Returns its size, in ``bytes`` and ``files``.
+        """Delete a run with all that it holds, for who asks; its jobs stay in the history.
+
+        Returns:
+            Its size, in ``bytes`` and ``files``; ``left``: where in the trash the rest is that can't be removed, else None.
 
         Raises:
-            RunNeeded: Something needs it, or a request uses it.
+            RunNeeded: Something needs it, a request uses it, or it can't be moved.
             Unavailable, OSError: The store or the database can't be used.
         """
         with self.alone(name):
@@ -359,12 +372,15 @@ class Retention:
             size, files = (0, 0) if facts is None else trash.size_of(path)
             if not self.stored.is_unchanged(name, facts):
                 raise RunNeeded(f"run {name} has just changed, and nothing of it is deleted; try again in a moment")
-            thrown = trash.throw_away(self._store, [path])
+            thrown, fixed = trash.throw_away(self._store, [path])
+            if path in fixed:
+                raise RunNeeded(f"run {name} is kept: {_unmoved(fixed[path])}")
             with self._writing, self._database.session() as session:
                 if (record := session.get(RunRecord, name)) is not None:
                     session.delete(record)
         self._remove(thrown)
-        return {"run": name, "bytes": size, "files": files}
+        left = next((str(each) for each in thrown if each.exists()), None)
+        return {"run": name, "bytes": size, "files": files, "left": left}
 
     @contextmanager
     def alone(self, name: str) -> Iterator[None]:
@@ -380,8 +396,16 @@ class Retention:
         return min(now(), self._steady())
 
 
+def _staying(look: Look, why: str) -> Look:
+    return Look(look.run, Decision(False, (), (why,)), look.facts, ())
+
+
+def _unmoved(error: OSError) -> str:
+    return f"it can't be moved into the store's trash ({error.strerror}: {error.filename})"
+
+
 def _age_of(tag: str) -> int | None:
     try:
-        return retention.age_of(tag)
+        return retention.rule_of(tag)
     except ValueError:  # an older Muster took any text
         return None

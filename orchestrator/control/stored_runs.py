@@ -11,7 +11,6 @@ from orchestrator import machine
 from orchestrator.control.peers import Peers
 from orchestrator.domain.retention import Reference, References, RunFacts
 from shared_store import contents
-from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store
 from shared_store.references import references
 
@@ -41,14 +40,14 @@ class StoredRuns:
         self._scanning = threading.Lock()
 
     def facts(self, runs: Collection[str]) -> dict[str, RunFacts | None]:
-        """Each run as the store has it now; None where there is none. Raises Unavailable, OSError."""
+        """Each run as the store has it now; None where there is none. Raises Unavailable."""
         self.check()
         found = {name: self._facts(self._store.run(name)) for name in runs}
         self.check()
         return found
 
     def is_unchanged(self, name: str, facts: RunFacts | None) -> bool:
-        """Whether the run is as it was when :meth:`facts` answered. Raises OSError."""
+        """Whether the run is as it was when :meth:`facts` answered."""
         return self._facts(self._store.run(name)) == facts
 
     def _facts(self, run: Run) -> RunFacts | None:
@@ -58,12 +57,12 @@ class StoredRuns:
             writer = self._peers.writer(run)
         except FileNotFoundError:
             return None
-        except (DamagedFile, ValueError) as error:
+        except (OSError, ValueError) as error:  # which may be one of this run alone: the volume is checked afterwards
             return RunFacts(run.name, damage=str(error))
         return RunFacts(run.name, inside.epoch, inside.results, inside.logged, _by_whom(archived), writer)
 
     def references(self, fresh: float) -> References:
-        """What in the store needs runs, as it was at most so many seconds ago. Raises Unavailable, OSError."""
+        """What in the store needs runs, as it was at most so many seconds ago. Raises Unavailable."""
         with self._scanning:
             found, version, began = self._found, self._version, machine.monotonic()
             if found is None or began - found.found_at > fresh or found.version != version:

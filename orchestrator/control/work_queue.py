@@ -146,7 +146,7 @@ class WorkQueue:
 
     def _entry(self, job: Job) -> Waiting:
         shape = job.gang.shape
-        if not self._waiting:
+        if len(self._shapes) > len(self._waiting):
             self._shapes.clear()
         shape = self._shapes.setdefault(shape, shape)
         since = job.runnable_at or job.created_at

@@ -25,14 +25,27 @@ OFF = "off"
 _UNITS = {"m": 60_000, "h": 3_600_000, "d": A_DAY}
 
 
-def age_of(rule: str) -> int | None:
-    """Milliseconds of a rule such as ``90d``, ``36h`` or ``45m``; None of :data:`OFF`. Raises ValueError, in one line."""
-    if rule == OFF:
-        return None
-    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([mhd])", rule.strip())
+def age_of(text: str) -> int:
+    """Milliseconds of a time such as ``90d``, ``36h`` or ``45m``. Raises ValueError, in one line."""
+    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([mhd])", text.strip())
     if match is None:
-        raise ValueError(f"{rule[:40]!r} is no time; expected one such as 90d, 36h or 45m, or {OFF} to keep everything")
+        raise ValueError(f"{text[:40]!r}: expected a time such as 90d, 36h or 45m")
     return int(float(match[1]) * _UNITS[match[2]])
+
+
+def rule_of(text: str) -> int | None:
+    """The same of a rule; None of :data:`OFF`. Raises ValueError, also where nothing would be kept at all."""
+    if text == OFF:
+        return None
+    try:
+        age = age_of(text)
+    except ValueError as error:
+        raise ValueError(f"{error}, or {OFF} to keep everything") from None
+    if not age:
+        raise ValueError(
+            f"{text[:40]!r}: every job would be deleted as it ends; expected a longer time, or {OFF} to keep everything"
+        )
+    return age
 
 
 @dataclass(frozen=True)

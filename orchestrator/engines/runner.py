@@ -358,13 +358,15 @@ class Runner:
         before = self._backoff.failure(_LOOKS)
         asked = machine.monotonic()
         try:
-            looks = self._call("look at its gangs", lambda: self.engine.observe(handles))
+            looks = self._call(
+                "look at its gangs", lambda: list(zip(handles, self.engine.observe(handles), strict=True))
+            )
         except EngineError as error:
             self._failed(_LOOKS, error)
             looks = []
         else:
             self._backoff.worked(_LOOKS)
-        changed = [handle for handle, look in zip(handles, looks, strict=False) if self._note(handle, look, asked)]
+        changed = [handle for handle, look in looks if self._note(handle, look, asked)]
         for handle in changed if before == self._backoff.failure(_LOOKS) else list(self._observed):
             self._changed(handle.gang)
 

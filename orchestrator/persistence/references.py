@@ -46,13 +46,15 @@ def references(session: Session, runs: Collection[str], rules: Rules, moment: in
         yield Reference("job", job, f"job {waiting} waits for it")
     array, child = aliased(Job), aliased(Job)
     of_array = select(Job.id, array.id).join(array, array.id == Job.parent).where(Job.run.in_(runs))
-    for job, parent in session.execute(of_array.where(array.status.not_in(TERMINAL))):
-        yield Reference("job", job, f"it belongs to array {parent}, which has not ended")
-    kept = select(child.id).where(
-        child.parent == Job.id, or_(child.stopped_at.is_(None), not_(due(rules, moment, child)))
-    )
+    for job, parent in session.execute(of_array.where(_is_kept(array, rules, moment))):
+        yield Reference("job", job, f"it belongs to array {parent}, which is kept longer")
+    kept = select(child.id).where(child.parent == Job.id, _is_kept(child, rules, moment))
     for job in session.scalars(select(Job.id).where(Job.run.in_(runs), Job.kind == "array", kept.exists())):
         yield Reference("job", job, f"children of array {job} are kept longer")
+
+
+def _is_kept(job: type[Job], rules: Rules, moment: int) -> ColumnElement[bool]:
+    return or_(job.stopped_at.is_(None), not_(due(rules, moment, job)))
 
 
 def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:

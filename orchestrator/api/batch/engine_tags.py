@@ -5,7 +5,7 @@ from __future__ import annotations
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.control.compute_environments import ENGINE_TAG, engine_named_by, environments_of
-from orchestrator.domain.retention import TAG, age_of
+from orchestrator.domain.retention import TAG, rule_of
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.installed import ENGINES, check_tags
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue
@@ -21,7 +21,7 @@ def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) 
         if (rule := tags.get(TAG)) is not None:
             tags = {tag: value for tag, value in tags.items() if tag != TAG}
             try:
-                age_of(rule)
+                rule_of(rule)
             except ValueError as error:
                 raise ClientError(f"tag {TAG}: {error}") from None
         engines = [engine_named_by(each.tags, first) for each in environments_of(context.session, resource)]

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from orchestrator.api import permissions
 from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
-from orchestrator.api.http.store_route import StoreRoute
+from orchestrator.api.http.store_route import WorkRoute
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.retention import RunNeeded
@@ -20,7 +20,7 @@ from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.domain.retention import age_of
 from shared_store import contents
 
-router = APIRouter(route_class=StoreRoute)
+router = APIRouter(route_class=WorkRoute)
 
 _A_PART = 2.0
 """Seconds of an answer: the rest of a pass comes with the next ones."""
@@ -88,7 +88,7 @@ def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, 
 
 @router.delete("/runs/{name}")
 def delete_run(request: Request, name: str) -> dict[str, Any]:
-    """Delete a run with all that it holds, where nothing needs it. Answers its size."""
+    """Delete a run with all that it holds, where nothing needs it. Answers its size; ``left`` is where in the trash the rest is that can't be removed."""
     reconciler = reconciler_of(request)
     run = permitted_run(reconciler, name, Operation.DELETE_RUN)
     reconciler.check_writable(adds=False)

@@ -111,8 +111,8 @@ class SlurmEngine:
         self._counted = (-inf, 0)
         """When the view was taken in which gangs were counted, and how many they were."""
         self._submitted: dict[str, float] = {}
-        self._cancelled: dict[str, None] = {}
-        """Numbers of the jobs that this engine has cancelled, while Slurm knows them."""
+        self._cancelled: dict[str, float] = {}
+        """Numbers of the jobs that this engine has cancelled, while Slurm knows them, and when (monotonic [s])."""
         self._submitting = threading.Lock()
         self._pending: dict[str, Future[str]] = {}
         """Submissions that are not answered, by gang."""
@@ -208,11 +208,11 @@ class SlurmEngine:
 
     def _cancel(self, number: str) -> None:
         """Cancel a job, and remember that it was not somebody else who did."""
-        known = self._jobs.value
-        for each in list(self._cancelled):
-            if each not in known:
+        known, taken = self._jobs.value, self._jobs.taken
+        for each, at in list(self._cancelled.items()):
+            if each not in known and at < taken:  # an older view may not have it yet
                 self._cancelled.pop(each, None)
-        self._cancelled[number] = None
+        self._cancelled[number] = machine.monotonic()
         _scancel(number)
 
     # -- jobs ---------------------------------------------------------------------------------------------------------

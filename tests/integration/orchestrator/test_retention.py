@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from orchestrator.control.run_store import RunStore
 from orchestrator.domain.errors import ApiError
 from orchestrator.keys import KeyStore
 from orchestrator.server import Server
-from shared_store import contents, models
+from shared_store import contents, models, trash
 from shared_store.bundles import seal
 from shared_store.checkpoints import list_checkpoints
 from tests.conftest import Serving
@@ -57,8 +58,8 @@ def test_what_jobs_of_the_batch_api_leave_goes_without_a_trace_but_what_they_mad
     kept = server.detail(maker)["run"]
     assert len(runs_of(server)) == 5
     plan = said(server, "gc", "--dry-run", "--older-than", "0m")
-    assert "would take 6 jobs and 4 runs" in plan and f"kept: run {kept}: it holds mine.csv" in plan
-    assert said(server, "gc", "--dry-run").startswith("would take 0 jobs"), "they are young"
+    assert "would delete 6 jobs and 4 runs" in plan and f"kept: run {kept}: it holds mine.csv" in plan
+    assert said(server, "gc", "--dry-run").startswith("would delete 0 jobs"), "they are young"
     assert len(runs_of(server)) == 5
     taken = json.loads(said(server, "gc", "--older-than", "0m", "--json"))
     assert sum(len(each["jobs"]) for each in taken["runs"]) == 6
@@ -67,7 +68,7 @@ def test_what_jobs_of_the_batch_api_leave_goes_without_a_trace_but_what_they_mad
     for each in (gang, array, f"{array}:1", maker):
         with pytest.raises(ApiError, match="does not exist"):
             server.detail(each)
-    assert said(server, "gc", "--older-than", "0m").startswith("took 0 jobs")
+    assert said(server, "gc", "--older-than", "0m").startswith("deleted 0 jobs")
 
 
 def test_an_archived_run_is_kept_out_of_lists_and_nothing_is_added_to_it(server: Serving) -> None:
@@ -103,8 +104,15 @@ def test_a_run_of_an_unfinished_job_is_neither_archived_nor_deleted(server: Serv
 
 
 def test_rules_are_checked_where_they_are_set(server: Serving) -> None:
-    refused(["serve", "--port", "0", "--retention", "soon"], server.home, 2, "--retention: 'soon' is no time; expected")
-    refused(["gc", "--older-than", "x"], server.home, 2, "'x' is no time")
+    refused(
+        ["serve", "--port", "0", "--retention", "soon"],
+        server.home,
+        2,
+        "--retention: 'soon': expected a time such as 90d",
+    )
+    refused(["serve", "--port", "0", "--retention", "0d"], server.home, 2, "every job would be deleted as it ends")
+    refused(["gc", "--older-than", "x"], server.home, 2, "'x': expected a time such as 90d, 36h or 45m")
+    refused(["gc", "--older-than", "off"], server.home, 2, "'off': expected a time such as 90d, 36h or 45m")
     with pytest.raises(ApiError, match="is no place of a pass"):
         server.client.get("/api/gc", after="nowhere")
     queue = "arn:aws:batch:us-east-1:000000000000:job-queue/default"
@@ -113,14 +121,14 @@ def test_rules_are_checked_where_they_are_set(server: Serving) -> None:
         return httpx.post(f"{server.url}/v1/tags/{queue}", json={"tags": {"muster:retention": value}})
 
     answer = set_tag("soon")
-    assert answer.status_code == 400 and "tag muster:retention: 'soon' is no time" in answer.text
+    assert answer.status_code == 400 and "tag muster:retention: 'soon': expected a time" in answer.text
     assert set_tag("2h").status_code == 200
     try:
         job = server.gang("print('here')", name="young")
         server.wait(job)
-        assert said(server, "gc", "--older-than", "0m").startswith("took 0 jobs"), "the queue's rule goes first"
+        assert said(server, "gc", "--older-than", "0m").startswith("deleted 0 jobs"), "the queue's rule goes first"
     finally:
-        assert set_tag("0m").status_code == 200
+        assert set_tag("0.001m").status_code == 200
     said(server, "gc")
     with pytest.raises(ApiError, match="does not exist"):
         server.detail(job)
@@ -277,6 +285,22 @@ def test_archiving_a_run_reads_that_run_alone(
     monkeypatch.setattr(inside.reconciler.retention.stored, "references", scan)
     assert http.post(f"/api/runs/{trained}/archive", json={}).json() == {"run": trained, "archived": True}
     http.post(f"/api/runs/{trained}/archive", json={"archived": False}).raise_for_status()
+
+
+def test_a_volume_that_fails_is_answered_in_one_line(
+    inside: Server, http: httpx.Client, trained: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error", "/volume")
+
+    for module, name in ((trash, "throw_away"), (contents, "archive"), (contents, "unarchive")):
+        monkeypatch.setattr(module, name, fail)
+    for answer in (
+        http.delete(f"/api/runs/{trained}"),
+        http.post(f"/api/runs/{trained}/archive", json={}),
+        http.post(f"/api/runs/{trained}/archive", json={"archived": False}),
+    ):
+        assert answer.status_code == 503 and "the store can't be used ([Errno 5] Input/output error" in answer.text
 
 
 def test_a_run_of_a_model_is_not_deleted(inside: Server, http: httpx.Client, trained: str) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from shared_store.layout import Run, Store
 from shared_store.parent import NewRun, TeacherCopy
 from shared_store.references import references
 from tests.support.orchestrator.trained import add_checkpoint, add_run
+from tests.support.permissions import permissions_count
 from tests.support.shared_store.leagues import entry, league
 
 
@@ -92,16 +95,50 @@ def test_a_directory_is_moved_whole_and_what_a_killed_controller_left_is_swept(s
     run = logged(store, "r")
     assert trash.size_of(run.path)[1] == 3
     other = logged(store, "other")
-    [thrown, _] = trash.throw_away(store, [run.path, store.run("none").path, other.path])
+    [thrown, _], _ = trash.throw_away(store, [run.path, store.run("none").path, other.path])
     assert not run.path.exists() and not other.path.exists() and (thrown / "run.json").is_file()
-    assert trash.throw_away(store, [run.path]) == []
+    assert trash.throw_away(store, [run.path]) == ([], {})
     logged(store, "r2")
-    assert trash.empty(store) == 2 and os.listdir(store.path / "trash") == []
-    assert store.run("r2").path.is_dir() and trash.empty(store) == 0
+    assert trash.empty(store) == [] and os.listdir(store.path / "trash") == []
+    assert store.run("r2").path.is_dir() and trash.empty(store) == []
     trash.throw_away(store, [store.run("r2").path])
     (store.path / "trash" / "stray").write_text("x")
     os.symlink(store.path / "runs", store.path / "trash" / "out")
-    assert trash.empty(store) == 3 and (store.path / "runs").is_dir(), "links in the trash lead nowhere"
+    assert trash.empty(store) == [] and (store.path / "runs").is_dir(), "links in the trash lead nowhere"
+    assert os.listdir(store.path / "trash") == []
+
+
+def test_directories_that_may_not_be_written_are_kept_where_they_are_and_removed_in_the_trash(store: Store) -> None:
+    fixed, open_ = logged(store, "fixed"), logged(store, "open")
+    deep = open_.path / "out" / "deep"
+    write(deep / "file")
+    os.symlink(fixed.path, deep / "link")
+    deep.chmod(0)
+    deep.parent.chmod(0o555)
+    fixed.path.chmod(0o555)
+    with permissions_count():
+        thrown, kept = trash.throw_away(store, [fixed.path, open_.path])
+        assert list(kept) == [fixed.path] and fixed.path.is_dir() and len(thrown) == 1
+        assert trash.remove(thrown[0]) and trash.empty(store) == []
+        assert os.stat(fixed.path).st_mode & 0o777 == 0o555, "a link is removed, not followed"
+
+
+def test_what_can_t_be_removed_is_named_and_the_rest_goes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    stuck, other = logged(store, "stuck"), logged(store, "other")
+    [there, _], _ = trash.throw_away(store, [stuck.path, other.path])
+    is_held = True
+    remove = shutil.rmtree
+
+    def held(path: Path, ignore_errors: bool = False) -> None:
+        if not (is_held and path == there):
+            remove(path, ignore_errors=ignore_errors)
+        elif not ignore_errors:
+            raise OSError(errno.EBUSY, "Device or resource busy", str(path))
+
+    monkeypatch.setattr("shutil.rmtree", held)
+    assert trash.empty(store) == [there]
+    is_held = False
+    assert trash.empty(store) == []
 
 
 def test_nothing_outside_of_the_store_is_thrown_away(store: Store, tmp_path: Path) -> None:
@@ -118,7 +155,7 @@ def test_nothing_outside_of_the_store_is_thrown_away(store: Store, tmp_path: Pat
     os.symlink(outside, store.path / "trash")
     with pytest.raises(DamagedFile):
         trash.throw_away(store, [run.path])
-    assert trash.empty(store) == 0 and (outside / "logs" / "j1" / "a").is_file()
+    assert trash.empty(store) == [] and (outside / "logs" / "j1" / "a").is_file()
 
 
 def needed(store: Store) -> set[tuple[str, str, str]]:
@@ -168,3 +205,33 @@ def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> 
     assert found == []
     for part in ("run source", "model ant@1", "model bee@1", "entry 1 of league cup", "entry 2 of league cup"):
         assert any(part in each for each in unreadable), (part, unreadable)
+
+
+def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
+    for name in ("source", "child", "pupil", "hidden"):
+        add_run(store, name)
+    for name in ("child", "hidden"):
+        store.run(name).parent.mkdir()
+        write_json(store.run(name).path / "run.json", {"run": name, "parent": {"run": "source"}})
+    write(store.run("pupil").path / "teachers" / "source" / "weights")
+    for name in ("ant", "bee"):
+        write_json(store.models / name / "1" / "model.json", {"run": "source"})
+    leagues.create(store, league())
+    write(store.leagues / "cup" / "entries" / "1" / "entry.json", "{}")
+    closed = (
+        store.models / "ant",
+        store.leagues / "cup" / "entries",
+        store.run("hidden").path,
+        store.run("pupil").path / "teachers",
+    )
+    for path in closed:
+        path.chmod(0)
+    with permissions_count():
+        found, unreadable = references(store)
+        (store.path / "models").chmod(0)
+        assert any(each.startswith("models can't be read") for each in references(store)[1])
+    for path in (*closed, store.models):
+        path.chmod(0o755)
+    assert {each.by for each in found} == {"run child is a clone of it", "model bee@1 is of it"}
+    for part in ("model ant", "league cup", "run hidden", "run pupil"):
+        assert any(each.startswith(f"{part} can't be read ([Errno 13]") for each in unreadable), (part, unreadable)

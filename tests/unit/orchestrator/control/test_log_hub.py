@@ -333,6 +333,20 @@ def test_looks_become_rare_while_they_find_nothing_and_frequent_again_with_a_cha
     assert looks_in(0.1) >= 1
 
 
+def test_what_happens_during_a_look_has_the_next_one_come_soon(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = log_hub._Followed(world.run, "job")
+    job.found -= 1000.0
+
+    def look() -> bool:
+        job.look_soon()
+        return False
+
+    monkeypatch.setattr(job.logs, "look", look)
+    world.hub._look(job)
+    wait_for(lambda: not job.is_looked_at)
+    assert job.pause == log_hub._LOOK
+
+
 def test_an_idle_hub_has_no_thread_and_the_next_follower_starts_it_again(world: World) -> None:
     for _ in range(2):
         with world.hub.follow(world.run, "job", Waker()):

@@ -72,11 +72,22 @@ def test_outcomes_of_nodes_that_an_earlier_controller_met_are_looked_for_only_wh
     gang.presence.expect("job", 1, 2, met=[0, 1])
     seen = gang.look(runs, runs)
     assert isinstance(seen, Observed) and [each is not None for each in seen.silences] == [is_on] * 2
-    assert bool(gang.pool.calls) is is_on and gang.observer.has_silent(("job", 1)) is is_on
+    assert bool(gang.pool.calls) is is_on and gang.observer.has_hidden(("job", 1)) is is_on
     for node in range(2):
         gang.presence.came(("job", 1, node))
     gang.look(runs, runs)
-    assert not gang.observer.has_silent(("job", 1))
+    assert not gang.observer.has_hidden(("job", 1))
+
+
+@pytest.mark.parametrize("hidden", [AWAY, NodeStatus(NodePhase.RUNNING, stale="slurmctld is away")])
+def test_a_node_that_its_engine_can_t_see_is_looked_for_again_soon_also_without_a_bus(hidden: NodeStatus) -> None:
+    gang = Gang(None)
+    gang.look(hidden, NodeStatus(NodePhase.RUNNING))
+    assert gang.observer.has_hidden(("job", 1))
+    gang.write(0, 0)
+    gang.pool.carry_out()
+    gang.look(hidden, NodeStatus(NodePhase.RUNNING))
+    assert not gang.observer.has_hidden(("job", 1)), "its outcome is known"
 
 
 def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_without_an_outcome() -> None:

@@ -34,6 +34,7 @@ from shared_store.files import sync_directory
 from shared_store.layout import Store
 from tests.support.orchestrator.retention import LONG_AGO, World
 from tests.support.orchestrator.rows import job
+from tests.support.permissions import permissions_count
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job-definition/"
 
@@ -123,23 +124,21 @@ def test_a_reader_that_has_ended_keeps_nothing(world: World) -> None:
     assert world.jobs() == ["reads"] and world.runs() == []
 
 
-def test_an_array_goes_after_its_children_and_with_all_of_them(world: World) -> None:
-    world.ended("p", kind="array", directory=False)
+def test_an_array_goes_with_all_of_its_children(world: World) -> None:
+    world.ended("p", kind="array", directory=False, stopped_at=now())
     for index in range(3):
         world.ended(f"p:{index}", parent="p", run=f"p-{index}", node_properties=None)
-    world.change("p:2", stopped_at=now())
-    assert world.retention().take_all().jobs == 2
-    assert world.jobs() == ["p", "p:2"], "the child has its definition from the array"
-    world.change("p:2", stopped_at=LONG_AGO + 5)
-    world.retention().take_all()
-    world.retention().take_all()
+    assert "array p, which is kept longer" in reasons(world)["p-0"]
+    assert world.retention().take_all().jobs == 0
+    world.change("p", stopped_at=LONG_AGO + 5)
+    assert world.retention().take_all().jobs == 4
     assert world.jobs() == [] and world.runs() == []
 
 
 def test_children_of_an_array_that_has_not_ended_are_kept(world: World) -> None:
     world.add(job("p", kind="array", status="PENDING"))
     world.ended("p:0", parent="p", run="p-0", node_properties=None)
-    assert "array p, which has not ended" in reasons(world)["p-0"]
+    assert "array p, which is kept longer" in reasons(world)["p-0"]
     assert world.retention().take_all().jobs == 0
 
 
@@ -171,7 +170,7 @@ def test_the_use_of_shares_is_forgotten_once_nothing_is_left_of_it(world: World)
     with world.database.session() as session:
         for share, as_of in (("old", 1), ("new", now() - 80 * A_DAY)):
             session.add(ShareUsage(queue="default", share=share, seconds=9.0, as_of=as_of))
-    world.retention().take_all()
+    world.retention(default=inf)._pass()
     with world.database.session() as session:
         assert {each.share for each in session.scalars(select(ShareUsage))} == {"new"}
 
@@ -296,7 +295,7 @@ def test_rules_of_queues_and_of_the_controller(world: World) -> None:
     assert [each["jobs"] for each in looks] == [["default"]]
     world.ended("default", stopped_at=day, from_yaml=True)
     assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "deleted", "kept"]
-    world.add(JobQueue(name="deleted", compute_environments=["local"], tags={"muster:retention": "0m"}))
+    world.add(JobQueue(name="deleted", compute_environments=["local"], tags={"muster:retention": "1m"}))
     assert world.retention().take_all().jobs == 1 and world.jobs() == ["bad", "kept"], "created again, with a rule"
 
 
@@ -308,11 +307,63 @@ def test_a_switch_turns_it_off(world: World) -> None:
         each._next = 0.0
         each.when_due(calls.append)
         each.when_due(calls.append)
-    assert len(calls) == 1, "one pass at a time, of the one that is on"
+    assert len(calls) == 2, "one pass of each at a time"
     calls[0]()
+    assert world.jobs() == ["old"]
+    calls[1]()
     assert world.jobs() == []
     on.when_due(calls.append)
-    assert len(calls) == 1, "the next pass comes later"
+    assert len(calls) == 2, "the next pass comes later"
+
+
+def test_a_run_that_can_t_be_read_or_moved_is_kept_and_stops_no_other(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("closed", "fixed", "free", "stuck"):
+        world.ended(name)
+    folders = {name: world.store.run(name).path for name in ("closed", "fixed", "stuck")}
+    (folders["closed"] / "logs").chmod(0)
+    folders["fixed"].chmod(0o555)
+    with permissions_count():
+        assert "it can't be read ([Errno 13] Permission denied" in reasons(world)["closed"]
+        totals = world.retention().take_all()
+        assert (totals.jobs, totals.runs, totals.kept) == (2, 2, 2)
+        assert world.runs() == world.jobs() == ["closed", "fixed"]
+        with pytest.raises(
+            RunNeeded, match=r"run fixed is kept: it can't be moved into the store's trash \(Permission denied"
+        ):
+            world.retention().delete("fixed")
+        assert world.runs() == ["closed", "fixed"]
+        for path in ((folders["closed"] / "logs"), folders["fixed"]):
+            path.chmod(0o755)
+        assert world.retention().take_all().jobs == 2 and world.trashed() == []
+
+
+def test_what_stays_in_the_trash_is_named_once_a_pass(
+    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    world.ended("old")
+    monkeypatch.setattr("shutil.rmtree", lambda path, ignore_errors=False: None)
+    deleted = world.retention().delete("old")
+    [left] = world.trashed()
+    assert deleted["left"].endswith(left) and deleted["bytes"] > 0
+    with caplog.at_level(logging.WARNING):
+        world.retention()._pass()
+    assert "1 thing in the store's trash can't be removed, such as" in caplog.text and left in caplog.text
+    monkeypatch.undo()
+    world.retention()._pass()
+    assert world.trashed() == []
+
+
+def test_a_link_in_the_trash_s_place_is_a_warning_and_no_traceback(
+    world: World, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    world.ended("old")
+    (tmp_path / "elsewhere").mkdir()
+    os.symlink(tmp_path / "elsewhere", world.store.path / "trash")
+    world.retention()._pass()
+    assert "links inside a run are not followed" in caplog.text and "Traceback" not in caplog.text
+    assert world.runs() == ["old"]
 
 
 def test_in_the_first_days_after_an_upgrade_it_only_logs(world: World, caplog: pytest.LogCaptureFixture) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from orchestrator.api.context import using
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention, RunNeeded
 from orchestrator.control.run_users import RunInUse
@@ -159,3 +161,20 @@ def test_a_run_that_changes_while_a_person_has_it_deleted_stays(world: World, mo
     with pytest.raises(RunNeeded, match="run old has just changed, and nothing of it is deleted; try again"):
         world.retention().delete("old")
     assert world.runs() == ["old"] and run.log("old", 1, 0).is_file()
+
+
+def test_what_needs_runs_is_looked_for_again_before_a_run_that_was_cited_can_be_taken(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    retention, taken = world.retention(), list[bool]()
+    look_again = retention.stored.look_again
+
+    def looked() -> None:
+        taken.append(world.users.take("old"))
+        look_again()
+
+    monkeypatch.setattr(retention.stored, "look_again", looked)
+    controller: Any = SimpleNamespace(retention=retention, run_users=world.users)
+    with using(controller, "old"):
+        assert not taken
+    assert taken == [False] and world.users.take("old")

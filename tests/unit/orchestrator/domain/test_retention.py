@@ -20,6 +20,7 @@ from orchestrator.domain.retention import (
     RunFacts,
     age_of,
     decide,
+    rule_of,
     still_needed,
 )
 
@@ -99,13 +100,20 @@ def test_after_an_upgrade_nothing_goes_in_the_first_days_and_without_a_rule_noth
     ("rule", "age"), [("90d", 90 * A_DAY), ("36h", 36 * 3_600_000), ("1.5d", 36 * 3_600_000), ("off", None)]
 )
 def test_a_rule_is_a_time_or_off(rule: str, age: int | None) -> None:
-    assert age_of(rule) == age
+    assert rule_of(rule) == age
 
 
 @pytest.mark.parametrize("rule", ["", "90", "d", "-1d", "90 days", "1e9d", "Off", "99999999d"])
 def test_anything_else_is_no_rule(rule: str) -> None:
-    with pytest.raises(ValueError, match="expected one such as 90d"):
-        age_of(rule)
+    for parse in (age_of, rule_of):
+        with pytest.raises(ValueError, match="expected a time such as 90d"):
+            parse(rule)
+
+
+def test_a_person_may_ask_for_everything_and_a_rule_may_not() -> None:
+    assert age_of("0d") == 0
+    with pytest.raises(ValueError, match=r"'0d': every job would be deleted as it ends"):
+        rule_of("0d")
 
 
 class World:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from orchestrator.engines import runner
-from orchestrator.engines.api import Gang, Handle, NotYet, Plan, Traits, Transient
+from orchestrator.engines.api import Gang, Handle, NodePhase, NotYet, Plan, Traits, Transient
 from orchestrator.engines.runner import Runner
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.testing.rigs import make_gang
@@ -48,6 +48,16 @@ def test_a_stop_does_not_wait_for_ever_for_the_last_look_of_an_engine_that_hangs
     engine.answers.set()
     monkeypatch.undo()
     assert [node.exit_code for node in asked.stop(handle, 1.0)] == [143, 143]
+
+
+def test_an_engine_that_answers_for_fewer_gangs_than_it_was_asked_for_is_at_fault(
+    engine: FakeEngine, asked: Runner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handle = engine.launch(engine.plan(GANG))
+    monkeypatch.setattr(engine, "observe", lambda handles: [])
+    wait_for(lambda: asked.observe(handle), what="the answer")
+    first, _ = asked.observe(handle) or []
+    assert first.phase is NodePhase.UNREACHABLE and "ValueError" in first.words
 
 
 @pytest.mark.parametrize("engine", [FullEngine()])

@@ -173,6 +173,18 @@ def test_numbers_of_cancelled_jobs_are_forgotten_with_their_jobs(cluster: Cluste
     assert len(engine._cancelled) <= 2
 
 
+def test_what_was_cancelled_before_a_view_has_it_is_remembered(cluster: Cluster) -> None:
+    cluster.states = {"1": "RUNNING"}
+    cluster.begin("1")
+    engine = slurm.SlurmEngine()
+    seen(engine, cluster, "1")
+    for number in ("2", "3"):
+        cluster.machine.time += 0.01
+        cluster.states[number] = "PENDING"
+        engine._cancel(number)
+    assert list(engine._cancelled) == ["2", "3"]
+
+
 def test_the_settings_are_checked(cluster: Cluster) -> None:
     assert _squeue_interval(None, ["local"]) is None and _squeue_interval("1m", ["slurm"]) == 60.0
     for text, engines, words in (
