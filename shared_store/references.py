@@ -53,7 +53,9 @@ def _read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
     """What a referrer finds, with what it can't read."""
     try:
         yield from referrer(*arguments)
-    except (DamagedBundle, DamagedFile, LeagueError, ModelError, OSError) as error:
+    except DamagedBundle as error:  # which names the model
+        yield Unreadable(str(error))
+    except (DamagedFile, LeagueError, ModelError, OSError) as error:
         yield Unreadable(f"{what} can't be read ({error})")
 
 

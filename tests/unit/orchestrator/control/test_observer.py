@@ -86,7 +86,8 @@ def test_a_node_that_its_engine_can_t_see_is_looked_for_again_soon_also_without_
     assert gang.observer.has_hidden(("job", 1))
     gang.write(0, 0)
     gang.pool.carry_out()
-    gang.look(hidden, NodeStatus(NodePhase.RUNNING))
+    for _ in range(2):  # the first one takes what was read
+        gang.look(hidden, NodeStatus(NodePhase.RUNNING))
     assert not gang.observer.has_hidden(("job", 1)), "its outcome is known"
 
 
