@@ -73,8 +73,8 @@ def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
     return or_(false(), *each)
 
 
-def forget_jobs(session: Session, ids: Collection[str]) -> int:
-    """Delete the history of these jobs, but for those that a job waits for by now, and arrays with other children; returns how many were.
+def forget_jobs(session: Session, ids: Collection[str]) -> None:
+    """Delete the history of these jobs, but for those that a job waits for by now, and arrays with other children.
 
     Definitions that nothing else needs go with them.
     """
@@ -101,7 +101,6 @@ def forget_jobs(session: Session, ids: Collection[str]) -> int:
     ):
         session.execute(delete(table).where(column.in_(gone)))
     _forget_definitions(session, {row.definition for row in found})
-    return len(gone)
 
 
 def forget_owners(session: Session, runs: Collection[str]) -> None:

@@ -23,7 +23,7 @@ FOUND_AT = {
     "look": (0, "runs, and its job is STARTING"),
     "missing": (0, "and its controller has not met"),
     "stop": (18, "and its engine is away"),
-    "T1": (3, "the store does not have its run"),
+    "T1": (2, "the store does not have its run"),
     "T2": (12, "is FAILED (main node: exit 0, outcome not written"),
 }
 """The first seed that finds each mutant, and how: ``python -m tests.support.simulation 0 200 --mutant B1``."""
