@@ -115,6 +115,15 @@ def json_object(data: bytes | str, name: str) -> dict[str, Any]:
     return value
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is anything, also a link that leads nowhere. Raises OSError where that can't be seen."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def refuse_links(path: Path, levels: int) -> None:
     """Raise DamagedFile if directory ``path``, or one of the ``levels - 1`` above it, is a link, which leads out of the run."""
     for each in (path, *path.parents[: levels - 1]):

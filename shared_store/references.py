@@ -5,14 +5,13 @@ A new kind of thing that needs runs adds a function to :data:`REFERRERS`.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from shared_store import leagues, models
 from shared_store.bundles import DamagedBundle
-from shared_store.files import DamagedFile, read_json
+from shared_store.files import DamagedFile, is_there, read_json
 from shared_store.layout import LARGEST_DESCRIPTION, Store, names_in
 from shared_store.leagues import LeagueError
 from shared_store.models import Model, ModelError
@@ -107,24 +106,15 @@ def _of_runs(store: Store) -> Found:
 
 
 def _of_run(name: str, path: Path) -> Found:
-    if _is_there(path / "parent"):
+    if is_there(path / "parent"):
         described = read_json(path / "run.json", LARGEST_DESCRIPTION) or {}
         yield from _run(_part(described.get("parent"), "run"), f"run {name} is a clone of it")
-    if _is_there(path / "teachers"):
+    if is_there(path / "teachers"):
         for teacher in names_in(path / "teachers"):
             yield from _run(teacher, f"it is the teacher of run {name}")
 
 
 REFERRERS: dict[str, Callable[[Store], Found]] = {"models": _of_models, "leagues": _of_leagues, "runs": _of_runs}
-
-
-def _is_there(path: Path) -> bool:
-    """Raises OSError where that can't be seen."""
-    try:
-        os.lstat(path)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    return True
 
 
 def _part(value: Any, key: str) -> Any:

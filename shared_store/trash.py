@@ -5,6 +5,7 @@ Whatever dies in between, a directory is either whole in its place or in the tra
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import stat
@@ -15,6 +16,9 @@ from pathlib import Path
 
 from shared_store.files import refuse_links, sync_directory
 from shared_store.layout import Store
+
+_FIXED = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.EXDEV)
+"""Errors that say something of one directory: it may not be written, or another volume is mounted there."""
 
 
 def throw_away(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Path, OSError]]:
@@ -45,7 +49,9 @@ def throw_away(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Pa
                 os.rename(path, there)
             except FileNotFoundError:
                 continue
-            except OSError as error:  # a directory that may not be written can't be moved
+            except OSError as error:
+                if error.errno not in _FIXED:
+                    raise
                 kept[path] = error
             else:
                 thrown.append(there)
@@ -59,18 +65,26 @@ def throw_away(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Pa
 
 def remove(thrown: Path) -> bool:
     """Remove what was thrown away, and return whether nothing is left; :func:`empty` tries again."""
-    with suppress(OSError):
+    with suppress(OSError, RecursionError):
         if thrown.is_symlink() or not thrown.is_dir():
             thrown.unlink()
         shutil.rmtree(thrown, ignore_errors=True)
         if thrown.exists():  # a job may have left directories that may not be written
-            thrown.chmod(stat.S_IRWXU)
-            for folder, names, _ in os.walk(thrown):
-                for path in (os.path.join(folder, name) for name in names):
-                    if not os.path.islink(path):
-                        os.chmod(path, stat.S_IRWXU)
-            shutil.rmtree(thrown)
+            _open_up(thrown)
+            shutil.rmtree(thrown, ignore_errors=True)
     return not os.path.lexists(thrown)
+
+
+def _open_up(directory: str | Path, within: int | None = None) -> None:
+    """Allow this user everything in a directory and those below, as far as that can be changed; no link is followed."""
+    with suppress(OSError):
+        descriptor = os.open(directory, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=within)
+        try:
+            os.chmod(f"/proc/self/fd/{descriptor}", stat.S_IRWXU)
+            for each in os.listdir(f"/proc/self/fd/{descriptor}"):
+                _open_up(each, descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def empty(store: Store) -> list[Path]:

@@ -50,7 +50,7 @@ def list_runs(
                 "max": _A_PAGE,
                 "archived": str(archived).lower(),
             }
-            page = client.get("/api/runs", **query)
+            page = client.get("/api/runs", **query, seconds=610)
             found = [*found, *page]
     if as_json:
         echo_json(found, indent=1)

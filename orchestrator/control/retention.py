@@ -29,7 +29,7 @@ from orchestrator.control.stored_runs import StoredRuns
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import Decision, JobFacts, References, Rules, RunFacts, decide, still_needed
+from orchestrator.domain.retention import JobFacts, References, Rules, RunFacts, decide, still_needed
 from orchestrator.persistence import references as rows
 from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart
@@ -100,6 +100,8 @@ class Retention:
         self._next, self._next_report = machine.monotonic() + _FIRST, machine.monotonic()
         self._is_under_way = False
         self._is_closing, self._passing = threading.Event(), threading.Lock()
+        self._fixed = dict[Path, OSError]()
+        """What the last pass could not move into the trash, and why."""
 
     # -- passes ---------------------------------------------------------------------------------------------------------
 
@@ -147,7 +149,13 @@ class Retention:
 
     def take_all(self) -> Totals:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
+        self._fixed.clear()
         totals = self._all(lambda rules, place: self.step(place, rules, take=True))
+        if self._fixed:
+            count, first = counted(len(self._fixed), "old directory"), next(iter(self._fixed.values()))
+            log.warning(
+                "%s can't be moved into the store's trash, such as %s (%s)", count, first.filename, first.strerror
+            )
         if totals.jobs or totals.runs:
             log.info(
                 "retention took %s; %d runs are kept that are old enough, see `muster gc --dry-run`",
@@ -245,7 +253,13 @@ class Retention:
             try:
                 again = self._looks(taken, rules, moment, whose)
                 described |= {look.run: look.described() for look in again}
-                described |= {look.run: look.described() for look in self._carry_out(again)}
+                gone, stay = self._carry_out(again)
+                for run, why in stay.items():
+                    described[run] |= {"whole": False, "kept": [why]}
+                for each in (described[run] for run in taken):
+                    each["jobs"] = [job for job in each["jobs"] if job in gone]
+                    if not each["jobs"]:
+                        each |= {"whole": False, "bytes": 0, "files": 0}
             finally:
                 for run in taken:
                     self._users.let_go(run)
@@ -265,7 +279,7 @@ class Retention:
         facts = self.stored.facts(runs)
         with self._database.session() as session:  # after the store: what was submitted meanwhile counts
             jobs = self._jobs(session, runs, rules, moment, whose)
-            needed = References.of(rows.references(session, runs, rules, moment)) | stored
+            needed = References.of(rows.references(session, runs)) | stored
         needed = needed if whose.queues is None else needed.unnamed()
         return [self._look(run, facts[run], jobs[run], needed) for run in sorted(runs)]
 
@@ -293,33 +307,36 @@ class Retention:
             name, decision, facts, tuple(path for job in decision.jobs for path in contents.job_directories(run, job))
         )
 
-    def _carry_out(self, looks: Sequence[Look]) -> list[Look]:
-        """Move into the trash what goes, delete the rows, and empty the trash; returns what stays, since it has changed.
+    def _carry_out(self, looks: Sequence[Look]) -> tuple[Collection[str], Mapping[str, str]]:
+        """Move into the trash what goes, delete the rows, and empty the trash.
 
-        Raises Unavailable, OSError.
+        Returns the jobs that went, and why something of a run stays, by run. Raises Unavailable, OSError.
         """
-        gone, stay = list[Look](), list[Look]()
+        unchanged, stay, gone = list[Look](), dict[str, str](), set[str]()
         self.stored.check()
-        thrown, fixed = trash.throw_away(self._store, self._directories(looks, gone, stay))
+        thrown, fixed = trash.throw_away(self._store, self._directories(looks, unchanged, stay))
         self.stored.check()
-        for look in list(gone):
-            if errors := [fixed[path] for path in look.directories if path in fixed]:
-                gone.remove(look)
-                stay.append(_staying(look, _unmoved(errors[0])))
+        self._fixed |= fixed
+        going = list[str]()
+        for look in unchanged:
+            held = [path for path in look.directories if path in fixed]
+            if held:
+                stay[look.run] = _unmoved(fixed[held[0]])
+            if not (held and look.decision.run):
+                going += set(look.decision.jobs) - {path.name for path in held}
         if self._is_closing.is_set():
-            return stay  # the next controller deletes the rows
-        # an array behind its children
-        jobs = sorted((job for look in gone for job in look.decision.jobs), key=lambda job: ":" not in job)
-        runs = [look.run for look in gone if look.decision.run or look.facts is None]
-        for start in range(0, len(jobs), A_TRANSACTION):
+            return gone, stay  # the next controller deletes the rows
+        going.sort(key=lambda job: ":" not in job)  # an array behind its children
+        runs = [look.run for look in unchanged if look.run not in stay and (look.decision.run or look.facts is None)]
+        for start in range(0, len(going), A_TRANSACTION):
             with self._writing, self._database.session() as session:
-                rows.forget_jobs(session, jobs[start : start + A_TRANSACTION])
-                if start + A_TRANSACTION >= len(jobs):
+                gone |= rows.forget_jobs(session, going[start : start + A_TRANSACTION])
+                if start + A_TRANSACTION >= len(going):
                     rows.forget_owners(session, runs)
         self._remove(thrown)
-        return stay
+        return gone, stay
 
-    def _directories(self, looks: Sequence[Look], gone: list[Look], stay: list[Look]) -> Iterator[Path]:
+    def _directories(self, looks: Sequence[Look], unchanged: list[Look], stay: dict[str, str]) -> Iterator[Path]:
         """The directories that go. Each run is read again right before: since it was looked at, another controller may have begun an
         attempt of it, which no lock of this one keeps out.
         """
@@ -327,10 +344,10 @@ class Retention:
             if not look.decision.jobs:
                 continue
             if self.stored.is_unchanged(look.run, look.facts):
-                gone.append(look)
+                unchanged.append(look)
                 yield from look.directories
             else:
-                stay.append(_staying(look, "it has just changed"))
+                stay[look.run] = "it has just changed"
 
     def _remove(self, thrown: Sequence[Path]) -> None:
         """Remove what was thrown away, several at once: each waits for the file system's journal."""
@@ -344,7 +361,7 @@ class Retention:
         rules, moment = self.rules(), self._moment()
         with self._database.session() as session:
             jobs = rows.jobs_of_runs(session, [name], rules, moment)[name]
-            needed = References.of(rows.references(session, [name], rules, moment)) | stored
+            needed = References.of(rows.references(session, [name])) | stored
         needed = needed if whose.queues is None else needed.unnamed()
         return facts, [] if facts is None else still_needed(facts, jobs, needed)
 
@@ -394,10 +411,6 @@ class Retention:
 
     def _moment(self) -> int:
         return min(now(), self._steady())
-
-
-def _staying(look: Look, why: str) -> Look:
-    return Look(look.run, Decision(False, (), (why,)), look.facts, ())
 
 
 def _unmoved(error: OSError) -> str:

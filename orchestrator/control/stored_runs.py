@@ -11,6 +11,7 @@ from orchestrator import machine
 from orchestrator.control.peers import Peers
 from orchestrator.domain.retention import Reference, References, RunFacts
 from shared_store import contents
+from shared_store.files import is_there
 from shared_store.layout import Run, Store
 from shared_store.references import references
 
@@ -55,8 +56,8 @@ class StoredRuns:
             inside = contents.contents(run)
             archived = contents.archived(run)
             writer = self._peers.writer(run)
-        except FileNotFoundError:
-            return None
+        except FileNotFoundError as error:
+            return RunFacts(run.name, damage=str(error)) if is_there(run.path) else None
         except (OSError, ValueError) as error:  # which may be one of this run alone: the volume is checked afterwards
             return RunFacts(run.name, damage=str(error))
         return RunFacts(run.name, inside.epoch, inside.results, inside.logged, _by_whom(archived), writer)

@@ -22,17 +22,24 @@ _UNUSED = 90 * A_DAY
 
 
 def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules, moment: int) -> dict[str, list[JobFacts]]:
-    """All jobs of these runs, by run, as they are at a moment (Unix time [ms])."""
+    """All jobs of these runs, by run, as they are at a moment (Unix time [ms]). The jobs of an array are due together."""
     found: dict[str, list[JobFacts]] = {run: [] for run in runs}
-    is_due = case((due(rules, moment), True), else_=False)  # where the time is missing, neither is known
+    other = aliased(Job)
+    of_array = or_(other.parent == Job.id, other.id == Job.parent)
+    is_kept = (
+        select(other.id).where(of_array, or_(other.stopped_at.is_(None), not_(due(rules, moment, other)))).exists()
+    )
+    is_due = case(
+        (and_(due(rules, moment), not_(is_kept)), True), else_=False
+    )  # where the time is missing, neither is known
     query = select(Job.id, Job.run, Job.status, is_due).where(Job.run.in_(runs))
     for job, run, status, due_now in session.execute(query.order_by(Job.created_at, Job.id)):
         found[run].append(JobFacts(job, status not in TERMINAL, due_now))
     return found
 
 
-def references(session: Session, runs: Collection[str], rules: Rules, moment: int) -> Iterator[Reference]:
-    """What needs these runs, or jobs of them, at a moment (Unix time [ms])."""
+def references(session: Session, runs: Collection[str]) -> Iterator[Reference]:
+    """What needs these runs, or jobs of them."""
     is_open = Job.status.not_in(TERMINAL)
     uses = select(RunUse.run, Job.id).join(Job, Job.id == RunUse.job_id)
     for used, job in session.execute(uses.where(RunUse.run.in_(runs), is_open)):
@@ -44,17 +51,10 @@ def references(session: Session, runs: Collection[str], rules: Rules, moment: in
     waits = select(Dependency.on_id, Dependency.job_id).join(Job, Job.id == Dependency.job_id)
     for job, waiting in session.execute(waits.where(Dependency.on_id.in_(ids), is_open)):
         yield Reference("job", job, f"job {waiting} waits for it")
-    array, child = aliased(Job), aliased(Job)
+    array = aliased(Job)
     of_array = select(Job.id, array.id).join(array, array.id == Job.parent).where(Job.run.in_(runs))
-    for job, parent in session.execute(of_array.where(_is_kept(array, rules, moment))):
-        yield Reference("job", job, f"it belongs to array {parent}, which is kept longer")
-    kept = select(child.id).where(child.parent == Job.id, _is_kept(child, rules, moment))
-    for job in session.scalars(select(Job.id).where(Job.run.in_(runs), Job.kind == "array", kept.exists())):
-        yield Reference("job", job, f"children of array {job} are kept longer")
-
-
-def _is_kept(job: type[Job], rules: Rules, moment: int) -> ColumnElement[bool]:
-    return or_(job.stopped_at.is_(None), not_(due(rules, moment, job)))
+    for job, parent in session.execute(of_array.where(array.status.not_in(TERMINAL))):
+        yield Reference("job", job, f"it belongs to array {parent}, which has not ended")
 
 
 def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
@@ -73,8 +73,8 @@ def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
     return or_(false(), *each)
 
 
-def forget_jobs(session: Session, ids: Collection[str]) -> None:
-    """Delete the history of these jobs, but for those that a job waits for by now, and arrays with other children.
+def forget_jobs(session: Session, ids: Collection[str]) -> set[str]:
+    """Delete the history of these jobs, but for those that a job waits for by now, and arrays with other children; returns what went.
 
     Definitions that nothing else needs go with them.
     """
@@ -101,6 +101,7 @@ def forget_jobs(session: Session, ids: Collection[str]) -> None:
     ):
         session.execute(delete(table).where(column.in_(gone)))
     _forget_definitions(session, {row.definition for row in found})
+    return set(gone)
 
 
 def forget_owners(session: Session, runs: Collection[str]) -> None:

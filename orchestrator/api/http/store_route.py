@@ -53,7 +53,7 @@ def _on_store(endpoint: Callable[..., Any], reads: bool) -> Callable[..., Corout
             return await _calls.get().answer(partial(endpoint, **parameters), works=works)
         except OSError as error:
             raise Unavailable(
-                f"the store can't be used ({error}); see whether its volume is well, and try again"
+                f"something in the store can't be used ({error}); see whether its volume is well, and try again"
             ) from error
 
     return answer

@@ -208,7 +208,7 @@ class SlurmEngine:
 
     def _cancel(self, number: str) -> None:
         """Cancel a job, and remember that it was not somebody else who did."""
-        known, taken = self._jobs.value, self._jobs.taken
+        taken, known = self._jobs.taken, self._jobs.value
         for each, at in list(self._cancelled.items()):
             if each not in known and at < taken:  # an older view may not have it yet
                 self._cancelled.pop(each, None)

@@ -34,7 +34,6 @@ from shared_store.files import sync_directory
 from shared_store.layout import Store
 from tests.support.orchestrator.retention import LONG_AGO, World
 from tests.support.orchestrator.rows import job
-from tests.support.permissions import permissions_count
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job-definition/"
 
@@ -124,22 +123,39 @@ def test_a_reader_that_has_ended_keeps_nothing(world: World) -> None:
     assert world.jobs() == ["reads"] and world.runs() == []
 
 
-def test_an_array_goes_with_all_of_its_children(world: World) -> None:
-    world.ended("p", kind="array", directory=False, stopped_at=now())
+def test_the_jobs_of_an_array_go_when_all_of_them_are_old_enough(world: World) -> None:
+    world.ended("p", kind="array", directory=False)
     for index in range(3):
         world.ended(f"p:{index}", parent="p", run=f"p-{index}", node_properties=None)
-    assert "array p, which is kept longer" in reasons(world)["p-0"]
-    assert world.retention().take_all().jobs == 0
-    world.change("p", stopped_at=LONG_AGO + 5)
+    for young in ("p", "p:2"):
+        world.change(young, stopped_at=now())
+        if young == "p":
+            assert world.retention().take_all().jobs == 0 and reasons(world) == {}, "its children wait for it"
+        world.change(young, stopped_at=LONG_AGO + 5)
     assert world.retention().take_all().jobs == 4
     assert world.jobs() == [] and world.runs() == []
+
+
+def test_an_array_stays_with_the_last_of_its_children_and_is_not_counted(world: World) -> None:
+    world.ended("p", kind="array", directory=False, stopped_at=LONG_AGO + 5)
+    for index in range(3):
+        world.ended(f"p:{index}", parent="p", run=f"p-{index}", node_properties=None)
+    contents.archive(world.store.run("p-1"), "key a")
+    totals = world.retention().take_all()
+    assert (totals.jobs, totals.runs) == (2, 2) and world.jobs() == ["p", "p:1"]
+    assert world.retention().take_all().jobs == 0
+    contents.unarchive(world.store.run("p-1"))
+    assert world.retention().take_all().jobs == 2 and world.jobs() == []
 
 
 def test_children_of_an_array_that_has_not_ended_are_kept(world: World) -> None:
     world.add(job("p", kind="array", status="PENDING"))
     world.ended("p:0", parent="p", run="p-0", node_properties=None)
-    assert "array p, which is kept longer" in reasons(world)["p-0"]
     assert world.retention().take_all().jobs == 0
+    with pytest.raises(RunNeeded, match="it belongs to array p, which has not ended"):
+        world.retention().delete("p-0")
+    world.change("p", status="SUCCEEDED", stopped_at=now())
+    assert world.retention().delete("p-0")["files"] == 3, "a person need not wait for a rule"
 
 
 def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,30 +267,6 @@ def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
     assert world.jobs() == [] and world.trashed() == []
 
 
-def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
-    world.ended("old")
-
-    def away() -> None:
-        raise OSError("the volume is not there")
-
-    world.absent = away
-    with pytest.raises(OSError):
-        world.retention().take_all()
-    assert world.jobs() == ["old"] and world.runs() == ["old"]
-    os.rename(world.store.path, world.store.path.with_name("gone"))  # it vanishes between two looks
-    checks = [0]
-
-    def vanishing() -> None:
-        checks[0] += 1
-        if checks[0] > 3:
-            raise OSError("the volume is not there")
-
-    world.absent = vanishing
-    with pytest.raises(OSError):
-        world.retention().take_all()
-    assert world.jobs() == ["old"]
-
-
 # -- rules, owners, definitions -----------------------------------------------------------------------------------------
 
 
@@ -314,56 +306,6 @@ def test_a_switch_turns_it_off(world: World) -> None:
     assert world.jobs() == []
     on.when_due(calls.append)
     assert len(calls) == 2, "the next pass comes later"
-
-
-def test_a_run_that_can_t_be_read_or_moved_is_kept_and_stops_no_other(
-    world: World, caplog: pytest.LogCaptureFixture
-) -> None:
-    for name in ("closed", "fixed", "free", "stuck"):
-        world.ended(name)
-    folders = {name: world.store.run(name).path for name in ("closed", "fixed", "stuck")}
-    (folders["closed"] / "logs").chmod(0)
-    folders["fixed"].chmod(0o555)
-    with permissions_count():
-        assert "it can't be read ([Errno 13] Permission denied" in reasons(world)["closed"]
-        totals = world.retention().take_all()
-        assert (totals.jobs, totals.runs, totals.kept) == (2, 2, 2)
-        assert world.runs() == world.jobs() == ["closed", "fixed"]
-        with pytest.raises(
-            RunNeeded, match=r"run fixed is kept: it can't be moved into the store's trash \(Permission denied"
-        ):
-            world.retention().delete("fixed")
-        assert world.runs() == ["closed", "fixed"]
-        for path in ((folders["closed"] / "logs"), folders["fixed"]):
-            path.chmod(0o755)
-        assert world.retention().take_all().jobs == 2 and world.trashed() == []
-
-
-def test_what_stays_in_the_trash_is_named_once_a_pass(
-    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    world.ended("old")
-    monkeypatch.setattr("shutil.rmtree", lambda path, ignore_errors=False: None)
-    deleted = world.retention().delete("old")
-    [left] = world.trashed()
-    assert deleted["left"].endswith(left) and deleted["bytes"] > 0
-    with caplog.at_level(logging.WARNING):
-        world.retention()._pass()
-    assert "1 thing in the store's trash can't be removed, such as" in caplog.text and left in caplog.text
-    monkeypatch.undo()
-    world.retention()._pass()
-    assert world.trashed() == []
-
-
-def test_a_link_in_the_trash_s_place_is_a_warning_and_no_traceback(
-    world: World, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    world.ended("old")
-    (tmp_path / "elsewhere").mkdir()
-    os.symlink(tmp_path / "elsewhere", world.store.path / "trash")
-    world.retention()._pass()
-    assert "links inside a run are not followed" in caplog.text and "Traceback" not in caplog.text
-    assert world.runs() == ["old"]
 
 
 def test_in_the_first_days_after_an_upgrade_it_only_logs(world: World, caplog: pytest.LogCaptureFixture) -> None:
@@ -431,14 +373,3 @@ def test_a_run_is_deleted_whole_and_its_jobs_stay_in_the_history(world: World) -
     with world.database.session() as session:
         assert session.get(RunRecord, "old") is None, "a new run of the name has an owner of its own"
     assert world.retention().delete("old")["files"] == 0
-
-
-def test_what_can_t_be_read_in_the_store_keeps_a_run_with_results_from_being_deleted(world: World) -> None:
-    world.ended("old")
-    world.ended("full")
-    (world.store.run("full").path / "results.csv").write_text("1")
-    (world.store.models / "ant" / "1").mkdir(parents=True)
-    with pytest.raises(RunNeeded, match=r"model ant@1.*model.json is missing, and may need it"):
-        world.retention().delete("full")
-    world.retention().delete("old")
-    assert world.runs() == ["full"]

@@ -1,0 +1,143 @@
+"""Retention where something in the store can't be read, moved or removed, and where the store is away."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orchestrator.control.retention import RunNeeded
+from tests.support.orchestrator.retention import World
+from tests.support.permissions import permissions_count
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    world = World(tmp_path)
+    yield world
+    world.database.close()
+
+
+def reasons(world: World) -> dict[str, str]:
+    """Of each run that is kept, why."""
+    looks, _ = world.step(take=False)
+    return {each["run"]: "; ".join(each["kept"]) for each in looks if each["kept"]}
+
+
+def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
+    world.ended("old")
+
+    def away() -> None:
+        raise OSError("the volume is not there")
+
+    world.absent = away
+    with pytest.raises(OSError):
+        world.retention().take_all()
+    assert world.jobs() == ["old"] and world.runs() == ["old"]
+    os.rename(world.store.path, world.store.path.with_name("gone"))  # it vanishes between two looks
+    checks = [0]
+
+    def vanishing() -> None:
+        checks[0] += 1
+        if checks[0] > 3:
+            raise OSError("the volume is not there")
+
+    world.absent = vanishing
+    with pytest.raises(OSError):
+        world.retention().take_all()
+    assert world.jobs() == ["old"]
+
+
+def test_a_run_that_can_t_be_read_or_moved_is_kept_and_stops_no_other(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("closed", "fixed", "free", "stuck"):
+        world.ended(name)
+    closed, fixed = world.store.run("closed").path / "logs", world.store.run("fixed").path
+    closed.chmod(0)
+    fixed.chmod(0o555)
+    with permissions_count():
+        assert "it can't be read ([Errno 13] Permission denied" in reasons(world)["closed"]
+        totals = world.retention().take_all()
+        assert (totals.jobs, totals.runs, totals.kept) == (2, 2, 2)
+        assert world.runs() == world.jobs() == ["closed", "fixed"]
+        warning = f"1 old directory can't be moved into the store's trash, such as {fixed} (Permission denied)"
+        assert [each.getMessage() for each in caplog.records] == [warning]
+        with pytest.raises(
+            RunNeeded, match=r"run fixed is kept: it can't be moved into the store's trash \(Permission denied"
+        ):
+            world.retention().delete("fixed")
+        assert world.runs() == ["closed", "fixed"]
+        for path in (closed, fixed):
+            path.chmod(0o755)
+        assert world.retention().take_all().jobs == 2 and world.trashed() == []
+
+
+def test_a_log_that_can_t_be_moved_keeps_its_job_alone(world: World) -> None:
+    for name in ("a", "b"):
+        world.ended(name, run="r")
+    run = world.store.run("r")
+    (run.path / "results.csv").write_text("1")
+    held = run.path / "outcomes" / "a"
+    held.chmod(0o555)
+    with permissions_count():
+        [look], _ = world.step(take=True)
+        assert look["jobs"] == ["b"] and look["kept"] == [
+            f"it can't be moved into the store's trash (Permission denied: {held})"
+        ]
+        held.chmod(0o755)
+    assert world.jobs() == ["a"] and world.retention().take_all().jobs == 1 and world.jobs() == []
+
+
+def test_a_volume_that_fails_ends_the_step(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.ended("old")
+
+    def fail(source: Path, _target: Path) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(source))
+
+    monkeypatch.setattr("os.rename", fail)
+    with pytest.raises(OSError, match="Read-only"):
+        world.retention().take_all()
+    assert world.jobs() == world.runs() == ["old"]
+
+
+def test_what_stays_in_the_trash_is_named_once_a_pass(
+    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    world.ended("old")
+    monkeypatch.setattr("shutil.rmtree", lambda path, ignore_errors=False: None)
+    deleted = world.retention().delete("old")
+    [left] = world.trashed()
+    assert deleted["left"].endswith(left) and deleted["bytes"] > 0
+    with caplog.at_level(logging.WARNING):
+        world.retention()._pass()
+    assert "1 thing in the store's trash can't be removed, such as" in caplog.text and left in caplog.text
+    monkeypatch.undo()
+    world.retention()._pass()
+    assert world.trashed() == []
+
+
+def test_a_link_in_the_trash_s_place_is_a_warning_and_no_traceback(
+    world: World, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    world.ended("old")
+    (tmp_path / "elsewhere").mkdir()
+    os.symlink(tmp_path / "elsewhere", world.store.path / "trash")
+    world.retention()._pass()
+    assert "links inside a run are not followed" in caplog.text and "Traceback" not in caplog.text
+    assert world.runs() == ["old"]
+
+
+def test_what_can_t_be_read_in_the_store_keeps_a_run_with_results_from_being_deleted(world: World) -> None:
+    world.ended("old")
+    world.ended("full")
+    (world.store.run("full").path / "results.csv").write_text("1")
+    (world.store.models / "ant" / "1").mkdir(parents=True)
+    with pytest.raises(RunNeeded, match=r"model ant@1.*model.json is missing, and may need it"):
+        world.retention().delete("full")
+    world.retention().delete("old")
+    assert world.runs() == ["full"]
