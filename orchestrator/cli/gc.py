@@ -23,7 +23,10 @@ def register(app: typer.Typer) -> None:
 
 def gc(
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Delete nothing: print what would go, how much, and why the rest is kept.")
+        bool,
+        typer.Option(
+            "--dry-run", help="Delete nothing: print what would go, how much, and why other old runs are kept."
+        ),
     ] = False,
     older_than: Annotated[
         str | None,
@@ -56,6 +59,8 @@ def gc(
     files = counted(sum(each["files"] for each in gone), "file")
     what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {files}, {size / 2**20:.1f} MiB"
     echo(f"would delete {what}" if dry_run else f"deleted {what}")
+    if not found:
+        echo("no job of yours is old enough by the rule of its queue; `muster gc --help` says which rules there are")
 
 
 def _parts(client: Client, dry_run: bool, older_than: str) -> Iterator[list[dict[str, Any]]]:

@@ -118,4 +118,5 @@ def _confirm(client: Client, run: str) -> None:
     if not sys.stdin.isatty():
         raise UsageError(f"run {run} is not deleted: give --yes where nobody can be asked")
     found = client.get(f"/api/runs/{named(run)}")
-    typer.confirm(f"delete run {run} with {counted(found['checkpoints'], 'checkpoint')} for good?", abort=True)
+    what = f"{counted(found['checkpoints'], 'checkpoint')} and everything else in it"
+    typer.confirm(f"delete run {run} with {what} for good?", abort=True)

@@ -32,7 +32,7 @@ from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import JobFacts, References, Rules, RunFacts, decide, still_needed
 from orchestrator.persistence import references as rows
 from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
-from orchestrator.persistence.own_models import RetentionStart
+from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
 from shared_store import contents, trash
 from shared_store.files import DamagedFile
@@ -366,9 +366,10 @@ class Retention:
         return facts, [] if facts is None else still_needed(facts, jobs, needed)
 
     def open_job(self, name: str) -> str | None:
-        """A job of the run that has not ended."""
+        """A job that has not ended, of the run or one that uses it."""
         with self._database.session() as session:
-            query = select(Job.id).where(Job.run == name, Job.status.not_in(TERMINAL))
+            using = select(RunUse.job_id).where(RunUse.run == name)
+            query = select(Job.id).where(or_(Job.run == name, Job.id.in_(using)), Job.status.not_in(TERMINAL))
             return session.scalars(query.limit(1)).first()
 
     def delete(self, name: str, whose: Whose = CONTROLLER) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def age_of(text: str) -> int:
     """Milliseconds of a time such as ``90d``, ``36h`` or ``45m``. Raises ValueError, in one line."""
     match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([mhd])", text.strip())
     if match is None:
-        raise ValueError(f"{text[:40]!r}: expected a time such as 90d, 36h or 45m")
+        raise ValueError(f"{text[:40]!r}: expected days, hours or minutes, such as 90d, 36h or 45m")
     return int(float(match[1]) * _UNITS[match[2]])
 
 

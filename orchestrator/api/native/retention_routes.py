@@ -105,9 +105,14 @@ def _part(reconciler: Reconciler, after: str, older_than: str, *, take: bool) ->
     whose = _caller()
     try:
         place = Place.of(after) if after else Place()
-        older = age_of(older_than) if older_than else None
     except ValueError as error:
         raise ClientError(str(error)) from None
+    try:
+        older = age_of(older_than) if older_than else None
+    except ValueError as error:
+        raise ClientError(f"older_than: {error}") from None
+    if not after:
+        reconciler.retention.stored.look_again()  # others may have changed the store
     found: list[dict[str, Any]] = []
     deadline = time.monotonic() + _A_PART
     while True:

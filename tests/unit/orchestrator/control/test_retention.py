@@ -116,6 +116,13 @@ def test_a_run_that_something_needs_is_kept_with_its_jobs(
     assert (world.store.run("old").path / "logs" / "old").is_dir()
 
 
+def test_a_job_that_uses_a_run_is_one_of_its_open_jobs(world: World) -> None:
+    world.ended("old")
+    assert world.retention().open_job("old") is None
+    world.add(job("reader", status="RUNNABLE"), RunUse(job_id="reader", run="old"))
+    assert world.retention().open_job("old") == "reader"
+
+
 def test_a_reader_that_has_ended_keeps_nothing(world: World) -> None:
     world.ended("old")
     world.add(job("reads", status="FAILED", stopped_at=now()), RunUse(job_id="reads", run="old"))

@@ -106,7 +106,7 @@ def test_a_rule_is_a_time_or_off(rule: str, age: int | None) -> None:
 @pytest.mark.parametrize("rule", ["", "90", "d", "-1d", "90 days", "1e9d", "Off", "99999999d"])
 def test_anything_else_is_no_rule(rule: str) -> None:
     for parse in (age_of, rule_of):
-        with pytest.raises(ValueError, match="expected a time such as 90d"):
+        with pytest.raises(ValueError, match="expected days, hours or minutes, such as 90d"):
             parse(rule)
 
 
