@@ -72,6 +72,9 @@ def logs(
             if found != hint:
                 echo(found, err=True)
             return
+        if not came and (detail := client.get(f"/api/jobs/{named(job)}"))["runIsGone"]:
+            echo(f"run {detail['run']} was deleted, and the log of job {job} with it", err=True)
+            return
     if not came:
         asked = {"node": node, "rank": rank, "attempt": attempt}
         of = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)

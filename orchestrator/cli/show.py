@@ -61,6 +61,13 @@ def _gpus(node: dict[str, Any]) -> str:
     return f", {counted(len(node['gpus']), 'GPU')}"
 
 
+def _fate(detail: dict[str, Any]) -> str:
+    """What became of the job's run, if it is not there any more."""
+    if detail["runIsReplaced"]:
+        return " (gone; another run has its name now)"
+    return " (deleted, with its logs)" if detail["runIsGone"] else ""
+
+
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
     """Show a job: its state and the reason, its attempts and nodes, its run and results."""
     with Client.connect() as client:
@@ -79,7 +86,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "created": when(detail["createdAt"]),
         "took": took(detail["ranSeconds"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
-        "run": detail["run"] + (" (gone; another run has its name now)" if detail["runIsReplaced"] else ""),
+        "run": detail["run"] + _fate(detail),
         "store": one_line(detail.get("storeProblem") or ""),
         _OF_RUN.get(detail["kind"], ""): _source(detail),
         "started from": started_from((detail["results"] or {}).get("parent")),
@@ -135,7 +142,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
                 state = f"{code}: {one_line(node.get('reason', '')).removeprefix(f'{code}, ')}"
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
-            if node["log"]:  # not before the attempt has its run
+            if node["log"] and not detail["runIsGone"]:  # not before the attempt has its run
                 console.print(f"      {node['log']}", markup=False, style="dim")
 
 

@@ -127,20 +127,22 @@ def job_detail(
 
     ``awsCode``: what the AWS Batch API states beyond ``statusReason``: AWS's code, or AWS's own words. ``ranSeconds``: how long all
     attempts ran, together. ``phase``: what a training does at present. ``children``: of an array, those that failed first.
-    ``storeProblem``: why there are no results, where the store does not answer.
+    ``storeProblem``: why there are no results, where the store does not answer. ``runIsGone``: it was deleted;
+    ``runIsReplaced``: another run has its name now.
     ``withoutEffect``: members of its definition for Fargate, which change nothing here.
     """
     reconciler = reconciler_of(request)
     with reconciler.database.session() as session:
         job = permitted_job(session, reference, Operation.READ_JOB)
         run = reconciler.store.run(job.run)
-    problem, is_replaced, results, progress = None, False, None, None
+    problem, is_replaced, is_gone, results, progress = None, False, False, None, None
     try:
         found = reconciler.calls.call(partial(facts_of, run)) if store else None
         if found is not None:
             with reconciler.database.session() as session:
                 owner = owner_of(session, found)
             is_replaced = is_of_earlier_run(job, found)
+            is_gone = found.missing and job.first_epoch is not None and job.stopped_at is not None
             # a job may continue a run of another queue
             if owner is not None and permissions.is_visible(owner) and not is_replaced:
                 results, progress = reconciler.calls.call(partial(_results, run))
@@ -159,6 +161,7 @@ def job_detail(
                 "owner": job.owner,
                 "run": job.run,
                 "runIsReplaced": is_replaced,
+                "runIsGone": is_gone,
                 "kind": job_list.kind_of(gang.spec),
                 "status": job.status,
                 "statusReason": reason.words or None,

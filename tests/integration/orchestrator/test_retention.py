@@ -92,6 +92,9 @@ def test_an_archived_run_is_kept_out_of_lists_and_nothing_is_added_to_it(server:
     refused(["runs", "delete", run], server.home, 2, "give --yes")
     assert f"deleted run {run}: " in said(server, "runs", "delete", run, "--yes")
     assert run not in runs_of(server) and server.detail(job)["status"] == "SUCCEEDED"
+    shown = said(server, "show", job)
+    assert f"{run} (deleted, with its logs)" in shown and "node-0.log" not in shown
+    assert f"run {run} was deleted, and the log of job {job} with it" in server.muster("logs", job).stderr
     refused(["runs", "delete", run, "--yes"], server.home, 2, f"run {run} does not exist")
 
 
