@@ -30,6 +30,7 @@ RETENTION = "10m"
 AT_ONCE = 8
 """Jobs that have not ended, at most; more are submitted when fewer are left."""
 FOLLOWERS = 4
+OPEN = ["SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING"]
 TABLES = ("jobs", "attempts", "nodes", "runs", "job_definitions", "dependencies", "run_uses")
 
 
@@ -102,8 +103,14 @@ class Load:
 
     def open(self) -> int:
         """Number of jobs that have not ended."""
-        found = self.client.get("/api/jobs", status=["SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING"], max=1)
-        return int(found["total"])
+        return int(self.client.get("/api/jobs", status=OPEN, max=1)["total"])
+
+    def stop_all(self) -> None:
+        """End what has not ended: nodes outlive their controller."""
+        while jobs := self.client.get("/api/jobs", status=OPEN, max=100)["jobs"]:
+            for job in jobs:
+                self.client.batch("TerminateJob", jobId=job["id"], reason="the soak is over")
+            time.sleep(1.0)
 
     def run(self) -> None:
         stopping: list[str] = []
@@ -198,7 +205,7 @@ def main() -> None:
         load.ending.set()
         for thread in threads:
             thread.join(60)
-        time.sleep(1.0)
+        load.stop_all()
         lines = [
             line for line in (home / "server.txt").read_text().splitlines() if "Traceback" in line or "ERROR" in line
         ]
