@@ -185,7 +185,9 @@ def using(reconciler: Reconciler, *runs: str, cites: bool = True) -> Iterator[No
     with ExitStack() as stack:
         for run in runs:
             stack.enter_context(reconciler.run_users.using(run))
-        if cites:  # before they are let go: whoever takes one then looks again
+        if (
+            cites
+        ):  # must run before the runs are released, so that retention looks at the store again before it takes one
             stack.callback(reconciler.retention.stored.look_again)
         yield
 

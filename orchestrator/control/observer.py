@@ -78,7 +78,7 @@ class Observer:
     def _silences(self, key: Key, handle: str, status: GangStatus) -> Sequence[Silence | None]:
         """The silence of each node, by what the engine and the store say of it; None for one that has ended."""
         seen = self._seen[key]
-        asked = self._engine.asked(handle)
+        asked = self._engine.status_age(handle)
         asked = None if asked is None or seen.checked is None else max(asked, machine.monotonic() - seen.checked)
 
         def silence(index: int, node: NodeStatus) -> Silence | None:

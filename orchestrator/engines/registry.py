@@ -187,10 +187,10 @@ class EngineSet:
         for runner in self._runners.values():
             runner.look()
 
-    def asked(self, handle: str) -> float | None:
+    def status_age(self, handle: str) -> float | None:
         """Seconds since the engine was asked for the status that :meth:`observe` returns; None where it does not answer now."""
         found = self._handle(handle)
-        return self._runner(found.engine).asked(found) if found.engine in self._runners else None
+        return self._runner(found.engine).status_age(found) if found.engine in self._runners else None
 
     def stop(self, handle: str, grace: float) -> GangStatus:
         """Stop the gang, which may take long; returns how its nodes ended. Raises EngineError."""

@@ -246,7 +246,7 @@ class Runner:
         self._is_looking = True
         self._submit(self._look_at_all)
 
-    def asked(self, handle: Handle) -> float | None:
+    def status_age(self, handle: Handle) -> float | None:
         """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
         if handle not in self._seen or self._trouble(handle):
             return None

@@ -14,7 +14,7 @@ from shared_store.files import write_json
 from shared_store.layout import Store
 from shared_store.metrics import MetricsWriter
 from tests.conftest import Serving
-from tests.support.orchestrator.jobs import jobs_of, refusal
+from tests.support.orchestrator.jobs import jobs_and_runs, nothing_changed, refusal
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
 CONFIG = {"angle_limit": 0.2}
@@ -208,19 +208,14 @@ def test_a_clone_whose_network_would_have_another_size_is_refused(full: Serving,
 
 
 def test_a_clone_can_be_tried_without_one(full: Serving, store: Store) -> None:
-    def there() -> set[str]:
-        return {each["jobId"] for each in jobs_of(full.client)} | {
-            path.name for path in (store.path / "runs").iterdir()
-        }
-
-    before = there()
+    before = jobs_and_runs(full)
     changes = ("--set", "train.config.track=chicane", "--set", "train.config.rewards.off_track=-20")
     shown = full.muster("clone", "racer", "--name", "faster", *changes, "--dry-run")
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.startswith("faster on the local engine, queue default; nothing was started\n")
     plan = json.loads(full.muster("clone", "racer", "--name", "faster", *changes, "--dry-run", "--json").stdout)
     assert '"track":"chicane"' in plan["nodes"][0]["environment"]["MUSTER_SPEC"]
-    assert there() <= before
+    assert nothing_changed(full, before)
     assert "exists already" in refusal(full, "clone", "racer", "--name", "racer", "--dry-run", code=1)
 
 

@@ -49,17 +49,24 @@ def await_status(client: Client, job_id: str, *wanted: str) -> dict[str, Any]:
     return found
 
 
+def jobs_and_runs(server: Serving) -> set[str]:
+    """Ids of all jobs of the queue ``default``, and names in the store's directory of runs."""
+    return {each["jobId"] for each in jobs_of(server.client)} | set(os.listdir(server.home / "store" / "runs"))
+
+
+def nothing_changed(server: Serving, before: set[str]) -> bool:
+    """Whether jobs and runs are as :func:`jobs_and_runs` found them, but for hidden copies of earlier commands, which go by themselves."""
+    now = jobs_and_runs(server)
+    return {each for each in before if not each.startswith(".")} <= now <= before
+
+
 def refusal(server: Serving, *arguments: str, code: int = 2) -> str:
     """The one line with which a command is refused; neither a job nor a run nor a hidden copy is left."""
 
-    def there() -> set[str]:
-        return {each["jobId"] for each in jobs_of(server.client)} | set(os.listdir(server.home / "store" / "runs"))
-
-    before = there()
+    before = jobs_and_runs(server)
     done = server.muster(*arguments)
     assert done.returncode == code and len(done.stderr.splitlines()) == 1, (done.returncode, done.stdout, done.stderr)
-    # a copy is deleted after the answer, also one that an earlier command has made
-    wait_for(lambda: there() <= before, 10, "nothing that is left")
+    wait_for(lambda: nothing_changed(server, before), 10, "nothing that is left")  # a copy is deleted after the answer
     return done.stderr
 
 

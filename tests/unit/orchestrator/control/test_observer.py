@@ -29,7 +29,7 @@ class Gang:
         self.presence = Presence()
         self.pool, self.written, self.status = SlowPool(), dict[int, Outcome](), list[NodeStatus]()
         errands = Errands(self.pool, "/store", lambda _: None)
-        engine = SimpleNamespace(observe=lambda _: self.status, asked=lambda _: 0.0)
+        engine = SimpleNamespace(observe=lambda _: self.status, status_age=lambda _: 0.0)
         self.observer = Observer(
             engine,  # type: ignore[arg-type]
             SimpleNamespace(outcomes=self._outcomes),  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -36,19 +36,6 @@ from tests.support.orchestrator.retention import LONG_AGO, World
 from tests.support.orchestrator.rows import job
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job-definition/"
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    world = World(tmp_path)
-    yield world
-    world.database.close()
-
-
-def reasons(world: World) -> dict[str, str]:
-    """Of each run that is kept, why."""
-    looks, _ = world.step(take=False)
-    return {each["run"]: "; ".join(each["kept"]) for each in looks if each["kept"]}
 
 
 def test_a_pass_takes_old_jobs_of_the_batch_api_with_their_runs_and_nothing_else(world: World) -> None:
@@ -108,7 +95,7 @@ def test_a_run_that_something_needs_is_kept_with_its_jobs(
     world.ended("old")
     make(world)
     before = world.rows()
-    assert reason in reasons(world)["old"]
+    assert reason in world.reasons()["old"]
     world.retention().take_all()
     assert world.rows() == before and (world.store.run("old").path / "logs" / "old").is_dir()
     with pytest.raises(RunNeeded, match=reason):
@@ -137,7 +124,7 @@ def test_the_jobs_of_an_array_go_when_all_of_them_are_old_enough(world: World) -
     for young in ("p", "p:2"):
         world.change(young, stopped_at=now())
         if young == "p":
-            assert world.retention().take_all().jobs == 0 and reasons(world) == {}, "its children wait for it"
+            assert world.retention().take_all().jobs == 0 and world.reasons() == {}, "its children wait for it"
         world.change(young, stopped_at=LONG_AGO + 5)
     assert world.retention().take_all().jobs == 4
     assert world.jobs() == [] and world.runs() == []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,19 +12,6 @@ import pytest
 from orchestrator.control.retention import RunNeeded
 from tests.support.orchestrator.retention import World
 from tests.support.permissions import permissions_count
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    world = World(tmp_path)
-    yield world
-    world.database.close()
-
-
-def reasons(world: World) -> dict[str, str]:
-    """Of each run that is kept, why."""
-    looks, _ = world.step(take=False)
-    return {each["run"]: "; ".join(each["kept"]) for each in looks if each["kept"]}
 
 
 def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
@@ -61,7 +47,7 @@ def test_a_run_that_can_t_be_read_or_moved_is_kept_and_stops_no_other(
     closed.chmod(0)
     fixed.chmod(0o555)
     with permissions_count():
-        assert "it can't be read ([Errno 13] Permission denied" in reasons(world)["closed"]
+        assert "it can't be read ([Errno 13] Permission denied" in world.reasons()["closed"]
         totals = world.retention().take_all()
         assert (totals.jobs, totals.runs, totals.kept) == (2, 2, 2)
         assert world.runs() == world.jobs() == ["closed", "fixed"]

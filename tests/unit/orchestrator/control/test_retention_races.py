@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,13 +19,6 @@ from shared_store.epoch import Claim
 from shared_store.layout import Run, Store
 from tests.support.orchestrator.retention import World
 from tests.support.orchestrator.rows import job
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    world = World(tmp_path)
-    yield world
-    world.database.close()
 
 
 def test_a_run_that_a_request_uses_is_not_taken_and_one_that_is_taken_is_not_used(world: World) -> None:
