@@ -26,8 +26,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from benchmarks import load
 from orchestrator.client import Client
-from shared_store.layout import Store
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import Serving, submit_gang
 
 JOBS = 1000

@@ -24,7 +24,7 @@ import httpx
 
 from benchmarks.log_follow import MUSTER, finish, submit
 from orchestrator.client import Client
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.console.visitor import Visitor
 from tests.support.faults.stalled import stalled
 

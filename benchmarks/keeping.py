@@ -30,7 +30,7 @@ from typing import Any
 import yaml
 
 from benchmarks.keeping_table import ON_CPU, PLAN, POINTS, WORLDS, curves_of, draw, is_whole, keep, table
-from shared_store.learning import LEARNING
+from shared_store.volume.learning_metrics import LEARNING
 from worker.learning.ppo.settings import PPOConfig
 
 SPECS = Path(__file__).parents[1] / "job_specs"

@@ -23,7 +23,7 @@ from unittest import mock
 from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_config, stock_runner
 from benchmarks.training import build, device_name, wait
-from shared_store.metrics import read_metrics
+from shared_store.volume.metrics import read_metrics
 from worker.learning.setup import build_task
 
 EVERY = 25

@@ -26,8 +26,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from benchmarks.load import Watch, add_option, machine, told
-from shared_store.bundles import seal
-from shared_store.policy_contract import Contract
+from shared_store.contract.policy import Contract
+from shared_store.volume.bundles import seal
 
 REPOSITORY = Path(__file__).parent.parent
 REPEATS, SECONDS = 3, 4.0

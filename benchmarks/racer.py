@@ -33,7 +33,7 @@ import yaml
 from benchmarks.load import Watch, add_option, told
 from benchmarks.peers.inside.clock import versions
 from benchmarks.training import CUDA, build, device_name, rate, wait
-from shared_store.layout import Run
+from shared_store.volume.layout import Run
 from worker.errors import UserError
 from worker.evaluation.evaluation import evaluate
 from worker.learning.loop import Loop

@@ -24,10 +24,10 @@ import torch
 
 from benchmarks.load import Watch, add_option, machine, told
 from benchmarks.spine import MUSTER, REPOSITORY, Bench, seconds
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.processes import find_process
+from shared_store.process.processes import find_process
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from worker.learning.saving import Saver
 from worker.learning.shards import read_file
 

@@ -27,7 +27,7 @@ from orchestrator.control.run_store import RunStore
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.api import Gang, Handle, Plan
 from orchestrator.persistence.models import Attempt, Job, Node, RunRecord
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 
 _TABLES = (Job, Attempt, Node, RunRecord)
 _OPEN = [status for status in Status if status not in TERMINAL]

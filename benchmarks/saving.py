@@ -19,8 +19,8 @@ from typing import Any
 
 from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, build, device_name
-from shared_store.checkpoints import list_checkpoints
-from shared_store.metrics import read_metrics
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.metrics import read_metrics
 
 WORLDS = dict.fromkeys(("Ant", "Humanoid", "Cartpole", "Quadruped"), 4096) | {"CartpolePixels": 1024}
 WORLDS_CPU = {"Ant": 64, "Humanoid": 32, "Cartpole": 64, "Quadruped": 32, "CartpolePixels": 32}

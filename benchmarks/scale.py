@@ -38,9 +38,9 @@ from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.persistence.models import Job, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
-from shared_store.epoch import Claim
-from shared_store.layout import Store
-from shared_store.outcomes import Outcome, write_outcome
+from shared_store.volume.epoch import Claim
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import Outcome, write_outcome
 
 E = TypeVar("E", bound=Engine)
 

@@ -30,8 +30,8 @@ import torch
 
 from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, build, device_name
-from shared_store.layout import Run
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import read_metrics
 from worker.distributed import Placement, connect
 from worker.evaluation.blocks import SIZE, Blocks
 from worker.evaluation.episodes import play

@@ -26,8 +26,8 @@ import torch
 
 from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_runner, stock_seconds
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from worker.distributed import Placement, connect
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import Job, StopRequest

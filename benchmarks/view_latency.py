@@ -27,7 +27,7 @@ import rerun as rr
 
 from benchmarks.load import Watch, add_option, machine, told
 from benchmarks.training import build
-from shared_store.layout import Run
+from shared_store.volume.layout import Run
 from tests.support.browser import empty_page
 from worker.telemetry import screen
 from worker.telemetry.page import Page

@@ -33,7 +33,7 @@ from benchmarks.peers.cases import CASES
 from benchmarks.peers.inside.clock import versions
 from benchmarks.peers.judging import Judgement, VelocityErrors, judge
 from benchmarks.training import device_name, wait
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
 from worker.tasks.adapting import adaptive_steps, begin_evaluation

@@ -21,7 +21,7 @@ import httpx
 from orchestrator.domain.errors import ApiError, NotServing, NoUrl, Unreachable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.home import local_url, muster_home
-from shared_store.texts import digest_of
+from shared_store.volume.texts import digest_of
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
 

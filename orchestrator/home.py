@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from orchestrator.domain.errors import ServerError
-from shared_store.files import write_atomic
+from shared_store.volume.files import write_atomic
 
 _OURS = re.compile(
     r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?console\..*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"

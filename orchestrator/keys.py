@@ -22,8 +22,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic.alias_generators import to_camel
 
 from orchestrator.domain.errors import ServerError, UsageError
-from shared_store.files import sync_directory
-from shared_store.layout import NAME
+from shared_store.volume.files import sync_directory
+from shared_store.volume.layout import NAME
 
 _NAME_PATTERN = f"^(?:{NAME.pattern})$"
 _ID_LETTERS = string.ascii_uppercase + "234567"

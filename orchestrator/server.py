@@ -44,7 +44,7 @@ from orchestrator.home import HomeLock, console_secret
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 
 log = logging.getLogger("muster.controller")
 

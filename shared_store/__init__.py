@@ -1,9 +1,60 @@
-"""The shared persistent volume: its layout, atomic commits, checkpoints, logs, metrics and outcomes.
+"""What both sides of Muster share: the volume, the processes of a node, and the contracts between the two.
 
-Both sides of Muster import this package (``orchestrator`` → ``shared_store`` ← ``worker``); it imports neither of them, and no
-torch. Only this package and the environment variables of :mod:`shared_store.contract` cross between the two.
+Both sides import this package (``orchestrator`` → ``shared_store`` ← ``worker``); it imports neither of them, and no torch. Only
+this package and the environment variables of :mod:`shared_store.contract.node` cross between the two.
 """
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+
+TYPE_CHECKING = False  # a node's shim imports this package, and typing takes longer than the rest of its start
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import ModuleType
+
 __version__ = "0.1.0"
+
+
+class _OldNames:
+    """Finder and loader of modules under the names that they had before they moved."""
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        self._names = names
+        self._specs: dict[str, ModuleSpec | None] = {}
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        return ModuleSpec(name, self) if name in self._names else None  # type: ignore[arg-type]
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = import_module(self._names[spec.name])
+        self._specs[spec.name] = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """The module has run already; it keeps its own spec, which the import has just replaced."""
+        assert module.__spec__ is not None
+        module.__spec__ = self._specs[module.__spec__.name]
+
+
+def keep_old_names(names: Mapping[str, str]) -> None:
+    """Let modules be imported by their old names, too, since tasks and engines of others may hold these.
+
+    Args:
+        names: Old name → new name. A package needs an entry for each of its modules that is still imported by its old name.
+    """
+    sys.meta_path.insert(0, _OldNames(names))
+
+
+OLD_NAMES = {
+    "shared_store.checkpoints": "shared_store.volume.checkpoints",
+    "shared_store.file_fields": "shared_store.contract.file_fields",
+    "shared_store.layout": "shared_store.volume.layout",
+    "shared_store.policy_contract": "shared_store.contract.policy",
+    "shared_store.ports": "shared_store.process.ports",
+    "shared_store.processes": "shared_store.process.processes",
+}
+"""Names in the documentation before the modules moved into rooms."""
+keep_old_names(OLD_NAMES)

@@ -2,7 +2,7 @@
 
 ``definition/`` has the rules (``league.json``), ``entries/<number>/`` a model, its evaluation and its race (``entry.json``),
 ``disqualified/<number>/`` the reason why an entry does not count (``ruling.json``); each has a manifest of digests
-(:mod:`shared_store.bundles`). Entries count up from 1 without a gap: a missing one was deleted. Each appears by a rename that fails if
+(:mod:`shared_store.volume.bundles`). Entries count up from 1 without a gap: a missing one was deleted. Each appears by a rename that fails if
 its number exists, so simultaneous entries get different numbers. The digests show damage and edits, but they are not signatures:
 anyone who can write the store can forge a whole entry; running its race again exposes that.
 """
@@ -20,14 +20,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from shared_store import bundles, tracks
-from shared_store.bundles import DamagedBundle
-from shared_store.documents import DocumentError, parse
-from shared_store.files import DamagedFile, read_json, refuse_links, write_json
-from shared_store.layout import NAME, Store, names_in
+from shared_store import tracks
+from shared_store.contract.documents import DocumentError, parse
+from shared_store.contract.error_text import counted, nearest, shown
 from shared_store.races import race_changes, rules_of
 from shared_store.standings import BadRace, Contender, Ranking, read_race
-from shared_store.wording import counted, nearest, shown
+from shared_store.volume import bundles
+from shared_store.volume.bundles import DamagedBundle
+from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_json
+from shared_store.volume.layout import NAME, Store, names_in
 
 CAR: Mapping[str, Any] = {
     "control_hz": 15.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 TRIALS = 3
 """Laps of a race, by default."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
-from shared_store.wording import counted, shown
+from shared_store.contract.error_text import counted, shown
 
 Ranking = Literal["total", "best", "average"]
 RANKINGS: tuple[Ranking, ...] = get_args(Ranking)

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shared_store import bundles
-from shared_store.bundles import DamagedBundle
-from shared_store.files import DamagedFile, open_regular, refuse_links
-from shared_store.layout import NAME, Store, names_in
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
+from shared_store.volume import bundles
+from shared_store.volume.bundles import DamagedBundle
+from shared_store.volume.files import DamagedFile, open_regular, refuse_links
+from shared_store.volume.layout import NAME, Store, names_in
 
 FILE = "track.npy"
 LARGEST = 1 << 20

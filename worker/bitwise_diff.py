@@ -16,10 +16,10 @@ from typing import Any
 
 import torch
 
-from shared_store.checkpoints import Checkpoint, list_checkpoints
-from shared_store.layout import Run, Store
-from shared_store.metrics import read_metrics
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.checkpoints import Checkpoint, list_checkpoints
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import read_metrics
 from worker.errors import UserError
 from worker.learning.job import EX_ERROR, EX_USAGE, run_command
 from worker.learning.shards import Shards, read_file

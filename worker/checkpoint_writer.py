@@ -19,10 +19,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from shared_store.checkpoints import CheckpointWriter
-from shared_store.epoch import StaleEpoch, check_epoch
-from shared_store.files import read_json, sync_file, write_json
-from shared_store.layout import Run
+from shared_store.volume.checkpoints import CheckpointWriter
+from shared_store.volume.epoch import StaleEpoch, check_epoch
+from shared_store.volume.files import read_json, sync_file, write_json
+from shared_store.volume.layout import Run
 
 GATHER_SECONDS = 120.0
 """Time that the main rank's writer waits for the files of the other ranks [s]."""

@@ -16,7 +16,7 @@ class TrainingError(Exception):
 
     Args:
         message: The error.
-        cause: As :attr:`shared_store.faults.Fault.cause`.
+        cause: As :attr:`shared_store.contract.faults.Fault.cause`.
     """
 
     def __init__(self, message: str, cause: str = "") -> None:

@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from shared_store.outcomes import EX_TEMPFAIL
 from shared_store.races import NO_RACER, TRIALS, race_changes, rules_of
-from shared_store.settings import merged
-from shared_store.texts import beside, keep
+from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.run_settings import merged
+from shared_store.volume.texts import beside, keep
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
 
@@ -41,7 +41,7 @@ def main(kind: str = "evaluate") -> int:
         placement = Placement.from_env(os.environ)
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
-    from shared_store.evaluations import lines
+    from shared_store.volume.evaluations import lines
     from worker.evaluation.blocks import SIZE, Blocks
     from worker.evaluation.episodes import Stopped, play
     from worker.evaluation.evaluation import result_of

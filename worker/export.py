@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from worker.learning.job import Job, configure, run_command, user_errors
 
 if TYPE_CHECKING:
-    from shared_store.checkpoints import Checkpoint
-    from shared_store.layout import Run
+    from shared_store.volume.checkpoints import Checkpoint
+    from shared_store.volume.layout import Run
     from worker.tasks.task import Task
 
 

@@ -6,9 +6,9 @@ import io
 import math
 from pathlib import Path
 
-from shared_store.files import write_atomic
-from shared_store.layout import Run
-from shared_store.metrics import read_metrics
+from shared_store.volume.files import write_atomic
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import read_metrics
 
 
 def plot_reward(run: Run, path: Path | None = None) -> Path:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
 

@@ -9,7 +9,7 @@ import os
 import time
 from typing import TYPE_CHECKING
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
 

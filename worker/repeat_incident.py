@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared_store.policy_changes import brief, robot_changes
-from shared_store.policy_contract import RobotModel
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.policy import RobotModel
+from shared_store.contract.policy_changes import brief, robot_changes
 from worker.accepting import CHANGED_ROBOTS
 from worker.errors import UserError
 from worker.learning.job import EX_ERROR, configure, run_command, user_errors

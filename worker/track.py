@@ -23,11 +23,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from shared_store.epoch import StaleEpoch, check_epoch
-from shared_store.evaluations import list_evaluations
-from shared_store.files import read_json, write_json
-from shared_store.layout import Run
-from shared_store.metrics import MetricsHistory
+from shared_store.volume.epoch import StaleEpoch, check_epoch
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.files import read_json, write_json
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import MetricsHistory
 from worker.telemetry.services import SERVICES, Ending, Refused, Service, Tracked, one_line, without_key
 
 LOOK_SECONDS = 2.0

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from worker.distributed import Placement, connect
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop

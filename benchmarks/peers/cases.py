@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 LIMITS = ("theirs", "ours")
 """Sources of the solver's limits."""

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.learning.algorithm import POLICY
 from worker.tasks.interface import Interface
 

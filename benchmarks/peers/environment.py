@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 HERE = Path(__file__).parent
 FOLDER = HERE.parent.parent / ".peers"

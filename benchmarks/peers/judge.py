@@ -24,7 +24,7 @@ from benchmarks.peers.cases import LIMITS, Case, find_case
 from benchmarks.peers.conversion import check_contract, check_fit, check_probe, read_rsl_rl
 from benchmarks.peers.judging import Acting, judge
 from benchmarks.peers.run import RECORDS
-from shared_store.layout import Run
+from shared_store.volume.layout import Run
 from worker.learning.trained import find_checkpoint, load_policy
 from worker.tasks.task import Task
 

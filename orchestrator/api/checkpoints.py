@@ -5,8 +5,14 @@ from __future__ import annotations
 from typing import Literal
 
 from orchestrator.api.errors import ClientError
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_checkpoint, list_checkpoints
-from shared_store.layout import Run
+from shared_store.volume.checkpoints import (
+    Checkpoint,
+    DamagedCheckpoint,
+    NewerFormat,
+    best_checkpoint,
+    list_checkpoints,
+)
+from shared_store.volume.layout import Run
 
 CONFLICT = 409
 """The request is well formed, but conflicts with the present state."""

@@ -25,9 +25,9 @@ from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
-from shared_store.layout import Run, StoreError
-from shared_store.parent import NewRun, TeacherCopy, WeightsCopy
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
+from shared_store.volume.initial_weights import NewRun, TeacherCopy, WeightsCopy
+from shared_store.volume.layout import Run, StoreError
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
 """Makes it safe to repeat a submission whose answer was lost."""

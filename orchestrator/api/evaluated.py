@@ -9,10 +9,10 @@ from orchestrator.api.checkpoints import choose, refusal
 from orchestrator.api.errors import ClientError
 from orchestrator.api.racing_tracks import check_names
 from orchestrator.spec.settings import task_config
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
-from shared_store.layout import Run, Store
 from shared_store.races import NO_RACER, key_of, race_changes
-from shared_store.settings import merged
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.run_settings import merged
 
 
 def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str = "evaluate") -> Checkpoint | None:

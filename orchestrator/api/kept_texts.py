@@ -15,8 +15,8 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import now
 from orchestrator.persistence.own_models import KeptText
-from shared_store.layout import Run
-from shared_store.texts import Reference, TextError, beside, read, references, resolved_spec
+from shared_store.volume.layout import Run
+from shared_store.volume.texts import Reference, TextError, beside, read, references, resolved_spec
 
 
 def check_texts(context: Context, gang: GangSpec) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 
 from orchestrator.api.errors import ClientError
 from orchestrator.spec.settings import task_config
-from shared_store.layout import Store
 from shared_store.leagues import LeagueError, digest_of_track
+from shared_store.volume.layout import Store
 
 
 def check_tracks(

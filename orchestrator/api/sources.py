@@ -20,11 +20,11 @@ from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.contents import is_archived
-from shared_store.layout import NAME, Run
-from shared_store.parent import TeacherCopy, named_parent
-from shared_store.wording import shown
+from shared_store.contract.error_text import shown
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.volume.contents import is_archived
+from shared_store.volume.initial_weights import TeacherCopy, named_parent
+from shared_store.volume.layout import NAME, Run
 
 _TEACHER = "train.rsl_rl.teacher_checkpoint"
 

@@ -15,7 +15,7 @@ from orchestrator.cli.misuse import Misuse, told
 from orchestrator.cli.terminal import echo, log_visibly, one_line
 from orchestrator.domain.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
-from shared_store.layout import StoreError
+from shared_store.volume.layout import StoreError
 
 app = typer.Typer(
     name="muster",

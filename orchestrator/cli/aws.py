@@ -18,7 +18,7 @@ from orchestrator.cli.terminal import echo, echo_json, print_rows
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import config_path
 from orchestrator.home import muster_home
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 if TYPE_CHECKING:
     from orchestrator.engines.aws_batch.stack import Event, Stack

@@ -16,7 +16,7 @@ from orchestrator.cli.recordings import OverwriteOption, refuse_existing
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
-from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, versus
+from shared_store.volume.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, versus
 
 _PAGE = 10_000
 

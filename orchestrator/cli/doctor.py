@@ -29,10 +29,10 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.home import local_url, muster_home
 from shared_store import __version__
-from shared_store.cgroups import own_group
-from shared_store.files import write_json
-from shared_store.memory_groups import limits_memory
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.process.cgroups import own_group
+from shared_store.process.memory_groups import limits_memory
+from shared_store.volume.files import write_json
 
 _WORKER = ("torch", "warp-lang", "newton", "rsl-rl-lib", "gymnasium")
 _LEAST_SHARED_MEMORY = 256

@@ -15,10 +15,10 @@ from orchestrator.client import Client, named
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import validate
-from shared_store import bundles
-from shared_store.files import read_json
-from shared_store.layout import Store
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume import bundles
+from shared_store.volume.files import read_json
+from shared_store.volume.layout import Store
 
 _EXAMPLES = """Examples:  muster export ant-1f2e3d4c -o ant-policy
 muster export ant-1f2e3d4c@300 --episodes 64 --set resources.gpus=1"""

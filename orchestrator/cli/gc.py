@@ -11,7 +11,7 @@ from rich.table import Table
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 _PATIENCE = 610.0
 """Seconds for a part of a pass: the controller's own limit, and some."""

@@ -24,7 +24,7 @@ from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
-from shared_store.wording import counted, nearest
+from shared_store.contract.error_text import counted, nearest
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 AcceptOption = Annotated[

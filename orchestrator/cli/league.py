@@ -21,10 +21,10 @@ from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_th
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, NotServing, UsageError
+from shared_store.contract.error_text import counted, nearest
 from shared_store.leagues import moment
 from shared_store.races import clock
 from shared_store.standings import RANKINGS, differences
-from shared_store.wording import counted, nearest
 
 LeagueArgument = Annotated[str, typer.Argument(metavar="NAME", help="A league.")]
 EntryArgument = Annotated[int, typer.Argument(metavar="ENTRY", min=1, help="The number of an entry.")]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.domain.errors import UsageError
-from shared_store.files import write_atomic
 from shared_store.races import clock
 from shared_store.standings import Row
+from shared_store.volume.files import write_atomic
 
 COLUMNS = ("RANK", "ENTRY", "RACER", "MODEL", "TIME", "BEST LAP", "LAPS", "OFF-TRACKS", "CRASHES", "RESETS", "STATUS")
 _NUMBERS = ("off_tracks", "crashes", "resets")

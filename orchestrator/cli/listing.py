@@ -12,7 +12,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.show import COLOURS, took, when
 from orchestrator.cli.terminal import echo, echo_json, one_line, print_cut
 from orchestrator.client import Client
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 _NEWEST = 20
 _AT_ONCE = 100

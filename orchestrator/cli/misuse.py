@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from orchestrator.domain.errors import UsageError
-from shared_store.wording import explain, nearest
+from shared_store.contract.error_text import explain, nearest
 
 Misuse: type[Exception] = typer.BadParameter.__mro__[2]
 """The parser's exception. Typer takes it from click or has its own, depending on the version."""

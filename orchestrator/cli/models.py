@@ -19,12 +19,12 @@ from orchestrator.cli.show import scored
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
-from shared_store.bundles import POLICY
-from shared_store.documents import DocumentError
-from shared_store.evaluations import in_one_line, told_changes
-from shared_store.policy_changes import differences, robot_changes
-from shared_store.policy_contract import read
-from shared_store.wording import counted
+from shared_store.contract.documents import DocumentError
+from shared_store.contract.error_text import counted
+from shared_store.contract.policy import read
+from shared_store.contract.policy_changes import differences, robot_changes
+from shared_store.volume.bundles import POLICY
+from shared_store.volume.evaluations import in_one_line, told_changes
 
 ModelArgument = Annotated[str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version by default.")]
 

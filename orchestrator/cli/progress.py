@@ -15,10 +15,10 @@ from orchestrator.client import Client, named
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL, WAITING
-from shared_store.evaluations import in_one_line
-from shared_store.metrics import warnings_of
-from shared_store.phases import Phase, phase_in
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.phases import Phase, phase_in
+from shared_store.volume.evaluations import in_one_line
+from shared_store.volume.metrics import warnings_of
 
 _POLL = 0.3
 _PLAIN_INTERVAL = 2.0

@@ -23,7 +23,7 @@ from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, UsageError
 from orchestrator.spec.model import Record, Render, Spec
 from orchestrator.spec.sections import Resources, Retry
-from shared_store.tied import start_tied
+from shared_store.process.tether import start_tied
 
 SourceArgument = Annotated[
     str | None,

@@ -16,7 +16,7 @@ from orchestrator.cli.recordings import check_output
 from orchestrator.cli.tasks import ask_worker
 from orchestrator.cli.terminal import echo, echo_json, print_cut, print_wrapped
 from orchestrator.domain.errors import SpecError
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 _EXAMPLES = """Examples:  muster robot arm.urdf
 muster robot package:mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml -o go1.png

@@ -14,11 +14,11 @@ from orchestrator.cli.terminal import Console, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.installed import traits_of
-from shared_store.evaluations import in_one_line
-from shared_store.learning import in_words
-from shared_store.metrics import warnings_of
-from shared_store.phases import phase_in
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.phases import phase_in
+from shared_store.volume.evaluations import in_one_line
+from shared_store.volume.learning_metrics import in_words
+from shared_store.volume.metrics import warnings_of
 
 _OF_RUN = {
     "evaluate": "evaluates",

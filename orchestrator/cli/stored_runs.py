@@ -14,7 +14,7 @@ from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 RunArgument = Annotated[str, typer.Argument(help="A run; `muster runs list` prints the names.")]
 _A_PAGE = 100

@@ -16,7 +16,7 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.spec import file as specfile
 from orchestrator.spec.model import Spec
 from orchestrator.spec.sections import Resources, Retry
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 Connect = Callable[[], Client]
 

@@ -11,7 +11,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 
 def register(app: typer.Typer) -> None:

@@ -18,9 +18,9 @@ from orchestrator.console.curves import number
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from shared_store.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
-from shared_store.metrics import sampled
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
+from shared_store.volume.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
+from shared_store.volume.metrics import sampled
 
 router = page_router("run", stored=True)
 

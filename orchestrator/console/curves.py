@@ -30,8 +30,8 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Recent
 from orchestrator.console.routing import page_router
-from shared_store.layout import Run
-from shared_store.metrics import finite, history_of, sampled
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import finite, history_of, sampled
 
 router = page_router("name", stored=True)
 

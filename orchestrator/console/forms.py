@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Refusal
 from orchestrator.console.pages import form_token, render, wants_page
-from shared_store.wording import explain, path_of
+from shared_store.contract.error_text import explain, path_of
 
 TOKEN = "form_token"
 """The field of a form that other web pages can't know."""

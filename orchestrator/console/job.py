@@ -30,10 +30,10 @@ from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.reasons import short_id
-from shared_store.files import DamagedFile
-from shared_store.layout import Run
-from shared_store.learning import LEARNING
-from shared_store.metrics import history_of, sampled
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run
+from shared_store.volume.learning_metrics import LEARNING
+from shared_store.volume.metrics import history_of, sampled
 
 router, _stored = page_router(), page_router(stored=True)
 

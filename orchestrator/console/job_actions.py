@@ -25,8 +25,8 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.domain.reasons import short_id
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Run
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Run
 
 router, _stored = page_router(), page_router(stored=True)
 _Wanted = int | Literal["best", "latest"] | None

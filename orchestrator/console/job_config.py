@@ -19,7 +19,7 @@ from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.persistence.models import Job
-from shared_store.files import DamagedFile
+from shared_store.volume.files import DamagedFile
 
 _ABSENT = object()
 _LONGEST = 300

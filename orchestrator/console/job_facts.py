@@ -15,13 +15,13 @@ from orchestrator.console import words
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
-from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
-from shared_store.evaluations import by_checkpoint
-from shared_store.layout import Run
-from shared_store.learning import in_words
-from shared_store.metrics import finite, warnings_of
-from shared_store.phases import Phase
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.phases import Phase
+from shared_store.volume.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
+from shared_store.volume.evaluations import by_checkpoint
+from shared_store.volume.layout import Run
+from shared_store.volume.learning_metrics import in_words
+from shared_store.volume.metrics import finite, warnings_of
 
 CHECKPOINTS = 30
 """Number of a run's newest checkpoints that are listed, beside the best one."""

@@ -17,9 +17,9 @@ from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Event
 from orchestrator.console.routing import page_router
 from orchestrator.control.log_hub import LogHub
-from shared_store.log_view import Chosen, LogView, Places
-from shared_store.log_windows import LINES_A_WINDOW, Window, first_error, lines_after, lines_before, search
-from shared_store.logs import LogLine
+from shared_store.volume.log_view import Chosen, LogView, Places
+from shared_store.volume.log_windows import LINES_A_WINDOW, Window, first_error, lines_after, lines_before, search
+from shared_store.volume.logs import LogLine
 
 router = page_router(stored=True)
 

@@ -26,7 +26,7 @@ from orchestrator.api.native.routes import job_detail
 from orchestrator.api.permissions import Operation
 from orchestrator.console.forms import done
 from orchestrator.console.routing import page_router
-from shared_store.tied import start_tied
+from shared_store.process.tether import start_tied
 
 router = page_router()
 

@@ -24,7 +24,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.reasons import short_id
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 router = page_router()
 

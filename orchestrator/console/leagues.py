@@ -24,10 +24,10 @@ from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import races as races_of
 from orchestrator.console.tracks import track_names
 from orchestrator.domain.job import Status
+from shared_store.contract.error_text import counted
 from shared_store.leagues import moment
 from shared_store.races import clock
 from shared_store.standings import RANKINGS
-from shared_store.wording import counted
 
 router = page_router(stored=True)
 

@@ -24,7 +24,7 @@ from orchestrator.api.permissions import current_identity
 from orchestrator.console.pages import session
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.errors import Unavailable
-from shared_store.files import DamagedFile
+from shared_store.volume.files import DamagedFile
 
 INTERVAL = 0.5
 """Seconds between two looks."""

@@ -14,7 +14,7 @@ from orchestrator.console.lineage import drawing
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import written
-from shared_store.files import DamagedFile
+from shared_store.volume.files import DamagedFile
 
 router = page_router(stored=True)
 

@@ -20,7 +20,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import short_id, title
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 router = page_router()
 

@@ -18,8 +18,8 @@ from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.console.forms import Unconfirmed, check_form
 from orchestrator.console.pages import NAVIGATION, failure, wants_page
 from orchestrator.domain.errors import Unavailable
-from shared_store.files import DamagedFile
-from shared_store.wording import explain
+from shared_store.contract.error_text import explain
+from shared_store.volume.files import DamagedFile
 
 
 class PageRoute(APIRoute):

@@ -18,8 +18,8 @@ from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.routing import page_router
-from shared_store.files import DamagedFile, open_inside
-from shared_store.layout import NAME, Run
+from shared_store.volume.files import DamagedFile, open_inside
+from shared_store.volume.layout import NAME, Run
 
 router = page_router(stored=True)
 

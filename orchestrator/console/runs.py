@@ -19,9 +19,9 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.reasons import short_id
-from shared_store.evaluations import told_changes
-from shared_store.learning import LEARNING, in_words
-from shared_store.metrics import finite, warnings_of
+from shared_store.volume.evaluations import told_changes
+from shared_store.volume.learning_metrics import LEARNING, in_words
+from shared_store.volume.metrics import finite, warnings_of
 
 router = page_router(stored=True)
 

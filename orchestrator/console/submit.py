@@ -32,7 +32,7 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 router, _stored = page_router(), page_router(stored=True)
 

@@ -17,7 +17,7 @@ from orchestrator.spec.json_schema import schema
 from orchestrator.spec.model import ALGORITHMS
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import known_tasks
-from shared_store.file_fields import kept_files
+from shared_store.contract.file_fields import kept_files
 
 CODE = "reward_function.py"
 """Name of the code in the wizard's editor, as messages give it."""

@@ -19,7 +19,7 @@ from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from shared_store import tracks as stored
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 router = page_router(stored=True)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from shared_store.metrics import finite
+from shared_store.volume.metrics import finite
 
 _UNITS = ((86400, "d"), (3600, "h"), (60, "min"))
 _SPARK = (100.0, 24.0)

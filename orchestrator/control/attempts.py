@@ -64,7 +64,7 @@ from orchestrator.persistence.log_groups import record_logs
 from orchestrator.persistence.models import Attempt, Job, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decide import Start
-from shared_store.epoch import Claim
+from shared_store.volume.epoch import Claim
 
 log = logging.getLogger("muster.controller")
 

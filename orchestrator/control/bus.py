@@ -2,7 +2,7 @@
 
 Every node may connect; access rules in the router let a node publish below node keys and answer commands, and nothing else: it
 can neither send a command nor read a message. A node's message counts only with the proof of its attempt's credential, and
-commands carry that proof to the node (:mod:`shared_store.bus`).
+commands carry that proof to the node (:mod:`shared_store.contract.bus`).
 
 The bus is never a truth. Where a node's token vanishes, the controller looks at the engine at once instead of at the next interval; what the
 silence proves is a matter of :mod:`orchestrator.control.presence`. A lost message costs nothing. With the bus off everything works from the
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.control.presence import Presence
-from shared_store.bus import (
+from shared_store.contract.bus import (
     LARGEST_MESSAGE,
     LARGEST_PROGRESS,
     LARGEST_PUSH,
@@ -39,7 +39,7 @@ from shared_store.bus import (
     presence_key,
     push_proof,
 )
-from shared_store.files import DamagedFile, json_object, read_json, write_atomic, write_json
+from shared_store.volume.files import DamagedFile, json_object, read_json, write_atomic, write_json
 
 log = logging.getLogger("muster.bus")
 

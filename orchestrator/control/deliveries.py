@@ -30,10 +30,10 @@ from orchestrator.persistence.own_models import WebhookDelivery
 from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
-from shared_store.checkpoints import list_checkpoints
-from shared_store.evaluations import by_checkpoint, evaluation_name, list_evaluations
-from shared_store.layout import Run
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.evaluations import by_checkpoint, evaluation_name, list_evaluations
+from shared_store.volume.layout import Run
 
 TIMEOUT = 10.0
 """Seconds that one try may take in all: connecting, sending, and the answer's status."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
-from shared_store.outcomes import Outcome
+from shared_store.volume.outcomes import Outcome
 
 _TAKEN = (Cause.SIGNAL, Cause.HOST_LOST, Cause.PREEMPTED)
 """Causes from outside: who does not see the supervisor any more can't tell its end from that of its host."""

@@ -1,4 +1,4 @@
-"""The long texts of jobs, in the store from their upload until nothing needs them (:mod:`shared_store.texts`).
+"""The long texts of jobs, in the store from their upload until nothing needs them (:mod:`shared_store.volume.texts`).
 
 A text is kept while a job that has not ended names it, or an active job definition of a Batch client, and for some days after it was
 uploaded or named last. A definition that a submission of Muster's made counts as little as any other part of its job that has ended.
@@ -26,9 +26,9 @@ from orchestrator.persistence.models import Job, JobDefinition, now
 from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.references import is_of_submission
 from orchestrator.persistence.session import Database, DatabaseError
-from shared_store import texts
-from shared_store.layout import Store
-from shared_store.texts import LARGEST, Reference
+from shared_store.volume import texts
+from shared_store.volume.layout import Store
+from shared_store.volume.texts import LARGEST, Reference
 
 log = logging.getLogger("muster.controller")
 

@@ -1,6 +1,6 @@
 """Followers of logs, and what they share: nodes push their lines over the bus, and one reader a job fills what is missing.
 
-While somebody follows a job, its nodes are asked to push (:data:`shared_store.bus.LOG_LEASE`), and each tells once a second where its log
+While somebody follows a job, its nodes are asked to push (:data:`shared_store.contract.bus.LOG_LEASE`), and each tells once a second where its log
 ends. As long as all of them do and nothing is missing, nobody looks at a file. Otherwise (no bus, an engine without one, a lost push, a
 supervisor that knows no pushes) one look at the files serves all followers of the job. Files stay the truth.
 """
@@ -22,9 +22,9 @@ from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.domain.job import Status
 from orchestrator.persistence.queries import states_of
 from orchestrator.persistence.session import Database, DatabaseError
-from shared_store.bus import LOG_LEASE
-from shared_store.bus import Node as Address
-from shared_store.layout import Run
+from shared_store.contract.bus import LOG_LEASE
+from shared_store.contract.bus import Node as Address
+from shared_store.volume.layout import Run
 
 _MEMORY = 32 << 20
 """Bytes that all tails together keep, with what came too early, whatever their number."""

@@ -14,9 +14,9 @@ from itertools import takewhile
 from typing import NamedTuple
 
 from orchestrator import machine
-from shared_store.layout import Run
-from shared_store.log_files import UNKNOWN, Chunk, Identity, Segment, read_log
-from shared_store.log_view import Key, log_end, logs_of
+from shared_store.volume.layout import Run
+from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, Segment, read_log
+from shared_store.volume.log_view import Key, log_end, logs_of
 
 MOST = 256 << 10
 """Bytes that are kept of a log, and of the pushes to it that came too early, for each."""
@@ -57,7 +57,7 @@ class Tail:
     """Position up to which the log had been read when it was truncated or replaced."""
     identity: Identity = UNKNOWN
     inside: bool = False
-    """These two as :func:`shared_store.log_files.read_log` has them."""
+    """These two as :func:`shared_store.volume.log_files.read_log` has them."""
 
     @property
     def end(self) -> int:

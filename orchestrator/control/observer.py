@@ -17,7 +17,7 @@ from orchestrator.domain.job import NodeEnd, aws_ending
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Attempt, Job, Node, now
-from shared_store.outcomes import Outcome
+from shared_store.volume.outcomes import Outcome
 
 CHECK_INTERVAL = 5.0
 """Seconds between two looks at a gang of which a node can't be seen or heard, or whose cause is not known yet."""

@@ -1,7 +1,7 @@
 """The controllers that use a store: each leaves a heartbeat there, and reads those of the others.
 
 Controllers of several homes may share a store, each with jobs of its own; a run that one of them writes is not started by another.
-Heartbeats are advice: what keeps two gangs apart is the epoch (:mod:`shared_store.epoch`).
+Heartbeats are advice: what keeps two gangs apart is the epoch (:mod:`shared_store.volume.epoch`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathlib import Path
 
 from orchestrator import machine
 from orchestrator.domain.reasons import short_id
-from shared_store.epoch import read_claim, read_epoch
-from shared_store.files import read_json, write_json
-from shared_store.layout import NAME, Run, Store
+from shared_store.volume.epoch import read_claim, read_epoch
+from shared_store.volume.files import read_json, write_json
+from shared_store.volume.layout import NAME, Run, Store
 
 log = logging.getLogger("muster.controller")
 

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from orchestrator import machine
 from orchestrator.domain.attempt import UNHEARD
 from orchestrator.domain.attempt_events import Silence
-from shared_store.bus import Node
+from shared_store.contract.bus import Node
 
 LOST_AFTER = 120.0
 """Seconds of silence after which a node is lost, by default."""

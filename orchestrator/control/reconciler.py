@@ -39,8 +39,8 @@ from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.models import Attempt, Job, JobQueue
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
-from shared_store.layout import Store
-from shared_store.parent import WeightsCopy
+from shared_store.volume.initial_weights import WeightsCopy
+from shared_store.volume.layout import Store
 
 _SETTLED_A_TICK = 1000
 """Jobs that only change their state, in one pass: a large array that ends must not delay the looks at running gangs."""

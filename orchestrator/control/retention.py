@@ -34,10 +34,10 @@ from orchestrator.persistence import references as rows
 from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
-from shared_store import contents, trash
-from shared_store.files import DamagedFile
-from shared_store.layout import NAME, Store
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume import contents, trash
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import NAME, Store
 
 log = logging.getLogger("muster.retention")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.domain.retention import Decision, RunFacts
-from shared_store import trash
+from shared_store.volume import trash
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,12 @@ from orchestrator.control.peers import Peers
 from orchestrator.domain.attempt_events import Delayed
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.machine import Pool
-from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
-from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
-from shared_store.files import DamagedFile
-from shared_store.layout import Run, Store, StoreError
-from shared_store.outcomes import Outcome, read_outcome
-from shared_store.texts import Reference, keep, read_either
+from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.volume.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run, Store, StoreError
+from shared_store.volume.outcomes import Outcome, read_outcome
+from shared_store.volume.texts import Reference, keep, read_either
 
 log = logging.getLogger("muster.controller")
 
@@ -47,7 +47,7 @@ class RunRefused(Exception):
 
 @dataclass(frozen=True)
 class RunFacts:
-    """A run as it was found; a :class:`shared_store.layout.Run` for those who only read its ``run.json``."""
+    """A run as it was found; a :class:`shared_store.volume.layout.Run` for those who only read its ``run.json``."""
 
     name: str
     missing: bool

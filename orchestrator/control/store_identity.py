@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.models import Attempt, Job
 from orchestrator.persistence.own_models import KnownStore
-from shared_store.layout import Store, StoreError
+from shared_store.volume.layout import Store, StoreError
 
 _NEWEST = 100
 """How many of the newest runs of a database are looked for in a store without an identity."""

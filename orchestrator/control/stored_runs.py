@@ -10,10 +10,10 @@ from typing import Any
 from orchestrator import machine
 from orchestrator.control.peers import Peers
 from orchestrator.domain.retention import Reference, References, RunFacts
-from shared_store import contents
-from shared_store.files import is_there
-from shared_store.layout import Run, Store
-from shared_store.references import references
+from shared_store.volume import contents
+from shared_store.volume.files import is_there
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.references import references
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
 from orchestrator.spec.model import KINDS
-from shared_store.layout import NAME
-from shared_store.wording import explain, path_of
+from shared_store.contract.error_text import explain, path_of
+from shared_store.volume.layout import NAME
 
 PAUSES = (2, 10, 50, 250, 1250, 6250, 31250)
 """Seconds after each failed try; the eighth, about eleven hours after the first, is the last one."""

@@ -58,7 +58,7 @@ from orchestrator.domain.job import (
 )
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.domain.retry import retries
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 UNHEARD = 10.0
 """Seconds of a node's silence from which its job says so."""

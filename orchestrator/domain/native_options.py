@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from shared_store.log_files import LIMIT
+from shared_store.contract.node import LOG_LIMIT
 
 
 class MalformedOptions(ValueError):
@@ -30,7 +30,7 @@ class NativeOptions:
     """Worlds of the whole gang, for a training that continues a run; None where not given."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck."""
-    log_limit: int = LIMIT
+    log_limit: int = LOG_LIMIT
     """Bytes kept of each node's log."""
 
     @classmethod
@@ -47,7 +47,7 @@ class NativeOptions:
                 directory=given.get("DIRECTORY", ""),
                 worlds=int(worlds) if worlds.isdecimal() and len(worlds) < 10 else None,
                 stall_timeout=float(given["STALL_TIMEOUT"]) if "STALL_TIMEOUT" in given else None,
-                log_limit=int(given.get("LOG_LIMIT") or LIMIT),
+                log_limit=int(given.get("LOG_LIMIT") or LOG_LIMIT),
             )
         except ValueError as error:
             raise MalformedOptions(f"a MUSTER_* variable is malformed: {error}") from None

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from orchestrator.domain.hosts import Capacity, Placement
-from shared_store.contract import NodeContract
-from shared_store.log_files import LIMIT
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
+from shared_store.contract.node import LOG_LIMIT, NodeContract
 
 
 class EngineError(Exception):
@@ -64,7 +63,7 @@ class Gang:
     """Working directory of the commands."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck."""
-    log_limit: int = LIMIT
+    log_limit: int = LOG_LIMIT
     """Bytes of each node's log that are kept."""
     ranks: Sequence[int] = ()
     """Training processes by node index; empty: one on each."""

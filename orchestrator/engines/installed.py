@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting, Traits
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 GROUP = "muster.engines"
 _ORDER = ("local", "docker", "ray", "slurm", "aws-batch")

@@ -15,7 +15,7 @@ from orchestrator.scheduling.placement import affordable, count_of, needs
 from orchestrator.scheduling.quota import Quota
 from orchestrator.scheduling.reservation import Reservation
 from orchestrator.scheduling.snapshot import ComputeEnvironment
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 NO_ROOM = "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
 

@@ -8,7 +8,7 @@ from math import inf
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import EPSILON, Resources
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 
 def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[Placement, ...] | None:

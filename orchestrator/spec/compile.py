@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from orchestrator.spec.model import Spec
-from shared_store.texts import beside
+from shared_store.volume.texts import beside
 
 _MODULES = {kind: f"worker.{kind}" for kind in ("train", "evaluate", "race", "export", "record", "render")}
 
@@ -65,7 +65,7 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
 
 
 def long_texts(spec: Spec) -> list[str]:
-    """The texts of a spec that the store has to keep before its definition is registered (:mod:`shared_store.texts`)."""
+    """The texts of a spec that the store has to keep before its definition is registered (:mod:`shared_store.volume.texts`)."""
     return list(beside(spec.document())[1].values())
 
 

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.model import Spec, validate
 from orchestrator.spec.sections import Evaluation
-from shared_store.checkpoints import Checkpoint
-from shared_store.wording import explain, path_of
+from shared_store.contract.error_text import explain, path_of
+from shared_store.volume.checkpoints import Checkpoint
 
 AUTOMATIC_TAG = "muster:automatic-evaluation"
 """Tag of the jobs that the controller submits by itself; its value is the evaluated checkpoint, ``RUN@ITERATION``."""

@@ -11,7 +11,7 @@ from orchestrator.spec import strict_yaml
 from orchestrator.spec.changes import override
 from orchestrator.spec.kept_files import Place, check_sizes, check_texts, refuse_paths, with_files
 from orchestrator.spec.model import Spec, validate
-from shared_store.files import DamagedFile, read_json
+from shared_store.volume.files import DamagedFile, read_json
 
 
 def load(path: str, assignments: list[str] | None = None, store: Place = lambda: None) -> Spec:

@@ -11,7 +11,7 @@ from orchestrator.spec.model import ALGORITHMS, Spec
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.track import track_schema
 from orchestrator.spec.values import known_tasks
-from shared_store.policy_contract import Contract
+from shared_store.contract.policy import Contract
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 

@@ -1,6 +1,6 @@
 """Files that a job's YAML names in its task's configuration: their content becomes part of the job when it is submitted.
 
-A text that is too long for the job's definition is kept beside it (:mod:`shared_store.texts`).
+A text that is too long for the job's definition is kept beside it (:mod:`shared_store.volume.texts`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.spec.changes import override
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import place_of
-from shared_store.file_fields import KeptFile, kept_files
-from shared_store.settings import setting_at
-from shared_store.texts import IN_DEFINITION, LARGEST, beside, is_reference, size_in_definition
+from shared_store.contract.file_fields import KeptFile, kept_files
+from shared_store.volume.run_settings import setting_at
+from shared_store.volume.texts import IN_DEFINITION, LARGEST, beside, is_reference, size_in_definition
 
 _SECTIONS = ("train", "evaluate", "race")
 Note = Callable[[str], object]

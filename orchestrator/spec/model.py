@@ -40,9 +40,9 @@ from orchestrator.spec.values import (
     TaskName,
     place_of,
 )
+from shared_store.contract.error_text import Refused, explain, kind_of, nearest, path_of, shown
 from shared_store.races import DEFAULTS, TRIALS
-from shared_store.texts import beside
-from shared_store.wording import Refused, explain, kind_of, nearest, path_of, shown
+from shared_store.volume.texts import beside
 
 KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
 """The kinds of jobs: a spec has exactly one of these keys."""

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from orchestrator.domain.gang import MOST_NODES
 from orchestrator.spec.values import Memory, Section, Size
-from shared_store.log_files import LEAST_LIMIT, LIMIT
+from shared_store.contract.node import LEAST_LOG_LIMIT, LOG_LIMIT
 
 Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
 
@@ -55,8 +55,8 @@ class CheckpointPolicy(Section):
 class Logs(Section):
     """Limit of the kept output of each node."""
 
-    limit: Annotated[Size, Field(ge=LEAST_LIMIT)] = Field(
-        default=LIMIT,
+    limit: Annotated[Size, Field(ge=LEAST_LOG_LIMIT)] = Field(
+        default=LOG_LIMIT,
         description="of each node in each attempt, at least 1MiB; of a longer log its beginning and its end are kept",
     )
 

@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import BaseModel, Field, ValidationError, create_model
 from pydantic.dataclasses import is_pydantic_dataclass
 
-from shared_store.wording import explain
+from shared_store.contract.error_text import explain
 
 
 def settings_classes() -> dict[str, Any]:

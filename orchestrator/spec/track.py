@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from orchestrator.spec.values import Section
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
 
 SERVICES = ("wandb", "mlflow")
 

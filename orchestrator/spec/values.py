@@ -11,8 +11,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
-from shared_store.layout import NAME
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
+from shared_store.volume.layout import NAME
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}

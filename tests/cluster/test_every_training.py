@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from shared_store.layout import Run, Store
+from shared_store.volume.layout import Run, Store
 from tests.conftest import Serving, wait_for
 from tests.support.engines.sites import SITES
 from tests.support.engines.training import same_bits, submit

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from tests.conftest import MAIN_LAST, PATIENCE, Serving
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.hosts import start_ranks, two_hosts

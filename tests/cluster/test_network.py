@@ -15,11 +15,11 @@ from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import node_plans
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.log_view import LogView
-from shared_store.metrics import read_metrics
-from shared_store.outcomes import read_outcome
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
+from shared_store.volume.log_view import LogView
+from shared_store.volume.metrics import read_metrics
+from shared_store.volume.outcomes import read_outcome
 from tests.conftest import PATIENCE, REPOSITORY, wait_for
 from tests.support.engines.bench import make_gang
 from tests.support.faults.link import ADDRESSES, Link

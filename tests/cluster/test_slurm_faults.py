@@ -16,8 +16,8 @@ from orchestrator.engines.slurm import engine as slurm
 from orchestrator.engines.slurm.commands import call
 from orchestrator.engines.slurm.engine import SlurmEngine
 from orchestrator.engines.toolkit.looks import status_of
-from shared_store.checkpoints import list_checkpoints
-from shared_store.outcomes import read_outcome
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.outcomes import read_outcome
 from tests.conftest import MUSTER, PATIENCE, Serving, wait_for
 from tests.support.engines.sites import POLITE
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
@@ -51,8 +51,8 @@ def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: SlurmBenc
 
 LIVES_ON = """
 import os, pathlib, signal, time
-from shared_store.checkpoints import CheckpointWriter
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import CheckpointWriter
+from shared_store.volume.layout import Store
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 run = Store(os.environ["MUSTER_STORE"]).run("run")
 print("ready", flush=True)

@@ -9,8 +9,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from shared_store.layout import Store
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import submit_gang
 from tests.support.console.fixtures import Console
 from tests.support.console.person import PHONE, People

@@ -18,8 +18,8 @@ from muster_policy.contract import read
 from muster_policy.inputs import Inputs
 from muster_policy.messages import Messages
 from muster_policy.observations import Observations
-from shared_store.bundles import seal
-from shared_store.policy_contract import Contract
+from shared_store.contract.policy import Contract
+from shared_store.volume.bundles import seal
 
 
 def for_node(contract: Contract) -> NodeContract:

@@ -3,7 +3,7 @@
 ==================  ==========================================================================================================
 ``policy.onnx``     the mean action, the normaliser inside, batch size free; recurrent state as inputs and outputs
 ``policy.pt``       the same as TorchScript
-``contract.json``   what goes in and what comes out (:mod:`shared_store.policy_contract`)
+``contract.json``   what goes in and what comes out (:mod:`shared_store.contract.policy`)
 ``parity.npz``      observations of roll-outs, and what the trained policy did: a self-test for who runs the bundle
 ``report.json``     how the files were compared with the trained policy, and how both did on the same worlds
 ``leapp.yaml``      the same inputs and outputs as NVIDIA's LEAPP describes them (:mod:`worker.deploy.leapp_description`)
@@ -33,11 +33,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from shared_store import __version__
-from shared_store.bundles import CONTRACT, REPORT, publish, seal
-from shared_store.checkpoints import Checkpoint
-from shared_store.files import remove_tree, write_json
-from shared_store.layout import Run
-from shared_store.policy_contract import Contract
+from shared_store.contract.policy import Contract
+from shared_store.volume.bundles import CONTRACT, REPORT, publish, seal
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.files import remove_tree, write_json
+from shared_store.volume.layout import Run
 from worker.deploy import parity, rollouts
 from worker.deploy.leapp_description import LEAPP, leapp_description
 from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript

@@ -12,8 +12,8 @@ import torch
 import yaml
 
 from shared_store import __version__
-from shared_store.bundles import CONTRACT
-from shared_store.policy_contract import Contract, Group
+from shared_store.contract.policy import Contract, Group
+from shared_store.volume.bundles import CONTRACT
 from worker.deploy.model import OPSET
 
 LEAPP = "leapp.yaml"

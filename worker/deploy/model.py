@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from shared_store.policy_contract import Contract
+from shared_store.contract.policy import Contract
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 import warp
 
-from shared_store.bundles import DamagedBundle, read_contract, verify
-from shared_store.policy_contract import Contract
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.policy import Contract
+from shared_store.volume.bundles import DamagedBundle, read_contract, verify
 from worker.accepting import CHANGED_ROBOTS
 from worker.errors import UserError
 from worker.learning.job import configure, run_command, user_errors

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from shared_store.checkpoints import best_evaluated, list_checkpoints
-from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, in_one_line, list_evaluations
-from shared_store.files import write_json
-from shared_store.layout import Run
-from shared_store.pairs import are_paired, paired, read_returns
+from shared_store.volume.checkpoints import best_evaluated, list_checkpoints
+from shared_store.volume.evaluations import by_checkpoint, checkpoint_of, evaluation_name, in_one_line, list_evaluations
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Run
+from shared_store.volume.paired_episodes import are_paired, paired, read_returns
 from worker.distributed import Gang
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.statistics import Sample, difference, share

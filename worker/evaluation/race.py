@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 import warp as wp
 
-from shared_store.files import write_atomic
 from shared_store.races import SIM_TRACE
+from shared_store.volume.files import write_atomic
 from worker.racer.sim_trace import CONTINUOUS, SIM_TRACE_COLUMNS, model_documents, sim_trace, write_documents
 from worker.racer.trace import COLUMNS
 from worker.simulation.capture import on_torch_stream

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from shared_store.pairs import LEVEL, quantile, verdict
+from shared_store.volume.paired_episodes import LEVEL, quantile, verdict
 
 
 @dataclass(frozen=True)

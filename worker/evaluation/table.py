@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from shared_store.files import write_atomic
+from shared_store.volume.files import write_atomic
 from worker.evaluation.episodes import Episodes
 
 

@@ -1,4 +1,4 @@
-"""The start of a clone: from a copy of another run's weights in its own run directory (:mod:`shared_store.parent`)."""
+"""The start of a clone: from a copy of another run's weights in its own run directory (:mod:`shared_store.volume.initial_weights`)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
-from shared_store.files import DamagedFile
-from shared_store.parent import parent_checkpoint
-from shared_store.policy_changes import brief, differences, robot_changes
-from shared_store.settings import first_difference, fixed_settings, innermost
+from shared_store.contract.policy_changes import brief, differences, robot_changes
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.initial_weights import parent_checkpoint
+from shared_store.volume.run_settings import first_difference, fixed_settings, innermost
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm

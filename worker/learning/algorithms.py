@@ -17,7 +17,7 @@ import torch
 from pydantic import ValidationError
 from pydantic_core import ArgsKwargs
 
-from shared_store.wording import explain, nearest, path_of, shown
+from shared_store.contract.error_text import explain, nearest, path_of, shown
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
 from worker.tasks.config import TaskConfig

@@ -9,7 +9,7 @@ from typing import Any
 
 
 class Beacon:
-    """Messages to the supervisor: ``phase`` (:class:`shared_store.phases.Phase`), ``iteration`` and ``steps_per_second``, ``said`` (of a
+    """Messages to the supervisor: ``phase`` (:class:`shared_store.contract.phases.Phase`), ``iteration`` and ``steps_per_second``, ``said`` (of a
     save), ``done``.
 
     A message that finds the pipe full is dropped: the supervisor wants the newest, and the loop must not wait for it.

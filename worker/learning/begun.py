@@ -7,10 +7,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.files import DamagedFile
-from shared_store.parent import named_parent
-from shared_store.settings import fixed_settings, setting_at
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.initial_weights import named_parent
+from shared_store.volume.run_settings import fixed_settings, setting_at
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithms import refusal, section_of

@@ -7,8 +7,8 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING
 
-from shared_store.files import write_atomic
-from shared_store.phases import Phase
+from shared_store.contract.phases import Phase
+from shared_store.volume.files import write_atomic
 from worker.errors import TrainingError
 from worker.evaluation.evaluation import best_words, evaluate
 from worker.learning.algorithm import Share

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 if TYPE_CHECKING:
     from worker.tasks.telling import Telling

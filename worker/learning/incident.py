@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from shared_store.files import write_atomic
+from shared_store.volume.files import write_atomic
 from worker.tasks.policy_contract import robots_of
 
 if TYPE_CHECKING:

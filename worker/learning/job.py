@@ -17,12 +17,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
-from shared_store.epoch import StaleEpoch
-from shared_store.faults import fault_in
-from shared_store.layout import Run, Store, StoreError
-from shared_store.texts import TextError, resolved
-from shared_store.wording import kind_of
+from shared_store.contract.error_text import kind_of
+from shared_store.contract.faults import fault_in
+from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.volume.epoch import StaleEpoch
+from shared_store.volume.layout import Run, Store, StoreError
+from shared_store.volume.texts import TextError, resolved
 from worker.accepting import CHANGED_ROBOTS
 from worker.errors import GangError, TrainingError, UserError
 
@@ -235,7 +235,7 @@ def _write_error_file(message: str, shown: str, trace: str, cause: str = "") -> 
         message: The error.
         shown: The traceback for people, empty for an error that says all in one line.
         trace: The traceback with its place.
-        cause: As :attr:`shared_store.faults.Fault.cause`.
+        cause: As :attr:`shared_store.contract.faults.Fault.cause`.
     """
     path = os.environ.get("TORCHELASTIC_ERROR_FILE")
     if not path:

@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.outcomes import EX_TEMPFAIL
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.outcomes import EX_TEMPFAIL
 
 if TYPE_CHECKING:
     from worker.learning.job import StopRequest

@@ -6,10 +6,10 @@ import math
 import os
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import Checkpoint
-from shared_store.outcomes import EX_TEMPFAIL
-from shared_store.phases import Phase
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.phases import Phase
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError, UserError
 from worker.learning.adoption import adopt

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from shared_store.learning import in_log
-from shared_store.metrics import MetricsWriter, sampled, scalars, warnings_of
+from shared_store.volume.learning_metrics import in_log
+from shared_store.volume.metrics import MetricsWriter, sampled, scalars, warnings_of
 from worker.learning.watch import HISTORY, Watch
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from shared_store.epoch import check_epoch
-from shared_store.layout import Run
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.epoch import check_epoch
+from shared_store.volume.layout import Run
 
 _EVERY = 1.0
 """Seconds between two reads of the epoch."""

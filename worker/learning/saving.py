@@ -15,9 +15,9 @@ from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
-from shared_store.epoch import StaleEpoch
-from shared_store.layout import Run
-from shared_store.tied import start_tied
+from shared_store.process.tether import start_tied
+from shared_store.volume.epoch import StaleEpoch
+from shared_store.volume.layout import Run
 from worker.learning.host_copies import HostCopies
 from worker.learning.reporter import Gate
 

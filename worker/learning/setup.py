@@ -11,13 +11,13 @@ import torch
 import warp
 from tensordict import TensorDict
 
-from shared_store.checkpoints import Checkpoint
-from shared_store.documents import DocumentError
-from shared_store.epoch import check_epoch
-from shared_store.files import read_json, write_json
-from shared_store.phases import Phase
-from shared_store.policy_changes import brief, differences, robot_changes
-from shared_store.policy_contract import Contract, read
+from shared_store.contract.documents import DocumentError
+from shared_store.contract.phases import Phase
+from shared_store.contract.policy import Contract, read
+from shared_store.contract.policy_changes import brief, differences, robot_changes
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.epoch import check_epoch
+from shared_store.volume.files import read_json, write_json
 from worker.distributed import Gang, warm_marker
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition

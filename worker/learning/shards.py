@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from shared_store.checkpoints import Checkpoint
+from shared_store.volume.checkpoints import Checkpoint
 from worker.errors import UserError
 
 

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
-from shared_store.checkpoints import (
+from shared_store.contract.error_text import counted
+from shared_store.contract.policy_changes import brief, differences
+from shared_store.volume.checkpoints import (
     Checkpoint,
     DamagedCheckpoint,
     NewerFormat,
@@ -24,10 +26,8 @@ from shared_store.checkpoints import (
     set_aside,
     sweep,
 )
-from shared_store.epoch import check_epoch
-from shared_store.policy_changes import brief, differences
-from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
-from shared_store.wording import counted
+from shared_store.volume.epoch import check_epoch
+from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from shared_store.checkpoints import Checkpoint
+from shared_store.volume.checkpoints import Checkpoint
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Student

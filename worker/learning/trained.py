@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import (
+from shared_store.volume.checkpoints import (
     Checkpoint,
     DamagedCheckpoint,
     best_checkpoint,
@@ -12,7 +12,7 @@ from shared_store.checkpoints import (
     list_checkpoints,
     newest_checkpoint,
 )
-from shared_store.layout import Run
+from shared_store.volume.layout import Run
 from worker.errors import UserError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.metrics import THIS_RUN
+from shared_store.volume.metrics import THIS_RUN
 
 WINDOW = 20
 """Iterations over which returns are averaged."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from shared_store.bus import (
+from shared_store.contract.bus import (
     LARGEST_PROGRESS,
     LARGEST_PUSH,
     LEASE_MILLISECONDS,
@@ -28,8 +28,8 @@ from shared_store.bus import (
     presence_key,
     push_proof,
 )
-from shared_store.contract import NodeContract
-from shared_store.files import json_object
+from shared_store.contract.node import NodeContract
+from shared_store.volume.files import json_object
 
 if TYPE_CHECKING:
     import zenoh

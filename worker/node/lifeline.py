@@ -13,8 +13,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.contract import NodeContract
-from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.contract.node import NodeContract
+from shared_store.volume.outcomes import EX_TEMPFAIL
 
 PORT = 29499
 """Port of the main node, one below torch.distributed's."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from shared_store.contract import NodeContract
-from shared_store.memory_groups import killed_for_memory, make_memory_group
+from shared_store.contract.node import NodeContract
+from shared_store.process.memory_groups import killed_for_memory, make_memory_group
 
 
 class MemoryLimit:

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from shared_store.contract import NodeContract
-from shared_store.faults import fault_from, fault_in
-from shared_store.files import DamagedFile, json_object, read_json
-from shared_store.outcomes import FirstError
-from shared_store.tied import tied
+from shared_store.contract.faults import fault_from, fault_in
+from shared_store.contract.node import NodeContract
+from shared_store.process.tether import tied
+from shared_store.volume.files import DamagedFile, json_object, read_json
+from shared_store.volume.outcomes import FirstError
 
 _LONGEST_LINE = 65536
 """Bytes after which a line without an end is cut, so that a program that never prints a newline can't fill the memory."""

@@ -19,9 +19,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from shared_store.contract import NodeContract, sealed
-from shared_store.ports import free_port
-from shared_store.shim import shimmed
+from shared_store.contract.node import NodeContract, sealed
+from shared_store.process.ports import free_port
+from shared_store.process.shim import shimmed
 from worker.node.network import address_towards
 
 

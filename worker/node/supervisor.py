@@ -20,16 +20,16 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shared_store.contract import OWN_VARIABLES, ContractError, NodeContract
-from shared_store.epoch import StaleEpoch, check_epoch, find_epoch, read_epoch
-from shared_store.files import DamagedFile
-from shared_store.layout import Run, Store, StoreError
-from shared_store.log_files import LogWriter, left_out
-from shared_store.logs import END_LINE, format_line, format_lines
-from shared_store.nodes import end_descendants
-from shared_store.outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
-from shared_store.processes import PATIENCE, find_process, unkillable
-from shared_store.shim import SCRATCH
+from shared_store.contract.node import OWN_VARIABLES, ContractError, NodeContract
+from shared_store.process.node_processes import end_descendants
+from shared_store.process.processes import PATIENCE, find_process, unkillable
+from shared_store.process.shim import SCRATCH
+from shared_store.volume.epoch import StaleEpoch, check_epoch, find_epoch, read_epoch
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run, Store, StoreError
+from shared_store.volume.log_files import LogWriter, left_out
+from shared_store.volume.logs import END_LINE, format_line, format_lines
+from shared_store.volume.outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
 from worker.node.bus import Command, NodeBus
 from worker.node.memory import MemoryLimit
 from worker.node.network import interface_of

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from shared_store.contract import NodeContract, job_variables, rank_variables
+from shared_store.contract.node import NodeContract, job_variables, rank_variables
 
 _PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 _KEPT = (

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from shared_store import tracks as stored
-from shared_store.files import write_atomic
-from shared_store.layout import Store
+from shared_store.volume.files import write_atomic
+from shared_store.volume.layout import Store
 from worker.errors import UserError
 from worker.racer.generator import make_random
 from worker.racer.naming import keep, resolve

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from shared_store.wording import Refused, nearest, shown
+from shared_store.contract.error_text import Refused, nearest, shown
 
 STEERING = (-30.0, 30.0)
 """Least and greatest steering angle [degrees], to the left greater than 0."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.racer.arithmetic import Floats
 from worker.racer.geometry import place_at, project
 from worker.racer.track import Track

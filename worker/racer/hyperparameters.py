@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.wording import Refused, nearest, shown
+from shared_store.contract.error_text import Refused, nearest, shown
 
 EPISODE = 200
 """Control steps for which an episode counts where episodes are counted: 13 s, about a lap of a preset track."""

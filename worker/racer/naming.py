@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from shared_store import tracks as stored
-from shared_store.layout import Store
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
+from shared_store.volume.layout import Store
 from worker.racer.checks import BadTrack
 from worker.racer.generator import LARGEST_SEED, make_random
 from worker.racer.presets import PRESETS, make_preset

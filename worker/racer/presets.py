@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.racer.arithmetic import Floats, left_of, sine_cosine
 from worker.racer.checks import LENGTHS, WAYPOINTS, WIDTHS, BadTrack
 from worker.racer.track import CLOCKWISE, COUNTER_CLOCKWISE, DIRECTIONS, Direction, Track

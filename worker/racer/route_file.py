@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_store.files import DamagedFile, open_regular
+from shared_store.contract.error_text import counted
 from shared_store.tracks import LARGEST
-from shared_store.wording import counted
+from shared_store.volume.files import DamagedFile, open_regular
 from worker.racer.arithmetic import Floats, norm
 from worker.racer.checks import RINGS, SHORTEST_STEP, WAYPOINTS, BadTrack, at, check_numbers, inside, left_of_line
 from worker.racer.track import Track

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared_store.files import refuse_links, write_json
+from shared_store.volume.files import refuse_links, write_json
 from worker.racer.hyperparameters import deepracer_names
 from worker.racer.resets import MISHAPS
 from worker.racer.trace import COLUMNS

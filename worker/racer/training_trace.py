@@ -16,10 +16,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.files import write_atomic
-from shared_store.layout import Run
 from shared_store.races import SIM_TRACE
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.files import write_atomic
+from shared_store.volume.layout import Run
 from worker.racer.car_arrays import CarArrays
 from worker.racer.sim_trace import CONTINUOUS, SIM_TRACE_COLUMNS, sim_trace, write_documents
 from worker.racer.trace import COLUMNS, trace_car

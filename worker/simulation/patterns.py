@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import TypeVar
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 Value = TypeVar("Value")
 FLOORS = ("floor", "ground")

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.patterns import find
 from worker.simulation.randomization_kernels import CENTER, INERTIA, MASS, PAYLOAD
 from worker.simulation.robot_values import UNLIMITED

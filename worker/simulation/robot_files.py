@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import mujoco
 import newton.examples
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.robot_elements import plain
 
 FORMATS = {".xml": "", ".mjcf": "mjcf", ".urdf": "urdf", ".usd": "usd", ".usda": "usd", ".usdc": "usd", ".usdz": "usd"}

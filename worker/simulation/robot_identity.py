@@ -12,7 +12,7 @@ import mujoco
 import newton
 import numpy as np
 
-from shared_store.policy_contract import RobotModel
+from shared_store.contract.policy import RobotModel
 from worker.simulation.robot_connections import (
     Ends,
     actuator_ends,

@@ -18,8 +18,8 @@ import newton
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from shared_store.policy_contract import RobotModel
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.contract.policy import RobotModel
 from worker.accepting import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference, robot_usd, robot_values

@@ -14,7 +14,7 @@ import mujoco
 import newton
 import numpy as np
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation import robot_files, robot_floor, robot_urdf
 from worker.simulation.patterns import check_ignored
 from worker.simulation.robot_elements import kind_of, name_of, some, word_of

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation import robot_files
 from worker.simulation.robot_elements import some
 from worker.simulation.robot_files import RobotFile

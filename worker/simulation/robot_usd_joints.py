@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from pxr import UsdPhysics
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.robot_elements import some
 from worker.simulation.robot_usd_stage import PLACE, Stage, authored, plain, same, same_pose
 from worker.simulation.robot_view import actuator_value, actuators_of_dofs

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.actuators import Input
 from worker.simulation.carriers import is_carrier
 from worker.simulation.patterns import find

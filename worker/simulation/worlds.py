@@ -13,7 +13,7 @@ import newton
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.carriers import keep_inertias, unload
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives

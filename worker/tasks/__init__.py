@@ -12,7 +12,7 @@ import sys
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.tasks.mistakes import task_mistakes
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.tasks import find_task, task_names
 from worker.tasks.images import shown
 from worker.tasks.mistakes import task_mistakes

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.tasks import terms

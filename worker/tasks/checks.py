@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
 from worker.tasks.interface import Interface, Observation, deviations
 from worker.tasks.numbers import flat
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, WrapValidator
 from pydantic.dataclasses import dataclass
 
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
 from worker.learning.ppo.settings import PPOConfig
 from worker.tasks.overrides import Refused, configured, expecting, from_mapping, refused, training_sections
 

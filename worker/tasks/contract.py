@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
-from shared_store.policy_contract import Action
+from shared_store.contract.policy import Action
 from worker.simulation.sensors.differential_ik import AXES, DifferentialIK
 from worker.tasks.acting import frame_of
 from worker.tasks.declaration import Action as DeclaredAction

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from shared_store.policy_contract import Target
+from shared_store.contract.policy import Target
 from worker.tasks.randomize import Randomize
 
 Pattern = str | Sequence[str]

@@ -10,7 +10,7 @@ import newton
 import torch
 import warp as wp
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.camera import paint
 from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import STEP, check_group, check_observations

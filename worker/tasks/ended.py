@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import warp as wp
 
-from shared_store.evaluations import BY_CLOCK
+from shared_store.volume.evaluations import BY_CLOCK
 from worker.simulation.episodes import PHYSICS_FAILED, STEPS, TERMS
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
 from worker.tasks.config import TaskConfig
 from worker.tasks.declaration import Declaration

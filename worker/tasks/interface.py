@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
-from shared_store.policy_contract import Action
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
+from shared_store.contract.policy import Action
 
 
 @dataclass(frozen=True)

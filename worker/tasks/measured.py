@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from shared_store.policy_contract import Frame
+from shared_store.contract.policy import Frame
 from worker.simulation.sensors.imu import Imu
 from worker.tasks import terms
 from worker.tasks.terms import root

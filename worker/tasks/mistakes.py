@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType, TracebackType
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.errors import UserError, is_out_of_memory
 
 _OURS = str(Path(__file__).parents[1])

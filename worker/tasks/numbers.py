@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from shared_store.wording import nearest, shown
+from shared_store.contract.error_text import nearest, shown
 
 EXPRESSIONS: Mapping[Any, str] = {
     float: "numbers[{0}]",

@@ -12,8 +12,8 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError, WrapValidato
 from pydantic.errors import PydanticUserError
 from pydantic_core import ArgsKwargs
 
-from shared_store.wording import Path, explain, nearest
-from shared_store.wording import Refused as Refused
+from shared_store.contract.error_text import Path, explain, nearest
+from shared_store.contract.error_text import Refused as Refused
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.actuators import Input
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_view import RobotView

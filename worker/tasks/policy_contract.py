@@ -1,4 +1,4 @@
-"""The policy contract of a task: :class:`shared_store.policy_contract.Contract`, made from its declaration and its interface."""
+"""The policy contract of a task: :class:`shared_store.contract.policy.Contract`, made from its declaration and its interface."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from shared_store import __version__
-from shared_store.policy_contract import Command, Contract, Group, Image, RobotModel, State, Term
+from shared_store.contract.policy import Command, Contract, Group, Image, RobotModel, State, Term
 from worker.tasks.contract import described, range_of
 from worker.tasks.images import described as images_of
 from worker.tasks.measured import frame_of, is_library

@@ -12,8 +12,8 @@ import newton
 import torch
 import warp as wp
 
-from shared_store.layout import Run, Store
-from shared_store.policy_contract import Target
+from shared_store.contract.policy import Target
+from shared_store.volume.layout import Run, Store
 from worker.racer import resets
 from worker.racer import terms as racing
 from worker.racer.actions import CAMERA, ActionSpace

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 Pattern = str | tuple[str, ...]
 Ends = tuple[float, float]

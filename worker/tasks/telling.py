@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import torch
 
-    from shared_store.layout import Run
+    from shared_store.volume.layout import Run
     from worker.tasks.step_log import StepLog
 
 

@@ -10,8 +10,8 @@ import socket
 import time
 from pathlib import Path
 
-from shared_store.files import DamagedFile, read_json, write_json
-from shared_store.layout import Run
+from shared_store.volume.files import DamagedFile, read_json, write_json
+from shared_store.volume.layout import Run
 from worker.errors import UserError
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout

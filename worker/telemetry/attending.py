@@ -13,8 +13,8 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Any
 
-from shared_store.files import read_json, write_json
-from shared_store.layout import Run
+from shared_store.volume.files import read_json, write_json
+from shared_store.volume.layout import Run
 from worker.learning.reporter import Gate
 from worker.simulation.episodes import WATCHED
 from worker.telemetry.asking import answer_of, is_alive, request_of

@@ -14,11 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared_store.files import read_json
-from shared_store.layout import Run
-from shared_store.log_view import LogView
-from shared_store.metrics import history_of
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.files import read_json
+from shared_store.volume.layout import Run
+from shared_store.volume.log_view import LogView
+from shared_store.volume.metrics import history_of
 from worker.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.progress import Activity, loading

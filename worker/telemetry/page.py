@@ -27,7 +27,7 @@ from pathlib import Path
 from types import TracebackType
 from urllib.parse import urlencode, urlsplit
 
-from shared_store.tied import tied
+from shared_store.process.tether import tied
 from worker.errors import UserError
 
 LOOPBACK = "127.0.0.1"

@@ -244,7 +244,7 @@ def pace(control_hz: float, ending: str) -> tuple[int, float]:
 
 def write(path: Path, data: bytes) -> None:
     """Write a picture as a whole or not at all. Raises UserError."""
-    from shared_store.files import write_atomic
+    from shared_store.volume.files import write_atomic
 
     try:
         write_atomic(path, data)

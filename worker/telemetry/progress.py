@@ -9,8 +9,8 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from shared_store.layout import Run
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.layout import Run
 
 _SECONDS = 2.0
 """Between two plain lines of the same activity."""

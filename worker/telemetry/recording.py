@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.rows import Rows

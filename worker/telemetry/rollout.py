@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 import warp
 
-from shared_store.checkpoints import Checkpoint
-from shared_store.layout import Run
-from shared_store.texts import resolved_spec
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.layout import Run
+from shared_store.volume.texts import resolved_spec
 from worker.learning.job import configure, user_errors
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.setup import begin_as_trained, check_contract, observed

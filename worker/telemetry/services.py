@@ -13,9 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from shared_store.evaluations import flattened
-from shared_store.files import remove_tree
-from shared_store.metrics import scalars
+from shared_store.volume.evaluations import flattened
+from shared_store.volume.files import remove_tree
+from shared_store.volume.metrics import scalars
 
 OUTCOMES = {"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}
 """The possible ends of a training, and MLflow's word for each."""

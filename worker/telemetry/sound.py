@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.telemetry import messages
 from worker.telemetry.shapes import (
     ATTACHMENT,

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
-from shared_store.outcomes import EX_TEMPFAIL
-from shared_store.tied import start_tied
+from shared_store.process.tether import start_tied
+from shared_store.volume.outcomes import EX_TEMPFAIL
 from worker.errors import UserError
 from worker.learning.job import Job
 

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from shared_store.layout import Run
-from shared_store.log_view import LogView
-from shared_store.logs import LogLine
-from shared_store.metrics import history_of
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.layout import Run
+from shared_store.volume.log_view import LogView
+from shared_store.volume.logs import LogLine
+from shared_store.volume.metrics import history_of
 from worker.accepting import CHANGED_ROBOTS
 from worker.errors import UserError
 from worker.telemetry.page import Page, need_rerun

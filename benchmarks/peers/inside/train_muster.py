@@ -12,8 +12,8 @@ from typing import Any
 
 from benchmarks.peers.building import build_loop
 from benchmarks.peers.inside.clock import device_facts, versions
-from shared_store.checkpoints import list_checkpoints
-from shared_store.metrics import read_metrics
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.metrics import read_metrics
 
 CURVE = {"collect_s": "collect_seconds", "learn_s": "learn_seconds", "seconds": "total_seconds"}
 """Names of these metrics in a point of the curve."""

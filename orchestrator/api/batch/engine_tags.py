@@ -9,7 +9,7 @@ from orchestrator.domain.retention import TAG, rule_of
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.installed import ENGINES, check_tags
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 
 def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) -> None:

@@ -22,7 +22,7 @@ from orchestrator.api.http import limits
 from orchestrator.api.permissions import Operation
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
-from shared_store.parent import TeacherCopy
+from shared_store.volume.initial_weights import TeacherCopy
 
 OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
     "RegisterJobDefinition": definitions.register_job_definition,

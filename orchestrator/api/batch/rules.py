@@ -14,8 +14,8 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.domain.gang import MOST_NODES, GangSpec, gang_needs, target_nodes
 from orchestrator.domain.native_options import MalformedOptions
-from shared_store.log_files import LEAST_LIMIT
-from shared_store.wording import shown
+from shared_store.contract.error_text import shown
+from shared_store.contract.node import LEAST_LOG_LIMIT
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
@@ -122,7 +122,7 @@ def _check_options(gang: GangSpec) -> None:
     try:
         spec = gang.spec
         json.dumps(spec, ensure_ascii=False).encode()  # half of a character can't be shown
-        if _depth(spec) > _DEEPEST_SPEC or not LEAST_LIMIT <= gang.options.log_limit < 2**63:
+        if _depth(spec) > _DEEPEST_SPEC or not LEAST_LOG_LIMIT <= gang.options.log_limit < 2**63:
             raise ValueError
     except (ValueError, RecursionError):
         raise ClientError(_MALFORMED) from None

@@ -33,8 +33,8 @@ from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQ
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import note_changed
 from orchestrator.spec.evaluations import place_of, wanted_of
-from shared_store.contents import is_archived
-from shared_store.layout import NAME
+from shared_store.volume.contents import is_archived
+from shared_store.volume.layout import NAME
 
 _MOST_DEPENDENCIES = 20
 _ARRAY_SIZES = range(2, 10_001)

@@ -28,7 +28,7 @@ from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import RequestError, Unavailable
 from shared_store import __version__
-from shared_store.files import DamagedFile
+from shared_store.volume.files import DamagedFile
 
 BROWSER_HEADERS = [
     ("X-Content-Type-Options", "nosniff"),

@@ -20,9 +20,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from shared_store.files import DamagedFile, open_regular
-from shared_store.log_files import UNKNOWN, Segment, left_out, read_log, segments_of
-from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
+from shared_store.volume.files import DamagedFile, open_regular
+from shared_store.volume.log_files import UNKNOWN, Segment, left_out, read_log, segments_of
+from shared_store.volume.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
 
 _BLOCK = 32 << 10
 """Bytes between two marks."""

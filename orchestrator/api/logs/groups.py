@@ -23,7 +23,7 @@ from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
 from orchestrator.persistence.models import Job, Node
 from orchestrator.persistence.own_models import LogGroup, LogStream
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 
 _RETENTIONS = (
     *(1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288),

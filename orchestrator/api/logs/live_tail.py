@@ -22,9 +22,9 @@ from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.models import now
-from shared_store.layout import Run
-from shared_store.log_view import Chosen, Key, LogView
-from shared_store.logs import LogLine
+from shared_store.volume.layout import Run
+from shared_store.volume.log_view import Chosen, Key, LogView
+from shared_store.volume.logs import LogLine
 
 LONGEST_SESSION = 3 * 3600.0
 """Seconds, as on AWS."""

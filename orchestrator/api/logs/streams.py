@@ -18,7 +18,7 @@ from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.own_models import LogStream
-from shared_store.layout import Run, Store
+from shared_store.volume.layout import Run, Store
 
 MOST_STREAMS = 1000
 """A request that names no stream is about this many: those of the newest jobs that it can be about."""

@@ -42,9 +42,9 @@ from orchestrator.spec.evaluations import (
     wanted_of,
 )
 from orchestrator.spec.sections import Evaluation
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.evaluations import evaluation_is_over, keep_for_evaluation, wanted_checkpoints
-from shared_store.layout import Run
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.volume.evaluations import evaluation_is_over, keep_for_evaluation, wanted_checkpoints
+from shared_store.volume.layout import Run
 
 LOOK = 2.0
 """Seconds between two looks at the checkpoints of running trainings: a listing of a directory each."""

@@ -1,6 +1,6 @@
 """The rules of cloning: a new run that begins with the weights of a checkpoint and nothing else of it.
 
-The weights are copied when the clone is submitted (:mod:`shared_store.parent`): its job may wait for days, so pruning or deleting
+The weights are copied when the clone is submitted (:mod:`shared_store.volume.initial_weights`): its job may wait for days, so pruning or deleting
 the source does no harm.
 """
 
@@ -31,11 +31,11 @@ from orchestrator.persistence.ownership import FoundRun, first_description, forg
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
-from shared_store.layout import Run
-from shared_store.parent import NewRun, RunExists, TeacherCopy
-from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
-from shared_store.wording import Refused, shown
+from shared_store.contract.error_text import Refused, shown
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.volume.initial_weights import NewRun, RunExists, TeacherCopy
+from shared_store.volume.layout import Run
+from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
 
 
 def clone(

@@ -29,7 +29,7 @@ class Changes:
     """The request for the new job."""
 
     checkpoint: int | Literal["best", "latest"] | None = None
-    """Iteration, or what :func:`shared_store.checkpoints.best_checkpoint` says; the newest where None."""
+    """Iteration, or what :func:`shared_store.volume.checkpoints.best_checkpoint` says; the newest where None."""
     assignments: tuple[str, ...] = ()
     """``key.path=value`` changes of the run's spec."""
     directory: str = ""

@@ -29,9 +29,9 @@ from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
 from orchestrator.spec.model import KINDS
-from shared_store.files import DamagedFile
-from shared_store.layout import Run, Store
-from shared_store.metrics import finite, sampled
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import finite, sampled
 
 router = APIRouter()
 

@@ -30,15 +30,16 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.spec.league_races import race_job
 from orchestrator.spec.settings import task_config
-from shared_store import bundles, leagues
-from shared_store.bundles import DamagedBundle
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
-from shared_store.evaluations import list_evaluations
-from shared_store.files import DamagedFile
+from shared_store import leagues
+from shared_store.contract.error_text import shown
 from shared_store.leagues import League, LeagueError, Rules, StoredLeague, UnknownLeague
-from shared_store.models import Model
 from shared_store.standings import BadRace, Ranking, read_race, table
-from shared_store.wording import shown
+from shared_store.volume import bundles
+from shared_store.volume.bundles import DamagedBundle
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.models import Model
 
 router = APIRouter(route_class=StoreRoute)
 

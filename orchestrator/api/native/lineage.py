@@ -7,8 +7,8 @@ import time
 
 from orchestrator.api.context import visible_runs
 from orchestrator.control.reconciler import Reconciler
-from shared_store.files import DamagedFile
-from shared_store.layout import Run
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run
 
 _KEPT = 600.0
 """Seconds for which the parent of a run is not read again: it changes only where the run is replaced by another of its name."""

@@ -14,8 +14,8 @@ from orchestrator.control.log_hub import LogHub, Waker
 from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.store_calls import StoreCalls, StoreSilent
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from shared_store.log_view import LogView
-from shared_store.logs import LogLine, timestamp
+from shared_store.volume.log_view import LogView
+from shared_store.volume.logs import LogLine, timestamp
 
 _PAUSE = 0.025
 """Seconds between two pieces of a log that is followed, while few are."""

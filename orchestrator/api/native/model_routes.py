@@ -16,10 +16,10 @@ from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import RunRecord
-from shared_store import bundles, models
-from shared_store.bundles import DamagedBundle
-from shared_store.files import DamagedFile
-from shared_store.models import AlreadyRegistered, Model, ModelError, UnknownModel
+from shared_store.volume import bundles, models
+from shared_store.volume.bundles import DamagedBundle
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.models import AlreadyRegistered, Model, ModelError, UnknownModel
 
 router = APIRouter(route_class=StoreRoute)
 

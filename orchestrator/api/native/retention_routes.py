@@ -18,7 +18,7 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.domain.retention import age_of
-from shared_store import contents
+from shared_store.volume import contents
 
 router = APIRouter(route_class=WorkRoute)
 

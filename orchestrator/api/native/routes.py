@@ -47,10 +47,10 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, unknown_job
-from shared_store.files import DamagedFile
-from shared_store.layout import Run
-from shared_store.log_view import Chosen, LogView
-from shared_store.phases import Phase, phase_in
+from shared_store.contract.phases import Phase, phase_in
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run
+from shared_store.volume.log_view import Chosen, LogView
 
 router = APIRouter(prefix="/api")
 router.include_router(job_list.router)

@@ -14,9 +14,9 @@ from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native import clones, lineage, runs
 from orchestrator.api.native.continuing import Changes
 from orchestrator.api.permissions import Operation
-from shared_store.checkpoints import best_checkpoint, list_checkpoints
-from shared_store.evaluations import by_checkpoint, list_evaluations
-from shared_store.metrics import history_of
+from shared_store.volume.checkpoints import best_checkpoint, list_checkpoints
+from shared_store.volume.evaluations import by_checkpoint, list_evaluations
+from shared_store.volume.metrics import history_of
 
 router = APIRouter(route_class=StoreRoute)
 

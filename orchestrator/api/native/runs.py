@@ -32,15 +32,15 @@ from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
-from shared_store.contents import is_archived
-from shared_store.evaluations import by_checkpoint
-from shared_store.files import DamagedFile
-from shared_store.layout import Run
-from shared_store.metrics import sampled
-from shared_store.parent import TeacherCopy
-from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
-from shared_store.wording import counted, shown
+from shared_store.contract.error_text import counted, shown
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
+from shared_store.volume.contents import is_archived
+from shared_store.volume.evaluations import by_checkpoint
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.initial_weights import TeacherCopy
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import sampled
+from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
 
 
 def list_runs(

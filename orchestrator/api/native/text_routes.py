@@ -12,7 +12,7 @@ from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.permissions import Operation
-from shared_store.texts import Reference, TextError, digest_of, read
+from shared_store.volume.texts import Reference, TextError, digest_of, read
 
 router = APIRouter(route_class=StoreRoute)
 

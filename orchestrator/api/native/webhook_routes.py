@@ -12,7 +12,7 @@ from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.control.deliveries import Deliveries
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 router = APIRouter()
 

@@ -7,8 +7,8 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from shared_store.comparison import Group
-from shared_store.files import write_atomic
+from shared_store.volume.comparison import Group
+from shared_store.volume.files import write_atomic
 
 Curves = Sequence[tuple[str, Sequence[tuple[float, float, float, int]]]]
 

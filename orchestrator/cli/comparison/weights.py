@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 LARGEST = 512 << 20
 """Greatest size of a policy file that is read [bytes]."""

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.aws_batch import OPTIONS
-from shared_store.wording import explain, nearest, shown
+from shared_store.contract.error_text import explain, nearest, shown
 
 
 class AwsConfig(BaseModel):

@@ -48,8 +48,8 @@ from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
-from shared_store.outcomes import EX_TEMPFAIL, Outcome
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.outcomes import EX_TEMPFAIL, Outcome
 
 _PORT = 29500
 _GRACE = 25.0

@@ -7,7 +7,7 @@ from typing import Any
 
 from orchestrator.engines.api import Cause, Handle, NodePhase, NodeStatus
 from orchestrator.engines.toolkit.endings import ended
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 
 
 def waiting(handle: Handle, index: int, status: str, detail: Mapping[str, Any], parent: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ from orchestrator.domain.gang import FARGATE_MEMBERS
 from orchestrator.engines.api import EngineError, Gang, NodePlan
 from orchestrator.engines.aws_batch.config import AwsConfig
 from shared_store import __version__
-from shared_store.contract import sealed_in_image
+from shared_store.contract.node import sealed_in_image
 
 DIGEST, GANG = "muster:digest", "muster:gang"
 """Tags: of a definition, of what it says; of a job, the attempt that it is."""

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import AwsConfig, config_path, problem_of, save_config
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 
 _PLACES = (
     Path(__file__).parents[3] / "containers" / "aws" / "muster.yaml",

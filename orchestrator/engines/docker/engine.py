@@ -55,10 +55,10 @@ from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from shared_store import __version__
-from shared_store.files import DamagedFile
-from shared_store.layout import Store
-from shared_store.outcomes import OUT_OF_MEMORY, read_outcome
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import OUT_OF_MEMORY, read_outcome
 
 log = logging.getLogger("muster.engines")
 

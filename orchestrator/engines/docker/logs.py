@@ -16,7 +16,7 @@ from docker.models.containers import Container
 from urllib3.exceptions import HTTPError
 
 from orchestrator.engines.toolkit.log_copy import LogCopy
-from shared_store.logs import format_line
+from shared_store.volume.logs import format_line
 
 _TIME = re.compile(rb"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?Z) ")
 _AGAIN = 1.0

@@ -12,7 +12,7 @@ from docker.types import Mount
 from orchestrator.engines.api import Gang, NodePlan
 from orchestrator.engines.docker.options import limits, linux
 from orchestrator.engines.toolkit.mounts import mounts_of
-from shared_store.contract import BUS_VARIABLES, NodeContract, sealed_in_image
+from shared_store.contract.node import BUS_VARIABLES, NodeContract, sealed_in_image
 
 STORE, KERNELS = "/muster/store", "/muster/kernels"
 """Paths of the store and of the cache of compiled kernels in a container of an image with Muster."""

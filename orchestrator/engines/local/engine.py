@@ -1,6 +1,6 @@
 """The local engine: nodes are process groups on this machine, each with its own loopback address and its share of it.
 
-Each supervisor has a shim as its parent (:mod:`shared_store.shim`), and a control group where these can be made. Both outlive the
+Each supervisor has a shim as its parent (:mod:`shared_store.process.shim`), and a control group where these can be made. Both outlive the
 controller. A restarted controller finds the shims again by pid and start time, what a node leaves behind by its control group and by
 the gang's name in its environment.
 """
@@ -44,15 +44,15 @@ from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.waiting import wait_until
-from shared_store.cgroups import own_group, remove_abandoned_groups
-from shared_store.contract import NodeContract, sealed
-from shared_store.layout import Store
-from shared_store.memory_groups import memory_group, memory_home
-from shared_store.nodes import NodeProcesses, end_nodes
-from shared_store.outcomes import read_outcome
-from shared_store.ports import first_port, free_port
-from shared_store.processes import await_marks, find_process, marked, unkillable
-from shared_store.shim import STUCK, exit_code_in, group_of, make_exit_file, shimmed
+from shared_store.contract.node import NodeContract, sealed
+from shared_store.process.cgroups import own_group, remove_abandoned_groups
+from shared_store.process.memory_groups import memory_group, memory_home
+from shared_store.process.node_processes import NodeProcesses, end_nodes
+from shared_store.process.ports import first_port, free_port
+from shared_store.process.processes import await_marks, find_process, marked, unkillable
+from shared_store.process.shim import STUCK, exit_code_in, group_of, make_exit_file, shimmed
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import read_outcome
 
 log = logging.getLogger("muster.engines")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from shared_store.processes import find_process
+from shared_store.process.processes import find_process
 
 
 def running_gangs(home: Path) -> dict[str, list[int]]:

@@ -46,8 +46,8 @@ from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.stopping import stop_within
-from shared_store.files import read_json, write_json
-from shared_store.ports import first_port
+from shared_store.process.ports import first_port
+from shared_store.volume.files import read_json, write_json
 
 DEFAULT_ADDRESS = "127.0.0.1:6379"
 _DRIVERS = 3

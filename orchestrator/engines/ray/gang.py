@@ -17,9 +17,9 @@ from orchestrator.engines.ray import node as ray_node
 from orchestrator.engines.ray.bundles import bundle_of
 from orchestrator.engines.ray.folder import LEASE, Folder
 from shared_store import __version__
-from shared_store.contract import NodeContract
-from shared_store.files import write_json
-from shared_store.ports import first_port
+from shared_store.contract.node import NodeContract
+from shared_store.process.ports import first_port
+from shared_store.volume.files import write_json
 
 _BEAT = 2.0
 """Seconds between two signs of life to an actor."""

@@ -35,7 +35,7 @@ class Node:
         self._started, self._ended, self._ordered = threading.Event(), threading.Event(), threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self._shim: Any = None
-        """``shared_store.nodes.NodeProcesses`` of the node."""
+        """``shared_store.process.node_processes.NodeProcesses`` of the node."""
         self._problem = ""
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
@@ -65,7 +65,7 @@ class Node:
         gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")
         if muster != version:
             return {"version": muster, "gpus": gpus, "port": 0, "problem": ""}
-        from shared_store.ports import free_port
+        from shared_store.process.ports import free_port
 
         port = 0
         with contextlib.suppress(OSError):
@@ -92,7 +92,7 @@ class Node:
             directory: Working directory.
         """
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(_OF_RAY)}
-        from shared_store.contract import sealed  # it is there by now, and of the same version: see facts()
+        from shared_store.contract.node import sealed  # it is there by now, and of the same version: see facts()
 
         environment = {
             **inherited,
@@ -140,10 +140,10 @@ class Node:
         assert self._order is not None
         command, environment, directory = self._order
         try:
-            from shared_store.cgroups import own_group
-            from shared_store.nodes import NodeProcesses
-            from shared_store.processes import find_process
-            from shared_store.shim import shimmed
+            from shared_store.process.cgroups import own_group
+            from shared_store.process.node_processes import NodeProcesses
+            from shared_store.process.processes import find_process
+            from shared_store.process.shim import shimmed
 
             name = "-".join(mark.partition("=")[2] for mark in self.marks).replace("/", "-")
             group = f"{groups}/muster-{name}" if (groups := own_group()) else ""
@@ -184,8 +184,8 @@ class Node:
         """SIGKILL to all of the node; what it does not end, or nothing."""
         if self._shim is None:
             return ""
-        from shared_store.nodes import end_nodes
-        from shared_store.processes import unkillable
+        from shared_store.process.node_processes import end_nodes
+        from shared_store.process.processes import unkillable
 
         left = end_nodes([self._shim], self.marks)
         return unkillable(left) if left else ""
@@ -193,8 +193,8 @@ class Node:
 
 def _foreign(store: str, run: str, epoch: int) -> str:
     """Why the store here is not the controller's; empty where it is. For a node with the driver's version of Muster."""
-    from shared_store.epoch import StaleEpoch, find_epoch
-    from shared_store.layout import Store, StoreError
+    from shared_store.volume.epoch import StaleEpoch, find_epoch
+    from shared_store.volume.layout import Store, StoreError
 
     try:
         find_epoch(Store(store).run(run), epoch)

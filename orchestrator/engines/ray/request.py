@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from shared_store.contract import NodeContract
+from shared_store.contract.node import NodeContract
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,8 @@ from orchestrator.engines.toolkit.looks import one_by_one
 from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
-from shared_store.layout import Store
-from shared_store.outcomes import OUT_OF_MEMORY, Outcome
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import OUT_OF_MEMORY, Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """Errors of sbatch after which it would accept the job later."""

@@ -18,7 +18,7 @@ from typing import Any
 from orchestrator.engines.api import EngineError, Gang, node_plans
 from orchestrator.engines.slurm import SBATCH
 from orchestrator.engines.toolkit.mounts import mounts_of
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 
 _NOTICE = 30.0
 """Seconds of a time limit's notice beyond the grace time: Slurm ends jobs on its own clock."""

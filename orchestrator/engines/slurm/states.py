@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orchestrator.engines.api import Cause
 from orchestrator.engines.slurm.commands import SlurmJob
-from shared_store.outcomes import OUT_OF_MEMORY
+from shared_store.volume.outcomes import OUT_OF_MEMORY
 
 QUEUED = frozenset(
     {"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "SPECIAL_EXIT", "RESV_DEL_HOLD"}

@@ -11,10 +11,10 @@ from typing import Any, Protocol, Self
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus
 from orchestrator.engines.testing.fake import FakeCluster, FakeEngine
-from shared_store.epoch import raise_epoch, read_epoch
-from shared_store.files import write_atomic
-from shared_store.layout import Store
-from shared_store.outcomes import read_outcome
+from shared_store.volume.epoch import raise_epoch, read_epoch
+from shared_store.volume.files import write_atomic
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import read_outcome
 
 _SCRIPT = """
 end="$MUSTER_STORE/ends/$MUSTER_JOB_ID-$AWS_BATCH_JOB_NODE_INDEX"

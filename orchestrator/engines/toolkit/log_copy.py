@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from shared_store.log_files import LogWriter
+from shared_store.volume.log_files import LogWriter
 
 
 class LogCopy:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.engines.api import Gang, Handle
-from shared_store.files import DamagedFile
-from shared_store.layout import Run, Store
-from shared_store.log_files import LIMIT
-from shared_store.outcomes import Outcome, read_outcome, write_outcome
+from shared_store.contract.node import LOG_LIMIT
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.outcomes import Outcome, read_outcome, write_outcome
 
 
 def store_facts(gang: Gang) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def record(handle: Handle, outcome: Outcome) -> None:
 def log_of(handle: Handle, index: int) -> tuple[Path, int]:
     """A node's log, and how many bytes of it are kept."""
     path = _run(handle).log(handle.facts["job"], handle.facts["attempt"], index)
-    return path, handle.facts.get("log_limit", LIMIT)
+    return path, handle.facts.get("log_limit", LOG_LIMIT)
 
 
 def _run(handle: Handle) -> Run:

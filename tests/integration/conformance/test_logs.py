@@ -9,7 +9,7 @@ import httpx
 import pytest
 from botocore.exceptions import ClientError
 
-from shared_store.logs import REPLACED, format_line
+from shared_store.volume.logs import REPLACED, format_line
 from tests.conftest import MAIN_LAST, Serving
 from tests.support.conformance.aws import Batch
 from tests.support.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, messages, stream_of

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from shared_store.cgroups import own_group
-from shared_store.memory_groups import memory_home
+from shared_store.process.cgroups import own_group
+from shared_store.process.memory_groups import memory_home
 from tests.support.conformance.aws import EXITED, Batch
 from tests.support.waiting import wait_for
 

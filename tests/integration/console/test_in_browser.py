@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from shared_store.layout import Store
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import Serving, submit_gang, wait_for
 from tests.support.console.person import People
 from tests.support.orchestrator.jobs import FOREVER

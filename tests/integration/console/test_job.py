@@ -13,9 +13,9 @@ from orchestrator.api.errors import ClientError
 from orchestrator.console import job_view
 from orchestrator.console.job_view import State, Views
 from orchestrator.domain.errors import ApiError
-from shared_store.layout import Run, Store
-from shared_store.logs import format_line
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.logs import format_line
+from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import submit_gang, wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page, Visitor

@@ -7,10 +7,10 @@ import xml.etree.ElementTree as xml
 
 import pytest
 
-from shared_store.evaluations import evaluation_name
-from shared_store.files import write_json
-from shared_store.layout import Store
-from shared_store.models import Model
+from shared_store.volume.evaluations import evaluation_name
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
+from shared_store.volume.models import Model
 from tests.support.console.fixtures import Console
 from tests.support.console.racers import add_league, add_racer
 from tests.support.console.visitor import Page, Visitor

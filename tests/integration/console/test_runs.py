@@ -16,9 +16,9 @@ import pytest
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.turns import Turns
-from shared_store.files import DamagedFile, open_inside, write_json
-from shared_store.layout import Run, Store
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.files import DamagedFile, open_inside, write_json
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import call_muster, wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page, Visitor

@@ -20,7 +20,7 @@ from orchestrator.engines.docker import engine as docker_engine
 from orchestrator.engines.docker.engine import DockerEngine
 from orchestrator.engines.toolkit.looks import status_of
 from shared_store import __version__
-from shared_store.log_files import LogWriter
+from shared_store.volume.log_files import LogWriter
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.engines.bench import Bench
 from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from orchestrator.engines.ray.node import Node
-from shared_store.contract import NodeContract
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.log_view import LogView
-from shared_store.outcomes import read_outcome
-from shared_store.processes import end_all, find_process
+from shared_store.contract.node import NodeContract
+from shared_store.process.processes import end_all, find_process
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
+from shared_store.volume.log_view import LogView
+from shared_store.volume.outcomes import read_outcome
 from tests.conftest import wait_for
 from tests.support.processes import alive, await_end, frozen
 
@@ -53,7 +53,7 @@ def pids(contract: NodeContract) -> list[int]:
 def test_a_stopped_node_leaves_nothing_and_names_a_process_that_can_not_be_killed(
     contract: NodeContract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
+    monkeypatch.setattr("shared_store.process.node_processes.end_all", lambda find, strike: end_all(find, 0.5, strike))
     node = Node({"MUSTER_GANG": contract.gang, "NODE_RANK": "0"}, 1e9)
     user = {"PYTHONPATH": str(tmp_path), "MUSTER_EPOCH": "9"}
     (tmp_path / "queue.py").write_text("MINE = True")

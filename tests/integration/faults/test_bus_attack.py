@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from orchestrator.control.bus import Bus, BusError
-from shared_store.bus import Credential, Node, log_command, presence_key, push_proof
+from shared_store.contract.bus import Credential, Node, log_command, presence_key, push_proof
 from tests.conftest import Serving, wait_for
 from tests.support.worker.node import node_contract
 from worker.node.bus import NodeBus

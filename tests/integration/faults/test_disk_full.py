@@ -16,8 +16,8 @@ from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.domain.errors import ApiError
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database, DatabaseFull
-from shared_store.layout import Store
-from shared_store.metrics import MetricsWriter, read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import MetricsWriter, read_metrics
 from tests.conftest import PATIENCE, Serving, wait_for
 from tests.support.conformance.streams import client_of
 from tests.support.faults.full_disk import fill, small_volume

@@ -22,9 +22,9 @@ from orchestrator.domain.errors import ApiError
 from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Run, Store
-from shared_store.parent import WeightsCopy
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.initial_weights import WeightsCopy
+from shared_store.volume.layout import Run, Store
 from tests.conftest import call_muster, submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.faults.stalled import stalled

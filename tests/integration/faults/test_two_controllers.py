@@ -12,8 +12,8 @@ import pytest
 from orchestrator.control import peers
 from orchestrator.control.peers import Peers
 from orchestrator.domain.errors import ApiError
-from shared_store.epoch import Claim, raise_epoch, read_epoch
-from shared_store.layout import Store
+from shared_store.volume.epoch import Claim, raise_epoch, read_epoch
+from shared_store.volume.layout import Store
 from tests.conftest import Serving, wait_for
 from tests.support.definitions import container, multinode
 

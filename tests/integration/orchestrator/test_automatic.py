@@ -19,8 +19,8 @@ from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from orchestrator.persistence.models import Job
 from orchestrator.server import Server
-from shared_store.checkpoints import list_checkpoints, retain
-from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
+from shared_store.volume.checkpoints import list_checkpoints, retain
+from shared_store.volume.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.orchestrator.jobs import FOREVER

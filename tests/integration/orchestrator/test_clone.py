@@ -12,9 +12,9 @@ from typing import Any
 import httpx
 import pytest
 
-from shared_store.checkpoints import FORMAT, list_checkpoints
-from shared_store.layout import Run, Store
-from shared_store.parent import NewRun, parent_checkpoint
+from shared_store.volume.checkpoints import FORMAT, list_checkpoints
+from shared_store.volume.initial_weights import NewRun, parent_checkpoint
+from shared_store.volume.layout import Run, Store
 from tests.conftest import Serving
 from tests.support.orchestrator.jobs import refusal
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run

@@ -43,7 +43,7 @@ from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.transience import is_final
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.conftest import submit_gang, wait_for
 from tests.support.definitions import container, multinode
 from tests.support.engines.bench import make_gang

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from shared_store.files import write_json
-from shared_store.layout import Store
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import Serving
 from tests.support.orchestrator.jobs import jobs_and_runs, nothing_changed, refusal
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run

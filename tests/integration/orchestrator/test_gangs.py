@@ -25,9 +25,9 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
-from shared_store.layout import Store
-from shared_store.log_view import Chosen
-from shared_store.log_windows import first_error
+from shared_store.volume.layout import Store
+from shared_store.volume.log_view import Chosen
+from shared_store.volume.log_windows import first_error
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
 from tests.support.definitions import container, single
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving

@@ -16,13 +16,13 @@ from orchestrator.client import Client
 from orchestrator.persistence.models import Job, JobQueue
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from shared_store.epoch import close_claim, raise_epoch, read_epoch
-from shared_store.files import DamagedFile, write_json
-from shared_store.layout import Run
-from shared_store.log_files import LogWriter
-from shared_store.log_view import LogView
-from shared_store.logs import format_line
-from shared_store.outcomes import Outcome, read_outcome, write_outcome
+from shared_store.volume.epoch import close_claim, raise_epoch, read_epoch
+from shared_store.volume.files import DamagedFile, write_json
+from shared_store.volume.layout import Run
+from shared_store.volume.log_files import LogWriter
+from shared_store.volume.log_view import LogView
+from shared_store.volume.logs import format_line
+from shared_store.volume.outcomes import Outcome, read_outcome, write_outcome
 from tests.conftest import call_muster, submit_gang, wait_for
 from tests.support.definitions import nodes_of
 

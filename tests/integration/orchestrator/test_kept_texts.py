@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from orchestrator.domain.errors import ApiError
-from shared_store.texts import digest_of
+from shared_store.volume.texts import digest_of
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode
 

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared_store import leagues, models
-from shared_store.bundles import seal
-from shared_store.checkpoints import Checkpoint
-from shared_store.evaluations import evaluation_name
-from shared_store.files import write_json
-from shared_store.layout import Store
-from shared_store.models import Model
+from shared_store import leagues
+from shared_store.volume import models
+from shared_store.volume.bundles import seal
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.evaluations import evaluation_name
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
+from shared_store.volume.models import Model
 from tests.conftest import Serving, call_muster
 from tests.support.orchestrator.jobs import FOREVER
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run

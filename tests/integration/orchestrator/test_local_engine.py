@@ -19,8 +19,8 @@ from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Cause, EngineError, Gang, Handle
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.toolkit.looks import status_of
-from shared_store.epoch import raise_epoch
-from shared_store.processes import children, end_all, find_process, marked
+from shared_store.process.processes import children, end_all, find_process, marked
+from shared_store.volume.epoch import raise_epoch
 from tests.conftest import wait_for
 from tests.support import processes
 from tests.support.engines.bench import Bench
@@ -301,7 +301,7 @@ def escaped(bench: LocalBench) -> list[int]:
 
 
 def test_a_gang_with_an_unkillable_process_is_not_stopped(bench: LocalBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
+    monkeypatch.setattr("shared_store.process.node_processes.end_all", lambda find, strike: end_all(find, 0.5, strike))
     handle = bench.ready(bench.gang(f"env -i setsid sh -c 'echo escaped $$; exec sleep 600' & {WAIT}", nodes=1))
     wait_for(lambda: escaped(bench), 10, "the process")
     [stubborn] = escaped(bench)

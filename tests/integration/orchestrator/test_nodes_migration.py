@@ -19,8 +19,8 @@ from sqlalchemy import create_engine, select, text
 from orchestrator.domain.hosts import Placement
 from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
 from orchestrator.persistence.session import Database
-from shared_store.epoch import Claim, take_epoch
-from shared_store.layout import Store
+from shared_store.volume.epoch import Claim, take_epoch
+from shared_store.volume.layout import Store
 from tests.support.orchestrator.databases import connected, migrate
 from tests.support.orchestrator.jobs import await_status, detail, serving
 

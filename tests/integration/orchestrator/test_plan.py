@@ -17,7 +17,7 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.server import Server
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
-from shared_store.files import write_json
+from shared_store.volume.files import write_json
 from tests.conftest import Serving, wait_for
 from tests.support.definitions import container, multinode
 from tests.support.orchestrator.jobs import jobs_of, serving

@@ -20,9 +20,9 @@ from orchestrator.control.run_store import RunStore
 from orchestrator.domain.errors import ApiError
 from orchestrator.keys import KeyStore
 from orchestrator.server import Server
-from shared_store import contents, models, trash
-from shared_store.bundles import seal
-from shared_store.checkpoints import list_checkpoints
+from shared_store.volume import contents, models, trash
+from shared_store.volume.bundles import seal
+from shared_store.volume.checkpoints import list_checkpoints
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode, single
 from tests.support.orchestrator.jobs import refused

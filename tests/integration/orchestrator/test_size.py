@@ -17,7 +17,7 @@ from orchestrator.api.permissions import Identity, current_identity
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.conftest import wait_for
 from tests.support.definitions import container, multinode, single
 from tests.support.orchestrator.rows import job

@@ -30,7 +30,7 @@ from orchestrator.home import HomeLock
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from shared_store import epoch, files
+from shared_store.volume import epoch, files
 from tests.conftest import submit_gang, wait_for
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.orchestrator.rows import job

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.logs import parse_line
+from shared_store.volume.logs import parse_line
 from tests.conftest import PATIENCE, wait_for
 from tests.support.faults.full_disk import full_volume
 from tests.support.worker.node import Node, Nodes

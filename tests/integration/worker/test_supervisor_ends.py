@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.contract import sealed
-from shared_store.epoch import raise_epoch
-from shared_store.faults import Fault
-from shared_store.outcomes import LONGEST_TEXT
+from shared_store.contract.faults import Fault
+from shared_store.contract.node import sealed
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.outcomes import LONGEST_TEXT
 from tests.conftest import PATIENCE, wait_for
 from tests.support.faults.full_disk import full_volume
 from tests.support.faults.outages import loop_volume
@@ -295,8 +295,8 @@ def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node
     n = node(grace=30.0)
     script = (
         "import os, sys\n"
-        "from shared_store.contract import NodeContract\n"
-        "from shared_store.layout import Store\n"
+        "from shared_store.contract.node import NodeContract\n"
+        "from shared_store.volume.layout import Store\n"
         "from worker.node.supervisor import Supervisor\n"
         "contract = NodeContract.from_env(os.environ)\n"
         "supervisor = Supervisor(contract, Store(contract.store).run(contract.run), sys.argv[2:])\n"

@@ -15,8 +15,8 @@ import pytest
 
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.conformance.aws import PREFIX, aws, pairs
 

@@ -6,9 +6,9 @@ import json
 import shutil
 from pathlib import Path
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
-from shared_store.metrics import history_of
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import history_of
 from tests.conftest import Serving, wait_for
 from tests.support.processes import kill_rank
 from tests.support.worker.trained import run_in

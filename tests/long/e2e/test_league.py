@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shared_store import leagues
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 
 SMALL = ("train.iterations=30", "checkpoint.every=15", "train.config.track=oval", "train.worlds=64")

@@ -11,8 +11,8 @@ import onnx
 from mcap.reader import make_reader
 from PIL import Image
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Store
 from tests.conftest import MUSTER, Serving, call_muster, wait_for
 from tests.support.processes import kill_rank
 

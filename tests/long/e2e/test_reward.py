@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import Serving
 
 SMALL = ["train.worlds=8", "train.iterations=2", "checkpoint.every=1", "resources.cpus=1"]

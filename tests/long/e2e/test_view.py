@@ -17,9 +17,9 @@ import numpy as np
 import psutil
 import pytest
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.files import read_json
-from shared_store.layout import Run, Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.files import read_json
+from shared_store.volume.layout import Run, Store
 from tests.conftest import MUSTER, Serving, wait_for
 from tests.long.e2e.test_recordings import SMALL as RECORDED
 from tests.support.browser import empty_page, picture

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from shared_store.checkpoints import best_checkpoint
-from shared_store.evaluations import list_evaluations
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import best_checkpoint
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.waiting import wait_for
 

@@ -16,8 +16,8 @@ from types import SimpleNamespace
 import pytest
 
 from orchestrator.control.bus import Bus, BusError
-from shared_store.bus import LEASE_MILLISECONDS, LONGEST_ANSWER
-from shared_store.contract import NodeContract
+from shared_store.contract.bus import LEASE_MILLISECONDS, LONGEST_ANSWER
+from shared_store.contract.node import NodeContract
 from tests.conftest import PATIENCE, REPOSITORY, Serving, wait_for
 from tests.support.faults.outages import partition
 from tests.support.processes import gang_members, processes_of
@@ -28,7 +28,7 @@ from worker.node.bus import NodeBus
 
 NODE = """
 import os, sys, time
-from shared_store.contract import NodeContract
+from shared_store.contract.node import NodeContract
 from worker.node import bus as node_bus
 from worker.node.bus import NodeBus
 node_bus.LEASE_MILLISECONDS = {lease}

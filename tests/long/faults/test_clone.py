@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
-from shared_store.parent import parent_checkpoint
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.initial_weights import parent_checkpoint
+from shared_store.volume.layout import Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training

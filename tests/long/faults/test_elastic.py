@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.checkpoints import Checkpoint, list_checkpoints
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.checkpoints import Checkpoint, list_checkpoints
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import Serving, wait_for
 from tests.support.processes import gang_members
 from worker.learning.shards import Shards

@@ -14,10 +14,10 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.toolkit.looks import status_of
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.engines.bench import make_gang
 from tests.support.processes import end_all, processes_of, signal_all

@@ -10,9 +10,9 @@ import pytest
 import torch
 import yaml
 
-from shared_store.evaluations import list_evaluations
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
 from tests.support.worker.loop import iterate, mean_return, setting_of
 from tests.support.worker.point_task import Point, PointConfig

@@ -15,9 +15,9 @@ import torch
 from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.extensions import RandomNetworkDistillation
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
-from shared_store.parent import TeacherCopy
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.initial_weights import TeacherCopy
+from shared_store.volume.layout import Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Store
 from tests.conftest import PATIENCE, Serving, wait_for
 from tests.support.faults.full_disk import fill
 from tests.support.processes import end_all, gang_members

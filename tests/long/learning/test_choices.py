@@ -12,8 +12,8 @@ import pytest
 from onnx.reference import ReferenceEvaluator
 
 import worker.train
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import run_muster
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.ranks import training

@@ -15,8 +15,8 @@ import torch
 
 from orchestrator.spec.model import validate
 from orchestrator.spec.settings import effective_problem
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, train

@@ -15,8 +15,8 @@ import yaml
 
 from orchestrator.cli.tasks import _table
 from orchestrator.cli.terminal import Console
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
 from tests.support.worker.tasks import observe, put, statistics
 from worker.learning.job import configure

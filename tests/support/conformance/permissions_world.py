@@ -14,10 +14,11 @@ from orchestrator.client import Client
 from orchestrator.keys import KeyStore
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
-from shared_store import leagues, models, texts
-from shared_store.bundles import seal
-from shared_store.checkpoints import Checkpoint
-from shared_store.layout import Store
+from shared_store import leagues
+from shared_store.volume import models, texts
+from shared_store.volume.bundles import seal
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode
 from tests.support.shared_store.leagues import entry

@@ -9,7 +9,7 @@ from typing import Any
 import boto3
 from botocore.config import Config
 
-from shared_store.logs import format_line
+from shared_store.volume.logs import format_line
 from tests.conftest import Serving
 
 GROUP = "/aws/batch/job"

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from shared_store import leagues, models
-from shared_store.bundles import seal
-from shared_store.evaluations import evaluation_name
-from shared_store.files import read_json, write_json
-from shared_store.layout import Store
-from shared_store.models import Model
-from shared_store.policy_contract import Contract, Group, RobotModel
+from shared_store import leagues
+from shared_store.contract.policy import Contract, Group, RobotModel
+from shared_store.volume import models
+from shared_store.volume.bundles import seal
+from shared_store.volume.evaluations import evaluation_name
+from shared_store.volume.files import read_json, write_json
+from shared_store.volume.layout import Store
+from shared_store.volume.models import Model
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.shared_store.leagues import entry, league, race, summary
 

@@ -10,11 +10,11 @@ from typing import Any
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
 from orchestrator.engines.toolkit.looks import status_of
-from shared_store.epoch import raise_epoch, read_epoch
-from shared_store.layout import Store
-from shared_store.log_view import LogView
-from shared_store.logs import LogLine
-from shared_store.outcomes import Outcome, read_outcome
+from shared_store.volume.epoch import raise_epoch, read_epoch
+from shared_store.volume.layout import Store
+from shared_store.volume.log_view import LogView
+from shared_store.volume.logs import LogLine
+from shared_store.volume.outcomes import Outcome, read_outcome
 from tests.support.engines.sites import WAIT
 from tests.support.processes import processes_of
 from tests.support.waiting import wait_for

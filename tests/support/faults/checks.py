@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
-from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
-from shared_store.epoch import read_epoch
-from shared_store.files import read_json
-from shared_store.layout import Run
-from shared_store.metrics import read_metrics
+from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.volume.epoch import read_epoch
+from shared_store.volume.files import read_json
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import read_metrics
 from tests.support.faults.home import Home
 from tests.support.processes import gang_members
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from shared_store.layout import Run, Store
+from shared_store.volume.layout import Run, Store
 from tests.conftest import MUSTER, REPOSITORY, run_muster
 from tests.support.waiting import PATIENCE
 

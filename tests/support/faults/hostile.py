@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from shared_store.cgroups import own_group
+from shared_store.process.cgroups import own_group
 from tests.conftest import Serving, submit_gang
 from tests.support.processes import processes_running, signal_all
 from tests.support.waiting import wait_for

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.files import read_json
-from shared_store.layout import Run
+from shared_store.volume.files import read_json
+from shared_store.volume.layout import Run
 from tests.support.faults.checks import Reference, Verdict, judge
 from tests.support.faults.fire import run_straight, write_spec
 from tests.support.faults.full_disk import fill

@@ -57,7 +57,7 @@ GROUPS = (
         options=["--noconftest"],
     ),
     Group(
-        ["shared_store/epoch.py", "shared_store/checkpoints.py", "shared_store/policy_contract.py"],
+        ["shared_store/volume/epoch.py", "shared_store/volume/checkpoints.py", "shared_store/contract/policy.py"],
         [
             *(
                 f"{_UNIT}/shared_store/test_{name}.py"

@@ -19,8 +19,8 @@ from orchestrator.domain.retention import A_DAY, BATCH_DAYS
 from orchestrator.persistence.models import Attempt, Base, Dependency, Job, Node, RunRecord, now
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.session import Database
-from shared_store.files import write_json
-from shared_store.layout import Store
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
 from tests.support.orchestrator.rows import job
 
 LONG_AGO = now() - (BATCH_DAYS + 1) * A_DAY

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from shared_store.checkpoints import Checkpoint, CheckpointWriter
-from shared_store.epoch import raise_epoch, read_epoch
-from shared_store.files import write_json
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import Checkpoint, CheckpointWriter
+from shared_store.volume.epoch import raise_epoch, read_epoch
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
 
 SPEC: dict[str, Any] = {
     "name": "taught",

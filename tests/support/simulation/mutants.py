@@ -17,7 +17,7 @@ from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Launch
 from orchestrator.domain.attempt_instructions import Explain, Instructions, Launch
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
-from shared_store.bus import Node
+from shared_store.contract.bus import Node
 from tests.support.simulation.database import SimulatedDatabase
 
 Mutant = AbstractContextManager[Any]

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.control.run_store import Progress, RunFacts, RunStore
-from shared_store.epoch import Claim
-from shared_store.layout import Store
-from shared_store.outcomes import Outcome
+from shared_store.volume.epoch import Claim
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import Outcome
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation

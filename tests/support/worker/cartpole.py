@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.waiting import wait_for
 

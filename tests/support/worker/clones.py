@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shared_store.checkpoints import Checkpoint, list_checkpoints
-from shared_store.layout import Run, Store
-from shared_store.parent import NewRun
+from shared_store.volume.checkpoints import Checkpoint, list_checkpoints
+from shared_store.volume.initial_weights import NewRun
+from shared_store.volume.layout import Run, Store
 
 
 def make_clone(store: Path, name: str, source: str = "run", checkpoint: Checkpoint | None = None) -> Run:

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Run
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Run
 from tests.support.waiting import PATIENCE
 from tests.support.worker.collectives import watching
 from tests.support.worker.point_task import Point

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from shared_store.contract import NodeContract
-from shared_store.epoch import raise_epoch, read_epoch
-from shared_store.layout import Run, Store
-from shared_store.log_view import LogView
-from shared_store.outcomes import Outcome, read_outcome
+from shared_store.contract.node import NodeContract
+from shared_store.volume.epoch import raise_epoch, read_epoch
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.log_view import LogView
+from shared_store.volume.outcomes import Outcome, read_outcome
 from tests.support.waiting import PATIENCE, wait_for
 
 ENVIRONMENT = {

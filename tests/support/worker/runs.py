@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch, read_epoch
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import raise_epoch, read_epoch
+from shared_store.volume.layout import Store
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import TASK
 from worker.distributed import Gang

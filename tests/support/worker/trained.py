@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.layout import Run, Store
+from shared_store.volume.layout import Run, Store
 from tests.conftest import run_muster
 
 CHANGES = ("name=cart", "nodes=1", "train.worlds=8", "train.iterations=2", "checkpoint.every=1")

@@ -6,9 +6,9 @@ import json
 import re
 from pathlib import Path
 
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
-from shared_store.phases import Phase
+from shared_store.contract.phases import Phase
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import Serving, run_muster
 from tests.support.processes import processes_of
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import Serving, wait_for
 from tests.support.engines.slurm_cluster import SlurmCluster, started
 from tests.support.engines.training import same_bits, submit

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.engines.training import same_bits
 from tests.support.processes import gang_members, has_signal

@@ -7,9 +7,9 @@ import shutil
 import sqlite3
 from pathlib import Path
 
-from shared_store.checkpoints import CheckpointWriter, list_checkpoints
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import CheckpointWriter, list_checkpoints
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.worker.trained import run_in
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.checkpoints import FORMAT, Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import FORMAT, Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.refusals import refusal
 from tests.support.worker.ranks import training

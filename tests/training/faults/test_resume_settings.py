@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from orchestrator.spec.model import ALGORITHMS, Train
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Store
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, runner, train

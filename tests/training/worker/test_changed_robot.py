@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 import worker.tasks.cartpole
-from shared_store import models
-from shared_store.bundles import REPORT, read_contract
-from shared_store.checkpoints import list_checkpoints
-from shared_store.files import read_json
-from shared_store.layout import Run, Store
+from shared_store.volume import models
+from shared_store.volume.bundles import REPORT, read_contract
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.files import read_json
+from shared_store.volume.layout import Run, Store
 from tests.support.worker.changing_task import TASK, Changing
 from tests.support.worker.clones import make_clone
 from tests.support.worker.in_process import call_worker

@@ -14,8 +14,8 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from tests.conftest import PATIENCE
 from tests.support.worker.loop import iterate, setting_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO

@@ -15,8 +15,8 @@ import pyarrow.parquet
 import pytest
 
 import worker.evaluate
-from shared_store.evaluations import list_evaluations
-from shared_store.layout import Run
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.layout import Run
 from tests.conftest import PATIENCE, wait_for
 from tests.support.processes import has_signal
 from tests.support.worker.in_process import call_worker

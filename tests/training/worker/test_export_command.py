@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.bundles import verify
+from shared_store.volume.bundles import verify
 from tests.conftest import Serving, call_muster
 from tests.support.worker.trained import run_in
 

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.evaluations import list_evaluations
-from shared_store.layout import Run, Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.layout import Run, Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.collectives import ALONE, TESTS, paths
 from tests.support.worker.gangs import Played, begun, case, digest, given, play_cases

@@ -11,10 +11,10 @@ import pytest
 
 from orchestrator.cli.jobs import submit_spec
 from orchestrator.spec import file as specfile
-from shared_store.checkpoints import list_checkpoints
-from shared_store.evaluations import list_evaluations
-from shared_store.layout import Run, Store
-from shared_store.texts import digest_of
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.evaluations import list_evaluations
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.texts import digest_of
 from tests.conftest import PATIENCE, Serving
 
 LINE = [[round(0.01 * number, 2), 0.5, 2.0] for number in range(1500)]

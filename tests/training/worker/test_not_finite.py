@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.worker.broken_task import Rooted, RootedCritic, Rotten, RottenInTorch
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.ranks import training

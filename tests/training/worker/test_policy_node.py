@@ -24,7 +24,7 @@ from muster_policy.bundle import open_bundle
 from muster_policy.graph import Node, open_session
 from muster_policy.messages import Messages
 from muster_policy.policy import Policy as NodePolicy
-from shared_store.layout import Run
+from shared_store.volume.layout import Run
 from tests.conftest import PATIENCE, REPOSITORY, wait_for
 from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
 from tests.support.worker.loop import setting_of
@@ -159,7 +159,7 @@ def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import worker.tasks.policy_contract as contracts
-    from shared_store.bundles import read_contract
+    from shared_store.volume.bundles import read_contract
 
     assert isinstance(open_robot(exported, Messages()), SimulatedRobot)
     changed = dataclasses.replace(read_contract(exported), control_hz=30.0)

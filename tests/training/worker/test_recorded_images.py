@@ -15,8 +15,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 
-from shared_store.files import write_json
-from shared_store.layout import Run
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Run
 from worker.learning.reporter import Gate
 from worker.tasks.cartpole_pixels import CartpolePixels
 from worker.tasks.overrides import configured

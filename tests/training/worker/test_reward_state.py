@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner

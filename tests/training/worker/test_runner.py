@@ -14,11 +14,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import worker.export
 import worker.train
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import StaleEpoch, raise_epoch
-from shared_store.layout import Store
-from shared_store.metrics import read_metrics
-from shared_store.phases import Phase
+from shared_store.contract.phases import Phase
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import StaleEpoch, raise_epoch
+from shared_store.volume.layout import Store
+from shared_store.volume.metrics import read_metrics
 from tests.support.refusals import refusal
 from tests.support.worker.declared import Sliders
 from tests.support.worker.in_process import call_worker

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from orchestrator.cli.evaluations import _copy
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Run, Store
-from shared_store.metrics import read_metrics
 from shared_store.races import race_changes, rules_of
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import read_metrics
 from tests.support.worker.loop import alone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, train

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Run, Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Run, Store
 from tests.conftest import PATIENCE
 from tests.support.waiting import wait_for
 from tests.support.worker.ranks import free_port, start_rank, training

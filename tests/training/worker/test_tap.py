@@ -12,8 +12,8 @@ import pytest
 import torch
 import warp as wp
 
-from shared_store.files import read_json, write_json
-from shared_store.layout import Run
+from shared_store.volume.files import read_json, write_json
+from shared_store.volume.layout import Run
 from tests.support.waiting import wait_for
 from worker.learning.reporter import Gate
 from worker.tasks.cartpole import Cartpole

@@ -20,9 +20,9 @@ from typing import Any
 import httpx
 import pytest
 
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Run, Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import read_metrics
 from tests.conftest import PATIENCE, wait_for
 from tests.support.worker.ranks import ROOT, free_port, placement
 from tests.support.worker.wandb_files import history, records

@@ -16,7 +16,7 @@ from muster_policy.cli import main
 from muster_policy.errors import Refused
 from muster_policy.policy import Policy
 from muster_policy.weights import EXTERNAL, PARTS
-from shared_store.bundles import seal
+from shared_store.volume.bundles import seal
 from tests.support.policy_node import write_bundle
 from tests.support.refusals import refusal
 from tests.unit.policy_node.walker import JOINTS, contract, term

@@ -13,7 +13,7 @@ from muster_policy.contract import read as node_read
 from muster_policy.errors import Refused
 from muster_policy.messages import Messages
 from muster_policy.observations import Observations
-from shared_store.policy_contract import Action, Contract, Group, Target, Term, read
+from shared_store.contract.policy import Action, Contract, Group, Target, Term, read
 from tests.support.policy_node import for_node
 
 SEEN = Term(

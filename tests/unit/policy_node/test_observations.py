@@ -14,7 +14,7 @@ from muster_policy.errors import Refused
 from muster_policy.inputs import Inputs
 from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWIST, Messages
 from muster_policy.observations import Observations
-from shared_store.policy_contract import Command, Contract, Frame, Group, Image
+from shared_store.contract.policy import Command, Contract, Frame, Group, Image
 from tests.support.policy_node import for_node
 from tests.support.refusals import refusal
 from tests.unit.policy_node.walker import HALF, JOINTS, TRUNK, UNIT, contract, term

@@ -18,7 +18,7 @@ from muster_policy.messages import JOINT_STATE, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
-from shared_store.policy_contract import Action
+from shared_store.contract.policy import Action
 from tests.support.policy_node import for_node, write_bundle
 from tests.support.refusals import refusal
 from tests.unit.policy_node.walker import JOINTS, KNEE, contract, term

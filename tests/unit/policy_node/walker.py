@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from shared_store.policy_contract import Action, Command, Contract, Frame, Group, State, Term
+from shared_store.contract.policy import Action, Command, Contract, Frame, Group, State, Term
 
 HALF = math.sqrt(0.5)
 UNIT = Frame("imu", "trunk", (0.1, 0.0, 0.2), (0.0, 0.0, HALF, HALF), True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.layout import Run, Store
+from shared_store.volume.layout import Run, Store
 
 
 @pytest.fixture

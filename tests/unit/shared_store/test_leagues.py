@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from shared_store import leagues, tracks
-from shared_store.bundles import seal
-from shared_store.files import write_json
-from shared_store.layout import Store
 from shared_store.leagues import LeagueError, Rules, StoredLeague, UnknownLeague
 from shared_store.standings import table
+from shared_store.volume.bundles import seal
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
 from tests.support.shared_store.at_once import at_once
 from tests.support.shared_store.leagues import CONFIG, entry, league, race, summary
 

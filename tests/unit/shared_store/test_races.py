@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from shared_store.evaluations import lines
 from shared_store.races import clock, key_of, race_changes, rules_of
 from shared_store.standings import BadRace, Contender, Race, Ranking, differences, read_race, table
+from shared_store.volume.evaluations import lines
 from tests.support.shared_store.leagues import race
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.layout import Run, Store
-from shared_store.metrics import read_metrics
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import read_metrics
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
 from worker import bitwise_diff
@@ -66,7 +66,7 @@ def test_one_bit_of_one_element_is_found(store: Path, name: str, capsys: pytest.
     victim.view(torch.int32).view(-1)[-1] ^= 1
     torch.save(content, path)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shared_store.checkpoints.Checkpoint.verify", lambda _: None)
+        patch.setattr("shared_store.volume.checkpoints.Checkpoint.verify", lambda _: None)
         code, said = say(store, "one", "twin", capsys)
     last = [size - 1 for size in victim.shape]
     assert code == 1 and f"{key.rpartition('.')[2]}: at {last}: " in said and "(1 of " in said, said
@@ -125,7 +125,7 @@ def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
         torch.save({**content, "worlds": {"state": state}}, checkpoint.path / f"rank-{rank}.pt")
     manifest = {**checkpoint.manifest, "shards": [[0, 3], [3, 5]], "world_size": 2}
     (checkpoint.path / "manifest.json").write_text(json.dumps(manifest))
-    monkeypatch.setattr("shared_store.checkpoints.Checkpoint.verify", lambda _: None)
+    monkeypatch.setattr("shared_store.volume.checkpoints.Checkpoint.verify", lambda _: None)
     code, said = say(store, "one", "twin", capsys)
     assert code == 0 and "generators are not compared: 1 rank saved them in one run, 2 in the other" in said, said
     some = Shards(list_checkpoints(run(store, "twin"))[-1]).worlds(2, 4)

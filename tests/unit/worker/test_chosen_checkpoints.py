@@ -12,7 +12,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from worker.distributed import Gang, Placement
 from worker.errors import UserError

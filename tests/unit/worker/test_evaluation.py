@@ -15,10 +15,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from shared_store.evaluations import lines
-from shared_store.files import write_json
-from shared_store.layout import Run, Store
-from shared_store.pairs import are_paired, paired
+from shared_store.volume.evaluations import lines
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.paired_episodes import are_paired, paired
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.worker.loop import alone
 from worker.evaluation.blocks import SIZE, Blocks

@@ -18,9 +18,9 @@ from tensordict import TensorDict
 from torch import nn
 
 import worker.tasks
-from shared_store.bundles import verify
-from shared_store.layout import Run
-from shared_store.policy_contract import Action, Command, Contract, Group, State, Term
+from shared_store.contract.policy import Action, Command, Contract, Group, State, Term
+from shared_store.volume.bundles import verify
+from shared_store.volume.layout import Run
 from tests.support.worker.rsl_loop import GRU, GroupedPoint, build, train
 from tests.support.worker.sac import make, point
 from worker.deploy import bundle

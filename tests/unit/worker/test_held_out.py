@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
 from tests.support.worker.loop import alone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from shared_store import texts
-from shared_store.layout import Store
-from shared_store.texts import digest_of
+from shared_store.volume import texts
+from shared_store.volume.layout import Store
+from shared_store.volume.texts import digest_of
 from tests.support.refusals import refusal
 from worker.errors import UserError
 from worker.learning.job import Job

@@ -15,8 +15,8 @@ import torch
 import warp as wp
 
 from job_specs.my_kernels import PendulumByHand, PendulumConfig
-from shared_store.policy_changes import differences, robot_changes
-from shared_store.policy_contract import Contract, read
+from shared_store.contract.policy import Contract, read
+from shared_store.contract.policy_changes import differences, robot_changes
 from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
 from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy

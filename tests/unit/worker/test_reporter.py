@@ -13,9 +13,9 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from orchestrator.cli.progress import shown_metrics
-from shared_store.epoch import StaleEpoch, check_epoch, raise_epoch
-from shared_store.layout import Run, Store
-from shared_store.metrics import read_metrics, scalars
+from shared_store.volume.epoch import StaleEpoch, check_epoch, raise_epoch
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import read_metrics, scalars
 from tests.support.waiting import wait_for
 from worker.learning import reporter as reporting
 from worker.learning.report import Report

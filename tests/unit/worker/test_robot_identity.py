@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from shared_store.policy_changes import robot_changes
+from shared_store.contract.policy_changes import robot_changes
 from worker.simulation import robot_identity, robot_judge
 from worker.simulation.robot_reading import Reading, Source, read
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import StaleEpoch, raise_epoch
-from shared_store.layout import Run, Store
+from shared_store.volume.checkpoints import list_checkpoints
+from shared_store.volume.epoch import StaleEpoch, raise_epoch
+from shared_store.volume.layout import Run, Store
 from tests.support.shared_store.operations import durable_operations
 from tests.support.waiting import wait_for
 from worker.checkpoint_writer import Orders, save

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from shared_store.epoch import raise_epoch
-from shared_store.files import write_json
-from shared_store.layout import Run, Store
-from shared_store.metrics import MetricsWriter, scalars
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import MetricsWriter, scalars
 from tests.conftest import REPOSITORY
 from worker import track
 from worker.learning.job import Job
@@ -117,7 +117,7 @@ def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(
     run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = (
-        "import sys; from pathlib import Path; from shared_store.layout import Run; from worker.track import Turn; "
+        "import sys; from pathlib import Path; from shared_store.volume.layout import Run; from worker.track import Turn; "
         "turn = Turn(Run(Path(sys.argv[1])), 'mlflow'); print(turn.take(), flush=True); sys.stdin.read()"
     )
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

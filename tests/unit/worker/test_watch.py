@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.learning import in_log, in_words
-from shared_store.metrics import read_metrics, warnings_of
+from shared_store.volume.epoch import raise_epoch
+from shared_store.volume.layout import Store
+from shared_store.volume.learning_metrics import in_log, in_words
+from shared_store.volume.metrics import read_metrics, warnings_of
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.report import Report
 from worker.learning.watch import Watch

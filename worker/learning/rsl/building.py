@@ -19,7 +19,7 @@ from rsl_rl.utils import resolve_callable, resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import nn
 
-from shared_store.wording import Refused, kind_of
+from shared_store.contract.error_text import Refused, kind_of
 from worker.errors import is_out_of_memory
 from worker.learning.algorithm import Setting, Share, Spaces
 from worker.learning.rsl.checks import check_gradient_length, check_networks

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Required
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
 
-from shared_store.wording import Refused, explain, kind_of, nearest, shown
+from shared_store.contract.error_text import Refused, explain, kind_of, nearest, shown
 
 _checked = with_config(ConfigDict(strict=True, extra="forbid", allow_inf_nan=False))
 Count = Annotated[int, Field(ge=1)]

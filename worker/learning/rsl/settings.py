@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from shared_store.wording import Refused, nearest
+from shared_store.contract.error_text import Refused, nearest
 from worker.learning.rsl.checks import check_algorithm, check_finite, check_gradient_length, check_networks, class_of
 
 _NETWORK = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu", "obs_normalization": True}

@@ -11,9 +11,9 @@ import json
 import sys
 from pathlib import Path
 
-from shared_store.layout import Store
-from shared_store.texts import IN_DEFINITION, size_in_definition
-from shared_store.wording import shown
+from shared_store.contract.error_text import shown
+from shared_store.volume.layout import Store
+from shared_store.volume.texts import IN_DEFINITION, size_in_definition
 from worker.racer.rewards.guard import check, read_file
 from worker.racer.rewards.samples import FINE_OVAL, Course
 from worker.racer.rewards.translation import Outside, translate

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from shared_store.layout import Store
-from shared_store.wording import Refused
+from shared_store.contract.error_text import Refused
+from shared_store.volume.layout import Store
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import Circuit, circuit_of
 from worker.racer.geometry import project

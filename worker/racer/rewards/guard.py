@@ -25,7 +25,7 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.racer.rewards.namespaces import FILES, MODULES, NAMES, SUBMODULES
 from worker.racer.rewards.problems import KINDS, Problem, RewardRefused, plain
 from worker.racer.rewards.samples import OVAL, Course

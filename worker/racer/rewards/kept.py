@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from shared_store.wording import Refused
+from shared_store.contract.error_text import Refused
 from worker.racer.rewards.guard import LARGEST, read, read_file
 from worker.racer.rewards.problems import RewardRefused
 from worker.tasks.config import STRICT
@@ -27,7 +27,7 @@ class RewardFile:
     text: Annotated[str, Field(max_length=LARGEST)] = ""
     """Its content."""
     sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")] = ""
-    """Of a text that is kept beside the job (:mod:`shared_store.texts`), which the ranks get as ``text``."""
+    """Of a text that is kept beside the job (:mod:`shared_store.volume.texts`), which the ranks get as ``text``."""
 
     def __post_init__(self) -> None:
         if self.sha256 and self.text:

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 from newton.sensors import SensorCamera
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.camera import (
     displace,
     displaced,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import newton
 import numpy as np
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.sensors.sensor import SensorContext
 
 if TYPE_CHECKING:

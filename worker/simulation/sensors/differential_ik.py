@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.ik_kernels import Chain, IkArrays, begin_targets, move_frame
 from worker.simulation.sensors.places import Place, find_places, only_one, place_names

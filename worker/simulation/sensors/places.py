@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.sensor import SensorContext

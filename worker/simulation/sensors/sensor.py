@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import torch
 import warp as wp
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import Worlds

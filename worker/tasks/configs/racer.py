@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from shared_store.file_fields import kept_file
+from shared_store.contract.file_fields import kept_file
 from worker.learning.ppo.settings import PPOConfig
 from worker.racer.actions import LIDARS, ActionSpace, action_space, read_metadata
 from worker.racer.hyperparameters import KNOWN, plain_settings

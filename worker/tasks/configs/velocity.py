@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field, WrapValidator
 from pydantic.dataclasses import dataclass
 
-from shared_store.wording import shown
+from shared_store.contract.error_text import shown
 from worker.learning.ppo.settings import PPOConfig
 from worker.learning.sac.settings import SACConfig
 from worker.tasks.config import STRICT, Amount, Count, Finite, Positive, Range, Rate, TaskConfig, reward_weights

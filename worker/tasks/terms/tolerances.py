@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 import warp as wp
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_arrays import RobotArrays

@@ -17,9 +17,9 @@ from orchestrator.control.log_hub import LogHub
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.job import Status
 from orchestrator.persistence.session import Database
-from shared_store.layout import Run
-from shared_store.log_files import LogWriter
-from shared_store.logs import format_line
+from shared_store.volume.layout import Run
+from shared_store.volume.log_files import LogWriter
+from shared_store.volume.logs import format_line
 from tests.support.orchestrator import rows
 from tests.support.waiting import wait_for
 

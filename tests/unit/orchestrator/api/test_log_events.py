@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from orchestrator.api.logs import events as log_events
 from orchestrator.api.logs.events import LogFile, View
 from orchestrator.api.logs.filter import parse
-from shared_store.logs import format_line
+from shared_store.volume.logs import format_line
 
 LINES = ["ERROR 404 in trainer", "ERROR in loader", "WARN: loss is nan", "iteration 12/300", 'said "hi" at 50%', "",
          "Fehler: größer"]  # fmt: skip

@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from orchestrator.cli.comparison.curves import draw
 from orchestrator.cli.comparison.weights import difference
-from shared_store.comparison import POINTS, RunFacts, grouped
+from shared_store.volume.comparison import POINTS, RunFacts, grouped
 
 
 def run(name: str, seed: int, rewards: list[float], *, evaluated: float | None = None, **train: Any) -> RunFacts:

@@ -17,8 +17,8 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.http.access import Access
 from orchestrator.console import job, live
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
-from shared_store.layout import Run, Store
-from shared_store.metrics import MetricsWriter, sampled
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.metrics import MetricsWriter, sampled
 
 
 def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:

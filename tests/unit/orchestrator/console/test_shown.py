@@ -14,8 +14,8 @@ from orchestrator.console import words
 from orchestrator.console.curves import columns, curves_of, number
 from orchestrator.console.job_config import code_of, differences
 from orchestrator.console.lineage import Drawing, drawing
-from shared_store.layout import Run
-from shared_store.metrics import MetricsWriter
+from shared_store.volume.layout import Run
+from shared_store.volume.metrics import MetricsWriter
 
 DURATIONS = {
     None: "",

@@ -22,8 +22,8 @@ from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.session import Database
 from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.model import validate
-from shared_store.layout import Store
-from shared_store.texts import LARGEST, digest_of
+from shared_store.volume.layout import Store
+from shared_store.volume.texts import LARGEST, digest_of
 from tests.support.refusals import refusal
 
 TEXT = "def reward_function(params):\n    return 1.0\n"

@@ -20,11 +20,11 @@ from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
-from shared_store import log_view
-from shared_store.layout import Run
-from shared_store.log_files import Chunk, LogWriter, read_log
-from shared_store.log_view import LogView
-from shared_store.logs import format_line
+from shared_store.volume import log_view
+from shared_store.volume.layout import Run
+from shared_store.volume.log_files import Chunk, LogWriter, read_log
+from shared_store.volume.log_view import LogView
+from shared_store.volume.logs import format_line
 from tests.support.orchestrator import rows
 from tests.support.waiting import wait_for
 

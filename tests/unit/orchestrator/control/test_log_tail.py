@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from orchestrator.control import log_tail
 from orchestrator.control.log_tail import MOST, JobLogs
-from shared_store.layout import Run
-from shared_store.log_files import LEAST_LIMIT, LogWriter
-from shared_store.log_view import LogView
-from shared_store.logs import REPLACED, format_line
+from shared_store.contract.node import LEAST_LOG_LIMIT
+from shared_store.volume.layout import Run
+from shared_store.volume.log_files import LogWriter
+from shared_store.volume.log_view import LogView
+from shared_store.volume.logs import REPLACED, format_line
 
 LOG = (1, 0)
 
@@ -88,7 +89,7 @@ def no_look(*_: object) -> None:
 def test_what_is_pushed_is_read_without_a_look_at_a_file(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
     job.state()
     monkeypatch.setattr(log_tail, "read_log", no_look)
-    monkeypatch.setattr("shared_store.log_view.read_log", no_look)
+    monkeypatch.setattr("shared_store.volume.log_view.read_log", no_look)
     for number in range(100):
         job.write(f"line {number}")
         assert not job.state() and job.logs.delivers()
@@ -193,7 +194,7 @@ def test_more_than_one_look_reads_is_left_to_the_readers(job: Followed) -> None:
 
 
 def test_a_reader_that_comes_too_late_hears_what_was_left_out(tmp_path: Path) -> None:
-    job = Followed(tmp_path / "run", LEAST_LIMIT)
+    job = Followed(tmp_path / "run", LEAST_LOG_LIMIT)
     for number in range(1500):
         job.write(f"{number} " + "x" * 2000, push=number % 100 != 0)
     while job.state():
@@ -241,7 +242,7 @@ def test_a_last_burst_that_was_not_pushed_is_read_though_the_volume_s_cached_siz
 def test_the_last_look_gives_no_line_twice_where_the_volume_shows_the_log_late_or_in_another_file(
     tmp_path: Path,
 ) -> None:
-    job = Followed(tmp_path / "run", LEAST_LIMIT)
+    job = Followed(tmp_path / "run", LEAST_LOG_LIMIT)
     job.write("in the first file", push=False)
     job.logs.look()
     assert [line.text for line in job.view.poll()] == ["in the first file"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from orchestrator.control.presence import Presence
-from shared_store.bus import Node
+from shared_store.contract.bus import Node
 
 L = 120.0
 """``lost_after``."""

@@ -29,9 +29,9 @@ from orchestrator.persistence.models import (
     now,
 )
 from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
-from shared_store import contents, trash
-from shared_store.files import sync_directory
-from shared_store.layout import Store
+from shared_store.volume import contents, trash
+from shared_store.volume.files import sync_directory
+from shared_store.volume.layout import Store
 from tests.support.orchestrator.retention import LONG_AGO, World
 from tests.support.orchestrator.rows import job
 
@@ -212,9 +212,9 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
         return call
 
     with monkeypatch.context() as patched:
-        patched.setattr("shared_store.trash.os.rename", dying(os.rename))
-        patched.setattr("shared_store.trash.sync_directory", dying(sync_directory))
-        patched.setattr("shared_store.trash.shutil.rmtree", dying(shutil.rmtree))
+        patched.setattr("shared_store.volume.trash.os.rename", dying(os.rename))
+        patched.setattr("shared_store.volume.trash.sync_directory", dying(sync_directory))
+        patched.setattr("shared_store.volume.trash.shutil.rmtree", dying(shutil.rmtree))
         patched.setattr("orchestrator.persistence.references.forget_jobs", dying(references.forget_jobs))
         try:
             world.retention().take_all()

@@ -14,9 +14,9 @@ from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention, RunNeeded
 from orchestrator.control.run_users import RunInUse
 from orchestrator.persistence.models import Dependency
-from shared_store import contents, epoch, trash
-from shared_store.epoch import Claim
-from shared_store.layout import Run, Store
+from shared_store.volume import contents, epoch, trash
+from shared_store.volume.epoch import Claim
+from shared_store.volume.layout import Run, Store
 from tests.support.orchestrator.retention import World
 from tests.support.orchestrator.rows import job
 

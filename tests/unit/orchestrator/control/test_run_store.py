@@ -9,8 +9,8 @@ import pytest
 
 from orchestrator.control.peers import Peers
 from orchestrator.control.run_store import Errands, RunStore, StoreUnavailable
-from shared_store.epoch import Claim, read_claim, read_epoch
-from shared_store.layout import Store
+from shared_store.volume.epoch import Claim, read_claim, read_epoch
+from shared_store.volume.layout import Store
 from tests.support.orchestrator.slow_pool import SlowPool
 
 

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.control.store_identity import StoreIdentity, recognise
 from orchestrator.persistence.models import Attempt
 from orchestrator.persistence.session import Database
-from shared_store.layout import Store, StoreError
+from shared_store.volume.layout import Store, StoreError
 from tests.support.orchestrator.rows import job
 
 

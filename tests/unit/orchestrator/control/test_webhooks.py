@@ -12,8 +12,8 @@ import pytest
 from orchestrator.control.deliveries import _evaluated
 from orchestrator.control.webhooks import PAUSES, Webhook, WebhooksError, kind_of, read_webhooks, run_of
 from orchestrator.persistence.models import Job
-from shared_store.files import write_json
-from shared_store.layout import Store
+from shared_store.volume.files import write_json
+from shared_store.volume.layout import Store
 from tests.support.orchestrator.receiver import SECRET, write_webhooks
 from tests.support.orchestrator.rows import job
 from tests.support.orchestrator.trained import add_checkpoint, add_run

@@ -15,8 +15,8 @@ from orchestrator.engines.api import Cause, Handle, NodePhase, NodeStatus
 from orchestrator.engines.installed import check_tags
 from orchestrator.engines.slurm import commands
 from orchestrator.engines.slurm import engine as slurm
-from shared_store.layout import Store
-from shared_store.outcomes import Outcome, write_outcome
+from shared_store.volume.layout import Store
+from shared_store.volume.outcomes import Outcome, write_outcome
 
 MEETING = 'muster: meeting {"nodes": ["n1"], "addresses": ["10.0.0.1"], "port": 1}\n'
 

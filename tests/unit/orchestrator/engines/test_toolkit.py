@@ -30,8 +30,9 @@ from orchestrator.engines.toolkit.outcomes import all_recorded, log_of, record, 
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView, View
 from orchestrator.engines.toolkit.waiting import wait_until
-from shared_store.layout import Store
-from shared_store.log_files import LIMIT, LogWriter
+from shared_store.contract.node import LOG_LIMIT
+from shared_store.volume.layout import Store
+from shared_store.volume.log_files import LogWriter
 from tests.conftest import wait_for
 
 
@@ -84,7 +85,7 @@ def test_no_outcome_is_written_for_a_run_that_is_gone_or_through_a_link_in_its_p
 
 def test_a_copied_log_has_each_line_once_whoever_copies(handle: Handle) -> None:
     path, limit = log_of(handle, 0)
-    assert limit == LIMIT
+    assert limit == LOG_LIMIT
     lines = [f"line {number} \udcff\n" for number in range(7)]
     with LogCopy(path, limit) as copy:
         copy.append(lines[:3])

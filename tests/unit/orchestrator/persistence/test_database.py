@@ -22,7 +22,7 @@ from orchestrator.persistence.models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of, record_owner
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
-from shared_store.layout import Run, Store
+from shared_store.volume.layout import Run, Store
 from tests.support.orchestrator.rows import job
 
 

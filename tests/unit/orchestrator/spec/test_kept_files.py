@@ -17,8 +17,8 @@ from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.kept_files import changes_with_files, with_files
 from orchestrator.spec.model import validate
 from orchestrator.spec.tracks import ask
-from shared_store.layout import Store
-from shared_store.texts import IN_DEFINITION, LARGEST, digest_of
+from shared_store.volume.layout import Store
+from shared_store.volume.texts import IN_DEFINITION, LARGEST, digest_of
 from tests.support.refusals import refusal
 
 GOOD = "# ½ 😀 \"quoted\" \\ and\ttabs\ndef reward_function(params):\n    return params['speed']\n"

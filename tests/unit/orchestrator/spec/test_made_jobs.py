@@ -11,8 +11,8 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.spec.evaluations import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
 from orchestrator.spec.league_races import race_job
 from orchestrator.spec.sections import Evaluation
-from shared_store.checkpoints import Checkpoint
 from shared_store.leagues import CAR, Rules
+from shared_store.volume.checkpoints import Checkpoint
 from tests.support.shared_store.leagues import league
 
 TRAINED: dict[str, Any] = {

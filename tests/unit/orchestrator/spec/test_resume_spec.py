@@ -18,9 +18,9 @@ from orchestrator.api.native.runs import _check_changes, _check_rate
 from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import ALGORITHMS, Spec, validate
-from shared_store.checkpoints import Checkpoint
-from shared_store.layout import Run, Store
-from shared_store.settings import setting_at
+from shared_store.volume.checkpoints import Checkpoint
+from shared_store.volume.layout import Run, Store
+from shared_store.volume.run_settings import setting_at
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.refusals import refusal
 

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from shared_store.contract import NodeContract, job_variables
+from shared_store.contract.node import NodeContract, job_variables
 from tests.conftest import wait_for
 from worker.node import lifeline
 from worker.node.lifeline import ChildEnd, Loss, MainEnd

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, known, open_track, straight
 from worker.racer.arithmetic import norm

@@ -14,8 +14,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from shared_store.layout import Run, Store
 from shared_store.races import race_changes, rules_of
+from shared_store.volume.layout import Run, Store
 from tests.support.worker.loop import alone
 from tests.support.worker.racing import OVAL, counted, known, open_track, racer, straight
 from worker.evaluation.episodes import Episodes, play

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from orchestrator.spec.model import validate
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, counted, known, racer, straight
 from worker.errors import UserError

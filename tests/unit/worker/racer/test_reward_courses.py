@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, open_track, racer
 from worker.racer.circuit import circuit_of

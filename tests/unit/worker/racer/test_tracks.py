@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from shared_store.layout import Store
 from shared_store.tracks import LARGEST
+from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from worker.racer.checks import BadTrack, area_of, inside
 from worker.racer.generator import make_random

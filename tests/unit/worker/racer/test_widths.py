@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from shared_store import tracks as stored
-from shared_store.layout import Store
+from shared_store.volume.layout import Store
 from tests.support.worker.racing import known
 from worker.racer import __main__ as command
 from worker.racer.arithmetic import norm

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from shared_store.wording import counted
+from shared_store.contract.error_text import counted
 from worker.racer.rewards.parameters import BY_NAME
 from worker.racer.rewards.translation.expressions import Expressions
 from worker.racer.rewards.translation.items import Iterated

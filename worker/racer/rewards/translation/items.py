@@ -6,7 +6,7 @@ import ast
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from shared_store.wording import nearest
+from shared_store.contract.error_text import nearest
 from worker.racer.rewards.parameters import BY_NAME
 from worker.racer.rewards.translation.emitting import Emitting
 from worker.racer.rewards.translation.values import (

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.wording import shown
+from shared_store.contract.error_text import shown
 
 ORDER = ("bool", "int", "float")
 """Kinds of numbers, from the narrowest on; a variable has the widest of its values."""

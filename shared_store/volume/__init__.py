@@ -1,0 +1,1 @@
+"""The volume: layout, atomic commits, checkpoints, logs, metrics, outcomes and models."""

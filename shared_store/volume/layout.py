@@ -1,0 +1,295 @@
+"""The layout of the shared volume (``<store>/runs/<run>/…``)."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_json
+
+FORMAT = 1
+"""Version of the layout; a store with a newer one is refused."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+"""Valid names of runs: a name becomes a directory."""
+
+_NAMING_TRIES = 20
+"""Tenths of a second to wait for another controller that is naming the store."""
+
+LARGEST_DESCRIPTION = 128 << 10
+"""Bytes of ``run.json`` and of an evaluation, which the API returns."""
+
+
+class StoreError(Exception):
+    """The store can't be used; the message names the path, the reason and the remedy."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training history, continued by one or more jobs. It has paths only, and creates nothing on access."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def contract(self) -> Path:
+        return self.path / "contract.json"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics"
+
+    @property
+    def parent(self) -> Path:
+        return self.path / "parent"
+
+    def teacher(self, name: str) -> Run:
+        """The copy of the weights of run ``name``, the teacher of this run's policy, in the layout of a run."""
+        return Run(self.path / "teachers" / name)
+
+    @property
+    def evaluations(self) -> Path:
+        return self.path / "evaluations"
+
+    @property
+    def incidents(self) -> Path:
+        return self.path / "incidents"
+
+    @property
+    def exports(self) -> Path:
+        return self.path / "exports"
+
+    @property
+    def recordings(self) -> Path:
+        return self.path / "recordings"
+
+    @property
+    def telemetry(self) -> Path:
+        return self.path / "telemetry"
+
+    @property
+    def tracking(self) -> Path:
+        return self.path / "tracking"
+
+    @property
+    def texts(self) -> Path:
+        return self.path / "texts"
+
+    def logs(self, job: str, attempt: int) -> Path:
+        return self.path / "logs" / job / str(attempt)
+
+    def log(self, job: str, attempt: int, node: int) -> Path:
+        return self.logs(job, attempt) / f"node-{node}.log"
+
+    def outcome(self, job: str, attempt: int, node: int) -> Path:
+        return self.path / "outcomes" / job / str(attempt) / f"node-{node}.json"
+
+    def check_links(self) -> None:
+        """Raise DamagedFile if the run, or a directory of it that Muster uses, is a link, which leads out of the store."""
+        for name in (
+            "checkpoints",
+            "metrics",
+            "evaluations",
+            "exports",
+            "recordings",
+            "telemetry",
+            "tracking",
+            "texts",
+            "sim-trace",
+            "logs",
+            "outcomes",
+            "parent",
+            "teachers",
+        ):
+            refuse_links(self.path / name, 2)
+
+    def description(self) -> dict[str, Any] | None:
+        """The content of ``run.json`` (spec, code versions, creation time); None if the run does not exist.
+
+        Raises DamagedFile if it is malformed or :meth:`check_links` refuses, OSError if the volume can't be read.
+        """
+        self.check_links()
+        path = self.path / "run.json"
+        found = read_json(path, LARGEST_DESCRIPTION)
+        if found is not None and not isinstance(found.get("spec"), dict | None):
+            raise DamagedFile(f"{path}: spec is not a mapping")
+        if found is not None and not isinstance(found.get("created"), int | float | None):
+            raise DamagedFile(f"{path}: created is not a number")
+        if found is not None and not 0 <= (found.get("created") or 0) < 2**53:  # no database holds more
+            raise DamagedFile(f"{path}: created is no time")
+        if found is not None and not isinstance(found.get("parent"), dict | None):
+            raise DamagedFile(f"{path}: parent is not a mapping")
+        return found
+
+    def is_missing(self) -> bool:
+        """Whether the store can be read and lacks the run; False if that is uncertain, for example while the volume is away."""
+        try:
+            os.lstat(self.path / "run.json")
+        except FileNotFoundError:
+            return os.path.lexists(self.path.parent.parent / "store.json")
+        except OSError:
+            return False
+        return False
+
+    def create(self, description: dict[str, Any]) -> None:
+        """Write ``run.json`` once; an existing run keeps its own. Raises as :meth:`check_links`, OSError."""
+        self.check_links()
+        if not (self.path / "run.json").exists():
+            write_json(self.path / "run.json", description)
+
+
+@dataclass(frozen=True)
+class Store:
+    """The shared volume at ``path``."""
+
+    path: Path
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        object.__setattr__(self, "path", Path(path).expanduser().absolute())
+
+    def identity(self) -> str | None:
+        """What tells this store from all others; None for a store of an older Muster.
+
+        Raises FileNotFoundError where there is no store, OSError or ValueError where ``store.json`` can't be read.
+        """
+        found = read_json(self.path / "store.json")
+        if found is None:
+            raise FileNotFoundError(f"{self.path / 'store.json'}: no such file")
+        identity = found.get("id")
+        return identity if isinstance(identity, str) and identity else None
+
+    def check_writable(self) -> None:
+        """Raises StoreError where this user can't write at the path, or can't create it. Makes nothing."""
+        present = next(each for each in (self.path, *self.path.parents) if os.path.exists(each))
+        if not present.is_dir():
+            raise self._not_writable(os.strerror(errno.ENOTDIR))
+        if not os.access(present, os.W_OK | os.X_OK):
+            is_read_only = os.statvfs(present).f_flag & os.ST_RDONLY
+            raise self._not_writable(os.strerror(errno.EROFS if is_read_only else errno.EACCES))
+
+    def check_owner(self) -> None:
+        """Raises StoreError where the owner of the store's directory can't write in directories that this user makes there."""
+        probe = self.path / "runs" / f".probe-{os.getpid()}"
+        try:
+            probe.mkdir()
+            made, owner = probe.stat(), self.path.stat()
+            probe.rmdir()
+        except OSError as error:
+            raise self._not_writable(error.strerror or str(error)) from error
+        bit = 0o200 if made.st_uid == owner.st_uid else 0o020 if made.st_gid == owner.st_gid else 0o002
+        if owner.st_uid != 0 and not made.st_mode & bit:
+            raise StoreError(
+                f"store {self.path}: it belongs to user {owner.st_uid}, as whom containers run, and they can't write what this "
+                f"controller makes there as user {made.st_uid}; chown the store, or start muster serve as user {owner.st_uid}"
+            )
+
+    def _not_writable(self, why: str) -> StoreError:
+        return StoreError(
+            f"store {self.path}: not writable ({why}); see whether its volume is mounted, or choose another with --store"
+        )
+
+    def open(self) -> Store:
+        """Create a missing layout, give the store an identity, and check that it can be written.
+
+        Raises StoreError for a path that can't be created or written, or that holds a newer format.
+        """
+        try:
+            (self.path / "runs").mkdir(parents=True, exist_ok=True)
+            description = read_json(self.path / "store.json")
+            if description is None or (description.get("format") == FORMAT and not description.get("id")):
+                description = self._name(description or {"format": FORMAT})
+            probe = self.path / "runs" / f".probe-{os.getpid()}"
+            probe.write_bytes(b"")
+            probe.unlink()
+        except OSError as error:
+            raise self._not_writable(error.strerror or str(error)) from error
+        except ValueError as error:
+            raise StoreError(f"store {self.path}: store.json is damaged ({error})") from error
+        if not isinstance(description.get("format"), int) or description["format"] > FORMAT:
+            raise StoreError(
+                f"store {self.path}: has format {description.get('format')}, this Muster reads up to {FORMAT}; upgrade Muster"
+            )
+        return self
+
+    def _name(self, description: dict[str, Any]) -> dict[str, Any]:
+        """Give the store an identity. Of several controllers that do so at once, the first one's stays."""
+        claim = self.path / ".naming"
+        try:
+            with open(claim, "xb") as file:
+                file.write(secrets.token_hex(16).encode())
+                file.flush()
+                os.fsync(file.fileno())
+        except FileExistsError:
+            pass
+        for _ in range(_NAMING_TRIES):
+            if named := claim.read_bytes().decode():
+                break
+            time.sleep(0.1)
+        else:  # who made it died before it wrote
+            named = secrets.token_hex(16)
+        described = {**description, "id": named}
+        write_json(self.path / "store.json", described)
+        return described
+
+    def run(self, name: str) -> Run:
+        """The run called ``name``, whether it exists or not. Raises StoreError for a name that can't be a directory."""
+        if not NAME.fullmatch(name):
+            raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
+        return Run(self.path / "runs" / name)
+
+    @property
+    def models(self) -> Path:
+        return self.path / "models"
+
+    @property
+    def tracks(self) -> Path:
+        return self.path / "tracks"
+
+    @property
+    def texts(self) -> Path:
+        return self.path / "texts"
+
+    @property
+    def leagues(self) -> Path:
+        return self.path / "leagues"
+
+    def runs(
+        self, after: str = "", most: int | None = None, among: Callable[[Run], bool] = lambda run: True
+    ) -> list[Run]:
+        """The existing runs, by name: those after ``after``, at most ``most``, of which ``among`` is true."""
+        try:
+            entries = sorted(entry.name for entry in os.scandir(self.path / "runs") if entry.name > after)
+        except FileNotFoundError:
+            return []
+        named = (self.run(name) for name in entries if NAME.fullmatch(name))
+        return list(islice((run for run in named if os.path.lexists(run.path / "run.json") and among(run)), most))
+
+
+def names_in(directory: Path) -> list[str]:
+    """The valid names in a directory of the store, sorted; none if the directory does not exist.
+
+    Raises:
+        DamagedFile: The directory is a link.
+        OSError: It can't be read.
+    """
+    refuse_links(directory, 1)
+    try:
+        entries = os.listdir(directory)
+    except FileNotFoundError:
+        return []
+    return sorted(name for name in entries if NAME.fullmatch(name))

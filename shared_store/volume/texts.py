@@ -1,0 +1,191 @@
+"""Long texts of jobs, such as reward functions, each a file named by its SHA-256.
+
+A text that is too long for a job's definition lies in ``texts/<controller>/`` of the store from its upload on. When an attempt begins,
+the controller copies it into ``texts/`` of the job's run, where every rank reads it: the run explains itself later. In a definition
+``{file, sha256}`` stands in the place of ``{file, text}``.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shared_store.volume.files import DamagedFile, open_regular, write_atomic
+
+LARGEST = 1 << 20
+"""Bytes of a text (UTF-8)."""
+IN_DEFINITION = 20 << 10
+"""Bytes that a spec may take in a job's definition, which has at most 24 KiB on AWS Batch, and so here."""
+_OF_REFERENCE = 256
+"""Bytes of a text that takes no more room in a definition than its digest."""
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_HALF = re.compile("[\ud800-\udfff]")
+"""A half of a character, which JSON can name and no file can hold."""
+_SECTIONS = ("train", "evaluate", "race")
+
+
+class TextError(ValueError):
+    """A kept text is missing or altered; one line with its file, its place and the remedy."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A text that a job's spec names by its digest."""
+
+    key: str
+    """Of the spec, such as ``train.config.reward_function``."""
+    file: str
+    """The name that the submitter's file had."""
+    sha256: str
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.file[:200]} (sha256 {self.sha256})"
+
+
+def digest_of(text: str) -> str:
+    """SHA-256 of a text in UTF-8, in hexadecimal."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def size_in_definition(value: Any) -> int:
+    """Bytes that a value takes in a definition, whose spec is JSON in a text of JSON."""
+    return len(json.dumps(json.dumps(value)))
+
+
+def references(spec: Mapping[str, Any] | None) -> list[Reference]:
+    """The texts that a job's spec names by their digests."""
+    return [
+        Reference(f"{section}.config.{field}", value.get("file", field), value["sha256"])
+        for section in _SECTIONS
+        for field, value in _config(spec, section)
+        if is_reference(value)
+    ]
+
+
+def beside(spec: Mapping[str, Any]) -> tuple[dict[str, Any], dict[Reference, str]]:
+    """A job's spec with references in the place of its long texts, and those texts: the longest first, until it fits into a definition."""
+    result, texts = dict(spec), dict[Reference, str]()
+    found = [
+        (size_in_definition(value), section, field, value)
+        for section in _SECTIONS
+        for field, value in _config(spec, section)
+        if isinstance(value, Mapping) and value.keys() <= {"file", "text"} and isinstance(value.get("text"), str)
+    ]
+    for size, section, field, value in sorted(found, key=lambda each: each[0], reverse=True):
+        if size <= _OF_REFERENCE or _HALF.search(value["text"]):
+            continue
+        if _size_of(result) <= IN_DEFINITION:
+            break
+        reference = Reference(f"{section}.config.{field}", str(value.get("file") or field), digest_of(value["text"]))
+        kept = {"file": reference.file, "sha256": reference.sha256}
+        result[section] = {**result[section], "config": {**result[section]["config"], field: kept}}
+        texts[reference] = value["text"]
+    return result, texts
+
+
+def _size_of(spec: Mapping[str, Any]) -> int:
+    """Bytes of a definition that depend on its spec: that itself, and what the definition has of it once more."""
+    again = {key: spec[key] for key in ("environment", "secrets", "command") if key in spec}
+    return size_in_definition(spec) + len(json.dumps(again))
+
+
+def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str, Any]:
+    """A task's configuration with the texts in the place of their references.
+
+    Args:
+        config: The configuration.
+        directory: That of the texts.
+        where: Key of the configuration in the spec, for errors.
+
+    Raises:
+        TextError: A text is missing or altered.
+        OSError: The volume can't be read.
+    """
+    result = dict(config)
+    for field, value in config.items():
+        if is_reference(value):
+            name = value.get("file", field)
+            text = read(directory, Reference(f"{where}.{field}", name, value["sha256"]))
+            result[field] = {"file": name, "text": text}
+    return result
+
+
+def resolved_spec(spec: Mapping[str, Any], *directories: Path) -> dict[str, Any]:
+    """A job's spec with the texts in the place of their references, to be shown: a text that none of the directories has is left out."""
+    result = dict(spec)
+    for section in _SECTIONS:
+        config = dict(_config(spec, section))
+        for directory in directories:
+            for field, value in config.items():
+                try:
+                    config |= resolved({field: value}, directory, f"{section}.config")
+                except (TextError, OSError):
+                    continue
+        if config:
+            result[section] = {**result[section], "config": config}
+    return result
+
+
+def keep(directory: Path, data: bytes) -> str:
+    """Keep a text under its digest, which is returned; one that is there already is written again. Raises OSError, such as for a full volume."""
+    digest = hashlib.sha256(data).hexdigest()
+    write_atomic(directory / digest, data)
+    return digest
+
+
+def read(directory: Path, reference: Reference) -> str:
+    """A kept text, whose digest is checked. Raises TextError, OSError."""
+    path = directory / reference.sha256
+    try:
+        with open_regular(path) as file:
+            data = file.read(LARGEST + 1)
+    except DamagedFile as error:
+        raise _lost(reference, path, str(error).partition(": ")[2]) from None
+    except OSError as error:
+        if error.errno not in (errno.ENOENT, errno.ENOTDIR):
+            raise
+        raise _lost(reference, path, "missing") from None
+    if hashlib.sha256(data).hexdigest() != reference.sha256:
+        raise _lost(reference, path, "altered: its content has another digest")
+    return data.decode()
+
+
+def read_either(first: Path, second: Path, reference: Reference) -> str:
+    """:func:`read` from the first of two directories that has the text unaltered."""
+    try:
+        return read(first, reference)
+    except TextError:
+        return read(second, reference)
+
+
+def _lost(reference: Reference, path: Path, why: str) -> TextError:
+    return TextError(f"{reference}: the text kept at {path} is {why}; submit the job again with the file")
+
+
+def _config(spec: Mapping[str, Any] | None, section: str) -> Iterator[tuple[str, Any]]:
+    values = (spec or {}).get(section)
+    config = values.get("config") if isinstance(values, Mapping) else None
+    return iter(config.items() if isinstance(config, Mapping) else ())
+
+
+def is_file(value: Any) -> bool:
+    """Whether a value of a configuration is the content of a file: its text, or the digest of that."""
+    return is_reference(value) or (isinstance(value, Mapping) and value.keys() == {"file", "text"})
+
+
+def is_reference(value: Any) -> bool:
+    """Whether a value of a configuration stands for a text by its digest; the name of the file may be missing, and the text empty."""
+    return (
+        isinstance(value, Mapping)
+        and {"sha256"} <= value.keys() <= {"file", "sha256", "text"}
+        and value.get("text", "") == ""
+        and isinstance(value.get("file", ""), str)
+        and isinstance(value["sha256"], str)
+        and _DIGEST.fullmatch(value["sha256"]) is not None
+    )

@@ -1,0 +1,81 @@
+"""An outcome file may have been written by the job itself: what is read of it is typed and bounded."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store.contract.faults import Fault
+from shared_store.volume import outcomes
+from shared_store.volume.layout import Run
+
+ERROR = outcomes.FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
+OUTCOME = outcomes.Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
+
+
+def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(tmp_path: Path) -> None:
+    run, long = Run(tmp_path), "begin " + "x" * 10_000_000 + " end"
+    error = replace(ERROR, message=long, traceback=long)
+    outcomes.write_outcome(run, "job", 1, replace(OUTCOME, reason=long, error=error))
+    assert run.outcome("job", 1, 0).stat().st_size < 4 * outcomes.LONGEST_TEXT
+    outcome = outcomes.read_outcome(run, "job", 1, 0)
+    assert outcome and outcome.error and outcome == outcomes.bounded(outcome)
+    assert outcome.reason == outcome.error.message
+    assert outcome.reason.startswith("begin x") and outcome.reason.endswith("x … (9983690 characters left out)")
+    traceback = outcome.error.traceback
+    assert traceback.startswith("(9983690 characters left out) …") and traceback.endswith(" end")
+    assert max(len(outcome.reason), len(traceback)) <= outcomes.LONGEST_TEXT
+
+
+@pytest.mark.parametrize("fault", [None, Fault("ValueError", "reward.py", 3)])
+def test_an_outcome_comes_back_with_its_fault(tmp_path: Path, fault: Fault | None) -> None:
+    error = replace(ERROR, fault=fault)
+    outcomes.write_outcome(Run(tmp_path), "job", 1, replace(OUTCOME, error=error))
+    assert outcomes.read_outcome(Run(tmp_path), "job", 1, 0) == replace(OUTCOME, error=error)
+
+
+WRONG: list[dict[str, Any]] = [
+    *({"exit_code": each} for each in (10**30, -1, 256, "1", True)),
+    *({"ended": -1e300}, {"ended": 1e300}, {"started": None}, {"reason": ["x"]}, {"cannot_start": 1}),
+    {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
+    {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": "x"}},
+    {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": {"type": "x"}}},
+    *({"error": [1]}, {"error": "x"}, {"other": 1}, {"asked": 1}),
+]
+
+
+@pytest.mark.parametrize("change", WRONG)
+def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = Run(tmp_path).outcome("job", 1, 0)
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({**asdict(OUTCOME), **change}))
+    assert outcomes.read_outcome(Run(tmp_path), "job", 1, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("ends", "cause"),
+    [
+        ([(False, 1.0)], 0),
+        ([(True, 1.0)], 0),
+        ([(False, 2.0), (False, 1.0)], 1),
+        ([(False, 1.0), (False, 1.0)], 0),
+        ([(True, 1.0), (False, 9.0)], 1),
+        ([(False, 9.0), (True, 1.0)], 0),
+        ([(True, 1.0), (False, 9.0), (False, 8.0), (True, 0.5)], 2),
+        ([(True, 2.0), (True, 1.0)], 1),
+    ],
+)
+def test_the_first_that_was_not_asked_to_end_is_the_cause(ends: list[tuple[bool, float]], cause: int) -> None:
+    assert outcomes.first_cause(ends) == cause
+
+
+def test_an_outcome_is_read_as_it_was_written_and_one_of_an_older_version_was_not_asked() -> None:
+    asked = replace(OUTCOME, asked=True)
+    written = asdict(asked)
+    assert outcomes.parse_outcome(written) == asked
+    del written["asked"]
+    assert outcomes.parse_outcome(written) == OUTCOME
