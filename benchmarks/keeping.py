@@ -31,7 +31,7 @@ import yaml
 
 from benchmarks.keeping_table import ON_CPU, PLAN, POINTS, WORLDS, curves_of, draw, is_whole, keep, table
 from shared_store.volume.learning_metrics import LEARNING
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 
 SPECS = Path(__file__).parents[1] / "job_specs"
 SHOWN = [metric.name for metric in LEARNING]

@@ -26,7 +26,7 @@ from worker.evaluation.evaluation import evaluate
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
 from worker.learning.setup import build_task
-from worker.tasks.adapting import adaptive_steps, begin_evaluation
+from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
 
 CURVE = ("object_height", "position_error", "at_goal", "episode_success")
 """Metrics of the task to keep."""

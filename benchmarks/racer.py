@@ -34,14 +34,14 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.peers.inside.clock import versions
 from benchmarks.training import CUDA, build, device_name, rate, wait
 from shared_store.volume.layout import Run
-from worker.errors import UserError
 from worker.evaluation.evaluation import evaluate
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
 from worker.learning.setup import build_task
-from worker.tasks.adapting import adaptive_steps, begin_evaluation
-from worker.tasks.configs.racer import RacerConfig
-from worker.tasks.task import Task
+from worker.settings.errors import UserError
+from worker.settings.racer import RacerConfig
+from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
+from worker.tasks.run.task import Task
 
 HERE = Path(__file__).parent
 JOBS = {"Racer": "racer.yaml", "RacerPixels": "racer-pixels.yaml"}

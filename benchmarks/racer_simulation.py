@@ -20,7 +20,7 @@ import yaml
 from benchmarks.load import Watch, add_option, told
 from benchmarks.racer import HERE, JOBS, REAL_TIME, merged, simulation_rate
 from benchmarks.training import CUDA, build, device_name
-from worker.errors import UserError
+from worker.settings.errors import UserError
 
 TASK = "RacerPixels"
 

@@ -32,10 +32,10 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, build, device_name
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import read_metrics
-from worker.distributed import Placement, connect
 from worker.evaluation.blocks import SIZE, Blocks
 from worker.evaluation.episodes import play
 from worker.export import export
+from worker.learning.distributed import Placement, connect
 from worker.learning.loop import Loop
 from worker.learning.trained import load_policy
 from worker.telemetry.picture import Camera

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from worker.learning.ppo.settings import PPOConfig
-from worker.tasks.rsl_rl_env import TaskVecEnv
-from worker.tasks.task import Task
+from worker.learning.rsl.environment import TaskVecEnv
+from worker.settings.ppo import PPOConfig
+from worker.tasks.run.task import Task
 
 
 def stock_config(task: Task, ppo: PPOConfig) -> dict[str, Any]:

@@ -42,9 +42,9 @@ from worker.simulation.sensors.imu import Imu
 from worker.simulation.sensors.momentum import AngularMomentum
 from worker.simulation.sensors.rays import LidarPattern, RayCaster
 from worker.tasks import find_task, terms
-from worker.tasks.compiler import Kernels, further
-from worker.tasks.declaration import Declaration, Metric, Observation
-from worker.tasks.declared import DeclaredTask
+from worker.tasks.compile.compiler import Kernels, further
+from worker.tasks.declare.declaration import Declaration, Metric, Observation
+from worker.tasks.run.declared import DeclaredTask
 
 WORLDS, WORLDS_CPU = 4096, 32
 TASKS = ("Ant", "Quadruped")

@@ -28,8 +28,8 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_runner, stock_seconds
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
-from worker.distributed import Placement, connect
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.distributed import Placement, connect
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.setup import build_task

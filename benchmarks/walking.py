@@ -36,8 +36,8 @@ from benchmarks.training import device_name, wait
 from shared_store.contract.error_text import nearest
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
-from worker.tasks.adapting import adaptive_steps, begin_evaluation
-from worker.tasks.task import Task
+from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
+from worker.tasks.run.task import Task
 
 ALGORITHMS = ("sac", "ppo")
 LENGTH = 0.987

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from worker.settings.task import TaskConfig, reward_weights
 from worker.simulation.episodes import STEP, EpisodeArrays, add_reward, begin_episode, end_step, random_stream
 from worker.simulation.worlds import WorldArrays, is_sound
-from worker.tasks.config import TaskConfig, reward_weights
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 MODEL = """<mujoco><worldbody><body pos="0 0 1">
   <joint name="hinge" type="hinge" axis="0 1 0" damping="0.02"/>

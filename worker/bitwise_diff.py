@@ -20,9 +20,9 @@ from shared_store.contract.error_text import counted
 from shared_store.volume.checkpoints import Checkpoint, list_checkpoints
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import read_metrics
-from worker.errors import UserError
 from worker.learning.job import EX_ERROR, EX_USAGE, run_command
 from worker.learning.shards import Shards, read_file
+from worker.settings.errors import UserError
 
 _OF_THE_WRITING = {"created", "epoch", "files", "format", "seconds", "shards", "train", "world_size"}
 """Keys of a manifest that say how and when it was written, not what was learnt (``train`` holds what was asked for)."""

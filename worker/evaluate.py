@@ -12,12 +12,12 @@ from shared_store.races import NO_RACER, TRIALS, race_changes, rules_of
 from shared_store.volume.outcomes import EX_TEMPFAIL
 from shared_store.volume.run_settings import merged
 from shared_store.volume.texts import beside, keep
-from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
+from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
     from worker.evaluation.race import Laps
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 EPISODES = 100
 WORLDS = 1024
@@ -34,7 +34,7 @@ def main(kind: str = "evaluate") -> int:
     job = Job.from_env(os.environ, kind)
     run, race = job.named_run(), kind == "race"
     episodes = job.setting("trials", TRIALS) if race else job.setting("episodes", EPISODES)
-    from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():

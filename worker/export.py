@@ -14,7 +14,7 @@ from worker.learning.job import Job, configure, run_command, user_errors
 if TYPE_CHECKING:
     from shared_store.volume.checkpoints import Checkpoint
     from shared_store.volume.layout import Run
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 
 def export(
@@ -35,7 +35,7 @@ def export(
     from worker.deploy import bundle
     from worker.learning.setup import check_contract, contract_from
     from worker.learning.trained import load_policy
-    from worker.tasks.policy_contract import policy_contract
+    from worker.tasks.compile.policy_contract import policy_contract
 
     changes = check_contract(checkpoint, task, section)
     policy = load_policy(checkpoint)
@@ -54,7 +54,7 @@ def main() -> int:
         return 0
     run = job.named_run()
     episodes, worlds = job.setting("episodes", 16, least=0), job.setting("worlds", 16)
-    from worker.distributed import Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import Placement, connect, require_gpus, use_cpu_threads
     from worker.learning.trained import find_checkpoint
 
     checkpoint = find_checkpoint(run, job.section.get("checkpoint"))

@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 
 from shared_store.contract.error_text import counted
-from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
+from worker.settings.errors import UserError
 
 
 def main() -> int:
@@ -22,7 +22,7 @@ def main() -> int:
 
     activity = Activity()
     activity.say(loading(run, worlds))
-    from worker.distributed import use_cpu_threads
+    from worker.learning.distributed import use_cpu_threads
 
     use_cpu_threads(os.environ)
     from worker.telemetry.recording import Recording

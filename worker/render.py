@@ -10,8 +10,8 @@ import time
 from typing import TYPE_CHECKING
 
 from shared_store.contract.error_text import counted
-from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
+from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,7 +32,7 @@ def main() -> int:
 
     activity = Activity()
     activity.say(loading(run, worlds))
-    from worker.distributed import use_cpu_threads
+    from worker.learning.distributed import use_cpu_threads
 
     use_cpu_threads(os.environ)
     from worker.telemetry import picture

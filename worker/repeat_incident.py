@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any
 from shared_store.contract.error_text import counted
 from shared_store.contract.policy import RobotModel
 from shared_store.contract.policy_changes import brief, robot_changes
-from worker.accepting import CHANGED_ROBOTS
-from worker.errors import UserError
 from worker.learning.job import EX_ERROR, configure, run_command, user_errors
+from worker.settings.accepted_changes import CHANGED_ROBOTS
+from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
     import torch
 
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 SHOWN = 10
 """At most so many steps with mishaps are shown."""
@@ -70,7 +70,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
 
 def _compare_robots(then: Sequence[Mapping[str, Any]], task: Task) -> None:
     """Print which robots load otherwise than in the training; files of older versions know none."""
-    from worker.tasks.policy_contract import robots_of
+    from worker.tasks.compile.policy_contract import robots_of
 
     if lines := robot_changes([RobotModel(**each) for each in then], robots_of(task)):
         print(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 
-from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, run_command, user_errors
+from worker.settings.errors import UserError
 from worker.telemetry.tracking import Tracking
 
 SWITCH_SECONDS = 0.0005
@@ -23,7 +23,7 @@ def main() -> int:
 
 
 def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
-    from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():

@@ -10,12 +10,12 @@ from typing import Any
 
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
-from worker.distributed import Placement, connect
+from worker.learning.distributed import Placement, connect
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.training import Training
 from worker.tasks import find_task
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 
 def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[str, Any]]:

@@ -14,7 +14,7 @@ from torch import nn
 
 from shared_store.contract.error_text import nearest
 from worker.learning.algorithm import POLICY
-from worker.tasks.interface import Interface
+from worker.tasks.declare.interface import Interface
 
 ACTIVATIONS: Mapping[str, type[nn.Module]] = {
     "elu": nn.ELU,

@@ -26,7 +26,7 @@ from benchmarks.peers.judging import Acting, judge
 from benchmarks.peers.run import RECORDS
 from shared_store.volume.layout import Run
 from worker.learning.trained import find_checkpoint, load_policy
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 SEED = 12345
 """Seed of the worlds in which policies are judged; no training uses it."""

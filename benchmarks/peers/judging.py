@@ -11,7 +11,7 @@ import warp as wp
 
 from worker.learning.setup import observed
 from worker.simulation.robot_view import body_arrays
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 COMMAND = ("command_forward", "command_left", "command_turn")
 """Names of the command's observations: velocities forward and left [m/s], turning velocity to the left [rad/s]."""

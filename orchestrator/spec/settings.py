@@ -36,7 +36,7 @@ def settings_classes() -> dict[str, Any]:
 
 
 def task_config(task: str) -> Any | None:
-    """The class of an installed task's configuration (``worker.tasks.config.TaskConfig``), imported when it is asked for.
+    """The class of an installed task's configuration (``worker.settings.task.TaskConfig``), imported when it is asked for.
 
     None of a task that names none, that is not installed (``module:Class``), or whose class can't be imported: its rank checks.
     """

@@ -42,11 +42,11 @@ from worker.deploy import parity, rollouts
 from worker.deploy.leapp_description import LEAPP, leapp_description
 from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
 from worker.deploy.robots import add_robot
-from worker.tasks.declared import DeclaredTask
+from worker.tasks.run.declared import DeclaredTask
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy, Policy
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 COPIED = ("iteration", "reward", "score", "score_error", "score_episodes", "env_steps", "algorithm")
 """Keys that a bundle's manifest repeats from its checkpoint's."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from worker.errors import TrainingError, UserError
+from worker.settings.errors import TrainingError, UserError
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy, Policy

@@ -6,13 +6,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import worker.tasks
+import worker.tasks.library
 from worker.simulation import robot_files
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
-_OWN = Path(worker.tasks.__file__).parent
+_OWN = Path(worker.tasks.library.__file__).parent
 
 
 def add_robot(task: Task, bundle: Path) -> dict[str, Any] | None:

@@ -11,14 +11,14 @@ import torch
 from tensordict import TensorDict
 
 from worker.deploy.parity import Recording
-from worker.distributed import Gang, Placement
-from worker.errors import TrainingError
 from worker.evaluation import episodes
 from worker.evaluation.episodes import Acting, Episodes
+from worker.learning.distributed import Gang, Placement
 from worker.learning.setup import observed
+from worker.settings.errors import TrainingError
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 RECORDED_WORLDS, RECORDED_STEPS = 4, 256
 """Worlds and steps of a recording: 1,024 observations."""

@@ -20,13 +20,13 @@ import warp
 from shared_store.contract.error_text import counted
 from shared_store.contract.policy import Contract
 from shared_store.volume.bundles import DamagedBundle, read_contract, verify
-from worker.accepting import CHANGED_ROBOTS
-from worker.errors import UserError
 from worker.learning.job import configure, run_command, user_errors
+from worker.settings.accepted_changes import CHANGED_ROBOTS
+from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
     from muster_policy.messages import Messages
-    from worker.tasks.declared import DeclaredTask
+    from worker.tasks.run.declared import DeclaredTask
 
 Message = tuple[str, str, Any]
 """Topic, ROS type and message."""
@@ -265,8 +265,8 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
     """
     from worker.learning.setup import check_fit, check_robots
     from worker.tasks import find_task
-    from worker.tasks.declared import DeclaredTask
-    from worker.tasks.policy_contract import policy_contract, same_policy
+    from worker.tasks.compile.policy_contract import policy_contract, same_policy
+    from worker.tasks.run.declared import DeclaredTask
 
     try:
         manifest, contract = verify(bundle), read_contract(bundle)

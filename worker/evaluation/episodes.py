@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
-from worker.distributed import Gang
+from worker.learning.distributed import Gang
 from worker.learning.setup import observed
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 _RETURN, _LENGTH, _TIME_OUT, _CAUSE, _SUCCESS, _TERMS = range(6)
 LOOK = 32

@@ -16,17 +16,17 @@ from shared_store.volume.evaluations import by_checkpoint, checkpoint_of, evalua
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Run
 from shared_store.volume.paired_episodes import are_paired, paired, read_returns
-from worker.distributed import Gang
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.statistics import Sample, difference, share
 from worker.evaluation.table import write_table
 from worker.learning.algorithm import Policy
+from worker.learning.distributed import Gang
 from worker.learning.report import shown_of
-from worker.tasks.tables import as_json
+from worker.tasks.compile.tables import as_json
 
 if TYPE_CHECKING:
     from worker.evaluation.race import Race
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 FORMAT = 1
 

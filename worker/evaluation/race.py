@@ -20,7 +20,7 @@ from worker.simulation.capture import on_torch_stream
 
 if TYPE_CHECKING:
     from worker.evaluation.episodes import Episodes
-    from worker.tasks.racer import Racer
+    from worker.tasks.library.racer import Racer
 
 COMPLETE = "lap_complete"
 _CALLED = {"off_tracks": "off_track", "crashes": "crashed", "immobilized": "immobilized", "reversed": "reversed"}

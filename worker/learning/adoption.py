@@ -13,13 +13,13 @@ from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.initial_weights import parent_checkpoint
 from shared_store.volume.run_settings import first_difference, fixed_settings, innermost
-from worker.distributed import Gang
-from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
 from worker.learning.algorithms import section_of
+from worker.learning.distributed import Gang
 from worker.learning.job import Job
 from worker.learning.setup import contract_from
 from worker.learning.shards import read_file
+from worker.settings.errors import UserError
 
 
 def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) -> Checkpoint | None:

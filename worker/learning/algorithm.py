@@ -15,8 +15,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from worker.distributed import Gang
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.distributed import Gang
 
 POLICY = "policy"
 """Name of the observation group that every task has: the policy's observations."""

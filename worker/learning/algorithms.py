@@ -18,9 +18,9 @@ from pydantic import ValidationError
 from pydantic_core import ArgsKwargs
 
 from shared_store.contract.error_text import explain, nearest, path_of, shown
-from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
-from worker.tasks.config import TaskConfig
+from worker.settings.errors import UserError
+from worker.settings.task import TaskConfig
 
 DEFAULT = "ppo"
 

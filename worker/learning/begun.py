@@ -11,11 +11,11 @@ from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.initial_weights import named_parent
 from shared_store.volume.run_settings import fixed_settings, setting_at
-from worker.distributed import Gang
-from worker.errors import UserError
 from worker.learning.algorithms import refusal, section_of
+from worker.learning.distributed import Gang
 from worker.learning.job import Job
 from worker.learning.training import Training
+from worker.settings.errors import UserError
 
 
 def as_begun(training: Training, gang: Gang) -> tuple[Training, str]:

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 from shared_store.contract.phases import Phase
 from shared_store.volume.files import write_atomic
-from worker.errors import TrainingError
 from worker.evaluation.evaluation import best_words, evaluate
 from worker.learning.algorithm import Share
 from worker.learning.randomness import held_out_seed
 from worker.learning.setup import build_task
-from worker.tasks.adapting import adaptive_steps, begin_evaluation
+from worker.settings.errors import TrainingError
+from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
 
 if TYPE_CHECKING:
     from worker.learning.loop import Loop
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
     from worker.telemetry.picture import Glance
 
 
@@ -50,7 +50,7 @@ def complete(loop: Loop) -> None:
     loop.beacon.tell(phase=Phase.WRITING)
     try:
         result.write(run, iteration=loop.state.progress.iteration, config={})
-        from worker.plot import plot_reward
+        from worker.telemetry.reward_plot import plot_reward
 
         plot = plot_reward(run)
     except (OSError, ValueError) as error:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from worker.distributed import Gang
 from worker.learning.cuda_graph import Readback
+from worker.learning.distributed import Gang
 from worker.learning.totals import Totals
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 SIGNALS = ("stopping", "save_now", "failed_saves", "busy", "stall", "iteration_seconds", "long")
 """Per-rank flags summed over the ranks each iteration: stop requests, save requests, failed saves, ranks whose earlier saves the

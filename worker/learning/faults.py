@@ -11,8 +11,8 @@ import os
 import signal
 from collections.abc import Mapping
 
-from worker.errors import UserError
 from worker.learning.job import Job
+from worker.settings.errors import UserError
 
 
 def kill_at(env: Mapping[str, str], job: Job) -> int | None:

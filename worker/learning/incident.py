@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from shared_store.volume.files import write_atomic
-from worker.tasks.policy_contract import robots_of
+from worker.tasks.compile.policy_contract import robots_of
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import Share
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 
 class Incident:

@@ -23,12 +23,12 @@ from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import StaleEpoch
 from shared_store.volume.layout import Run, Store, StoreError
 from shared_store.volume.texts import TextError, resolved
-from worker.accepting import CHANGED_ROBOTS
-from worker.errors import GangError, TrainingError, UserError
+from worker.settings.accepted_changes import CHANGED_ROBOTS
+from worker.settings.errors import GangError, TrainingError, UserError
 
 if TYPE_CHECKING:
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
 
 EX_ERROR, EX_USAGE = 1, 2
 
@@ -101,7 +101,7 @@ class Job:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str], kind: str) -> Job:
-        """Read the job for command ``kind``, and keep what it accepts (:mod:`worker.accepting`).
+        """Read the job for command ``kind``, and keep what it accepts (:mod:`worker.settings.accepted_changes`).
 
         Raises:
             UserError: A variable is missing or malformed; the message names it.
@@ -146,7 +146,7 @@ class Job:
 
 def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
     """Check sections, since the submission of a Batch API job does not. Raises UserError for a malformed section."""
-    from worker.tasks.overrides import training_sections
+    from worker.settings.overrides import training_sections
 
     section = spec[kind]
     if not isinstance(algorithm := section.get("algorithm", ""), str):
@@ -172,7 +172,7 @@ def configure(task: type[Task], section: Mapping[str, Any], kind: str = "train")
 
     Raises UserError for an unknown key or an invalid value, in the same words as the submission.
     """
-    from worker.tasks.overrides import Refused, configured
+    from worker.settings.overrides import Refused, configured
 
     try:
         configured(task.config_type, {})

@@ -10,8 +10,6 @@ from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.outcomes import EX_TEMPFAIL
-from worker.distributed import Gang
-from worker.errors import TrainingError, UserError
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
@@ -20,6 +18,7 @@ from worker.learning.begun import as_begun
 from worker.learning.cadence import Cadence
 from worker.learning.completion import complete
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.distributed import Gang
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
 from worker.learning.faults import die, kill_at
@@ -42,12 +41,13 @@ from worker.learning.setup import (
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
-from worker.tasks.config import value_at
+from worker.settings.errors import TrainingError, UserError
+from worker.settings.task import value_at
 from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
-    from worker.tasks.step_log import StepLog
-    from worker.tasks.task import Task
+    from worker.tasks.run.step_log import StepLog
+    from worker.tasks.run.task import Task
 
 
 WARNINGS = 10

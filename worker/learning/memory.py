@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 import psutil
 import torch
 
-from worker.distributed import Gang
-from worker.errors import UserError, is_out_of_memory
 from worker.learning.algorithm import Algorithm, Share
+from worker.learning.distributed import Gang
 from worker.learning.host_copies import HostCopies
 from worker.learning.setup import build_algorithm, build_task, load_kernels, observed, transition
+from worker.settings.errors import UserError, is_out_of_memory
 
 if TYPE_CHECKING:
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
 
 Learner = tuple[type[Algorithm], Any]
 """An algorithm, and its settings."""

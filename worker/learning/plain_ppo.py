@@ -22,7 +22,7 @@ from torch.distributions import Normal, kl_divergence
 from worker.learning.algorithm import POLICY, ExportedPolicy, Setting, Spaces, Transition
 from worker.learning.ppo import draws
 from worker.learning.ppo.draws import Draws
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 
 
 class Network(nn.Module):

@@ -18,22 +18,22 @@ from shared_store.contract.policy_changes import brief, differences, robot_chang
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.epoch import check_epoch
 from shared_store.volume.files import read_json, write_json
-from worker.distributed import Gang, warm_marker
-from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.beacon import Beacon
+from worker.learning.distributed import Gang, warm_marker
 from worker.learning.job import Job, user_errors
+from worker.settings.errors import UserError
 from worker.simulation.robot_values import shown_value
-from worker.tasks.adapting import begin_evaluation
-from worker.tasks.mistakes import task_mistakes
-from worker.tasks.policy_contract import policy_contract, readings_of, robots_of, same_policy
+from worker.tasks.compile.policy_contract import policy_contract, readings_of, robots_of, same_policy
+from worker.tasks.run.adapting import begin_evaluation
+from worker.tasks.run.mistakes import task_mistakes
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
+    from worker.settings.task import TaskConfig
     from worker.simulation.robot_judge import Difference
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 
 def build_task(
@@ -150,7 +150,7 @@ def describe(training: Training, task: Task, exported: ExportedPolicy | None = N
     Args:
         training: The training.
         task: Its task, with worlds.
-        exported: See :func:`worker.tasks.policy_contract.policy_contract`.
+        exported: See :func:`worker.tasks.compile.policy_contract.policy_contract`.
     """
     spaces, name = spaces_of(task), training.job.section["task"]
     return {

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from shared_store.volume.checkpoints import Checkpoint
-from worker.errors import UserError
+from worker.settings.errors import UserError
 
 
 def read_file(checkpoint: Checkpoint, name: str, device: str = "cpu") -> dict[str, Any]:

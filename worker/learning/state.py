@@ -28,20 +28,20 @@ from shared_store.volume.checkpoints import (
 )
 from shared_store.volume.epoch import check_epoch
 from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
-from worker.distributed import Gang
-from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import section_of
+from worker.learning.distributed import Gang
 from worker.learning.job import Job
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
 from worker.learning.setup import check_robots, contract_from
 from worker.learning.shards import Shards, read_file
-from worker.tasks.adapting import adaptive_steps
+from worker.settings.errors import UserError
+from worker.tasks.run.adapting import adaptive_steps
 
 if TYPE_CHECKING:
     from worker.learning.reporter import Gate, Reporter
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 
 class Ended(NamedTuple):

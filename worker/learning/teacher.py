@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from shared_store.volume.checkpoints import Checkpoint
-from worker.distributed import Gang
-from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Student
+from worker.learning.distributed import Gang
 from worker.learning.job import Job, user_errors
 from worker.learning.trained import choose_checkpoint, load_learner
+from worker.settings.errors import UserError
 
 
 def give_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint | None) -> None:

@@ -13,11 +13,11 @@ from shared_store.volume.checkpoints import (
     newest_checkpoint,
 )
 from shared_store.volume.layout import Run
-from worker.errors import UserError
+from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
-    from worker.distributed import Gang
     from worker.learning.algorithm import Policy
+    from worker.learning.distributed import Gang
 
 
 def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpoint:

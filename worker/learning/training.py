@@ -10,8 +10,8 @@ from worker.learning.algorithm import Algorithm
 from worker.learning.job import Job, configure
 
 if TYPE_CHECKING:
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ import numpy as np
 from shared_store import tracks as stored
 from shared_store.volume.files import write_atomic
 from shared_store.volume.layout import Store
-from worker.errors import UserError
 from worker.racer.generator import make_random
 from worker.racer.naming import keep, resolve
 from worker.racer.presets import PRESETS, make_preset
 from worker.racer.route_file import read_file, to_bytes
 from worker.racer.track import Track
+from worker.settings.errors import UserError
 
 Order = dict[str, Any]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.errors import UserError
 from worker.racer.arithmetic import Floats, cross, meetings, nearest_points, norm, segments_of
+from worker.settings.errors import UserError
 
 WAYPOINTS = (20, 5000)
 """Greatest number; the car looks at all of them in every step."""

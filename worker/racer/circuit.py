@@ -12,8 +12,8 @@ from shared_store.contract.error_text import counted
 from worker.racer.arithmetic import Floats
 from worker.racer.geometry import place_at, project
 from worker.racer.track import Track
-from worker.tasks.configs.racer import ObstacleConfig
-from worker.tasks.overrides import Refused
+from worker.settings.overrides import Refused
+from worker.settings.racer import ObstacleConfig
 
 GAP = 40.0
 """Between tracks [m]: a camera as low as the car's sees nothing of the next one."""

@@ -23,8 +23,8 @@ from worker.racer.rewards.parameters import OBJECT_COUNT as COUNT
 from worker.racer.rewards.parameters import TRACK as TRACK_ROW
 from worker.racer.rewards.reward import RewardFunction, checked, compiled_function
 from worker.racer.road import is_open
+from worker.settings.racer import FrontCameraConfig
 from worker.simulation.sensors.sensor import SensorContext
-from worker.tasks.configs.racer import FrontCameraConfig
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView

@@ -17,7 +17,7 @@ from worker.racer.resets import MISHAPS
 from worker.racer.trace import COLUMNS
 
 if TYPE_CHECKING:
-    from worker.tasks.racer import Racer
+    from worker.tasks.library.racer import Racer
 
 SIM_TRACE_COLUMNS = (
     *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done", "all_wheels_on_track"),

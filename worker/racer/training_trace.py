@@ -27,7 +27,7 @@ from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import EpisodeArrays
 
 if TYPE_CHECKING:
-    from worker.tasks.racer import Racer
+    from worker.tasks.library.racer import Racer
 
 wp.set_module_options({"enable_backward": False})
 

@@ -10,12 +10,12 @@ import torch
 import warp as wp
 from newton.sensors import SensorCamera
 
+from worker.settings.camera import CameraConfig
 from worker.simulation.episodes import STEP, EpisodeArrays, numbered_stream
 from worker.simulation.worlds import Worlds
-from worker.tasks.configs.camera import CameraConfig
 
 if TYPE_CHECKING:
-    from worker.tasks.config import Randomization
+    from worker.settings.task import Randomization
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,12 +13,12 @@ import newton
 import torch
 import warp as wp
 
+from worker.settings.task import FACTORS
 from worker.simulation.episodes import STEP, STEPS, EpisodeArrays, numbered_stream, random_stream
 from worker.simulation.worlds import WorldArrays, Worlds
-from worker.tasks.config import FACTORS
 
 if TYPE_CHECKING:
-    from worker.tasks.config import Randomization
+    from worker.settings.task import Randomization
 
 wp.set_module_options({"enable_backward": False})
 

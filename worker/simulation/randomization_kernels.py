@@ -9,11 +9,11 @@ from worker.simulation.episodes import EpisodeArrays, numbered_stream, random_st
 wp.set_module_options({"enable_backward": False})
 
 SCALE, ADD, SET = 0, 1, 2
-"""Operations, in the order of :data:`worker.tasks.randomize.OPERATIONS`."""
+"""Operations, in the order of :data:`worker.simulation.declared_randomization.OPERATIONS`."""
 UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2
-"""Distributions, in the order of :data:`worker.tasks.randomize.DISTRIBUTIONS`."""
+"""Distributions, in the order of :data:`worker.simulation.declared_randomization.DISTRIBUTIONS`."""
 STARTUP, RESET, INTERVAL = 0, 1, 2
-"""Times at which an entry is drawn, in the order of :data:`worker.tasks.randomize.MOMENTS`."""
+"""Times at which an entry is drawn, in the order of :data:`worker.simulation.declared_randomization.MOMENTS`."""
 MASS, CENTER, INERTIA, PAYLOAD = 0, 1, 2, 3
 """Properties of a body that a change can affect."""
 

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 
 from shared_store.contract.error_text import nearest
+from worker.simulation.declared_randomization import Randomize
 from worker.simulation.patterns import find
 from worker.simulation.randomization_kernels import CENTER, INERTIA, MASS, PAYLOAD
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
-from worker.tasks.randomize import Randomize
 
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _FIELDS = {

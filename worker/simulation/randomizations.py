@@ -14,6 +14,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from worker.simulation.declared_randomization import DISTRIBUTIONS, MOMENTS, OPERATIONS, Randomize
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.inverse_weights import InverseWeights
 from worker.simulation.randomization_kernels import (
@@ -31,7 +32,6 @@ from worker.simulation.randomization_targets import Change, Target, body_column,
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
-from worker.tasks.randomize import DISTRIBUTIONS, MOMENTS, OPERATIONS, Randomize
 
 
 @dataclass(frozen=True)

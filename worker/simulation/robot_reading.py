@@ -20,7 +20,7 @@ from newton.solvers import SolverMuJoCo
 
 from shared_store.contract.error_text import counted
 from shared_store.contract.policy import RobotModel
-from worker.accepting import CHANGED_ROBOTS
+from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference, robot_usd, robot_values
 from worker.simulation.carriers import keep_inertias

@@ -13,14 +13,14 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from shared_store.contract.error_text import nearest
-from worker.tasks.mistakes import task_mistakes
+from worker.tasks.run.mistakes import task_mistakes
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 _PUBLIC = {
-    "worker.tasks.config": ("Randomization", "STRICT", "TaskConfig", "reward_weights"),
-    "worker.tasks.declaration": (
+    "worker.settings.task": ("Randomization", "STRICT", "TaskConfig", "reward_weights"),
+    "worker.tasks.declare.declaration": (
         *(
             "Action",
             "Adaptive",
@@ -37,10 +37,10 @@ _PUBLIC = {
         ),
         "Termination",
     ),
-    "worker.tasks.declared": ("DeclaredTask",),
-    "worker.tasks.randomize": ("Randomize",),
-    "worker.tasks.task": ("Task",),
-    "worker.tasks.term_needs": ("needs",),
+    "worker.tasks.run.declared": ("DeclaredTask",),
+    "worker.simulation.declared_randomization": ("Randomize",),
+    "worker.tasks.run.task": ("Task",),
+    "worker.tasks.declare.term_needs": ("needs",),
     "worker.simulation.actuators": (
         *("DCMotorActuator", "EffortActuator", "ExplicitPDActuator", "PositionActuator", "VelocityActuator"),
     ),
@@ -83,17 +83,17 @@ def __dir__() -> list[str]:
 
 
 BUILT_IN = {
-    "Cartpole": "worker.tasks.cartpole:Cartpole",
-    "CartpolePixels": "worker.tasks.cartpole_pixels:CartpolePixels",
-    "Ant": "worker.tasks.ant:Ant",
-    "Humanoid": "worker.tasks.humanoid:Humanoid",
-    "Quadruped": "worker.tasks.quadruped:Quadruped",
-    "Go1Flat": "worker.tasks.go1:Go1Flat",
-    "Go1Rough": "worker.tasks.go1:Go1Rough",
-    "G1Flat": "worker.tasks.g1:G1Flat",
-    "G1Rough": "worker.tasks.g1:G1Rough",
-    "LiftCube": "worker.tasks.lift:LiftCube",
-    "LiftCubes": "worker.tasks.lift_cubes:LiftCubes",
+    "Cartpole": "worker.tasks.library.cartpole:Cartpole",
+    "CartpolePixels": "worker.tasks.library.cartpole_pixels:CartpolePixels",
+    "Ant": "worker.tasks.library.ant:Ant",
+    "Humanoid": "worker.tasks.library.humanoid:Humanoid",
+    "Quadruped": "worker.tasks.library.quadruped:Quadruped",
+    "Go1Flat": "worker.tasks.library.go1:Go1Flat",
+    "Go1Rough": "worker.tasks.library.go1:Go1Rough",
+    "G1Flat": "worker.tasks.library.g1:G1Flat",
+    "G1Rough": "worker.tasks.library.g1:G1Rough",
+    "LiftCube": "worker.tasks.library.lift:LiftCube",
+    "LiftCubes": "worker.tasks.library.lift_cubes:LiftCubes",
 }
 """Tasks found even without the distribution's metadata (a source tree on the path)."""
 
@@ -133,12 +133,12 @@ def find_task(name: str) -> type[Task]:
             f"task {name!r}: there is no module {module_name!r} on the path, nor in {os.getcwd()}"
         ) from error
     found = getattr(module, class_name, None)
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
     if not (isinstance(found, type) and issubclass(found, Task)):
         classes = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module_name]
         there = nearest(class_name, [each.__name__ for each in classes if issubclass(each, Task)])
         raise ValueError(
-            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.task.Task; {there}"
+            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.run.task.Task; {there}"
         )
     return found

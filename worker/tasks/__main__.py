@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from shared_store.contract.error_text import counted
 from worker.tasks import find_task, task_names
-from worker.tasks.images import shown
-from worker.tasks.mistakes import task_mistakes
-from worker.tasks.policy_contract import robots_of
-from worker.tasks.tables import numbers, tables
+from worker.tasks.compile.images import shown
+from worker.tasks.compile.policy_contract import robots_of
+from worker.tasks.compile.tables import numbers, tables
+from worker.tasks.run.mistakes import task_mistakes
 
 if TYPE_CHECKING:
-    from worker.tasks.plan import Plan
-    from worker.tasks.task import Task
+    from worker.tasks.compile.plan import Plan
+    from worker.tasks.run.task import Task
 
 
 def describe(name: str, whole: bool = False) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from worker.tasks import find_task
-from worker.tasks.tables import Row, numbers, tables
+from worker.tasks.compile.tables import Row, numbers, tables
 
 FAMILIES: Mapping[str, tuple[str, ...]] = {
     "Go1 and G1": ("Go1Flat", "Go1Rough", "G1Flat", "G1Rough"),

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from shared_store.volume.files import DamagedFile, read_json, write_json
 from shared_store.volume.layout import Run
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.segment import Segment

@@ -22,7 +22,7 @@ from worker.telemetry.segment import Segment
 from worker.telemetry.tap import Reading, Tap
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 LOOK_SECONDS = 1.0
 """Between two looks for a request."""

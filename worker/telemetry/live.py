@@ -19,7 +19,7 @@ from shared_store.volume.files import read_json
 from shared_store.volume.layout import Run
 from shared_store.volume.log_view import LogView
 from shared_store.volume.metrics import history_of
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.progress import Activity, loading
 from worker.telemetry.recording import Recording

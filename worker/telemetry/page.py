@@ -28,7 +28,7 @@ from types import TracebackType
 from urllib.parse import urlencode, urlsplit
 
 from shared_store.process.tether import tied
-from worker.errors import UserError
+from worker.settings.errors import UserError
 
 LOOPBACK = "127.0.0.1"
 PORTS = range(9090, 9100)

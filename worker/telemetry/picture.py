@@ -19,15 +19,15 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.simulation.camera import look
 from worker.simulation.on_host import numbers
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Reading, Tap
 
 if TYPE_CHECKING:
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
 
 FILMS = (".gif", ".mp4")
 MOMENTS = 6

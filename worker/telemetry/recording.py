@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from shared_store.contract.error_text import counted
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.rows import Rows
 from worker.telemetry.sound import CHANNELS, LIBRARY, with_checksum

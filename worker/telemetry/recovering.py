@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry.recording import CHUNK, PARTIAL, writer_to
 from worker.telemetry.sound import LIBRARY, SoundRecords, with_checksum
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.recording import PARTIAL
 from worker.telemetry.screen import Look

@@ -25,8 +25,8 @@ from worker.telemetry.tap import Reading, Tap
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import Policy
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Rollout:
     def attachments(self) -> dict[str, bytes]:
         """The policy's contract, the policy as ONNX where its algorithm can export it, and the job that trained it."""
         from worker.deploy.model import metadata_of, to_onnx
-        from worker.tasks.policy_contract import policy_contract
+        from worker.tasks.compile.policy_contract import policy_contract
 
         name, files = self.checkpoint.manifest["task"], {}
         try:

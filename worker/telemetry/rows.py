@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 MARKS = ("episode", "age", "done", "time_out", "cause")
 """Whole numbers of a row: how many episodes of the world have ended before this step since the tap began, steps on the clock after the
@@ -34,7 +34,7 @@ class Layout:
         terms: Names of the reward terms.
         control_hz: Control steps of a simulated second.
         images: The observation groups of images that are kept: name, channels (3: red, green and blue; 1), height and width [px].
-        causes: Names of what can end an episode, see :class:`worker.tasks.ended.Ended`.
+        causes: Names of what can end an episode, see :class:`worker.tasks.run.ended.Ended`.
     """
 
     worlds: int

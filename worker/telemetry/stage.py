@@ -21,11 +21,11 @@ from worker.simulation.carriers import is_carrier
 from worker.simulation.on_host import numbers
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
-from worker.tasks.declared import DeclaredTask
+from worker.tasks.run.declared import DeclaredTask
 
 if TYPE_CHECKING:
-    from worker.tasks.config import TaskConfig
-    from worker.tasks.task import Task
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
 
 APART = 3.0
 """Between the origins of two worlds, along y [m]; a viewer shows them side by side."""

@@ -21,7 +21,7 @@ from worker.simulation.worlds import WorldArrays
 from worker.telemetry.rows import MARKS, Layout, Rows
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task
+    from worker.tasks.run.task import Task
 
 wp.set_module_options({"enable_backward": False})
 

@@ -16,8 +16,8 @@ from typing import Any
 
 from shared_store.process.tether import start_tied
 from shared_store.volume.outcomes import EX_TEMPFAIL
-from worker.errors import UserError
 from worker.learning.job import Job
+from worker.settings.errors import UserError
 
 READY_SECONDS = 60.0
 """Time that a training waits for the import of a service's package [s]; then it continues without knowing whether a key exists."""

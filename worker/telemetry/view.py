@@ -27,8 +27,8 @@ from shared_store.volume.layout import Run
 from shared_store.volume.log_view import LogView
 from shared_store.volume.logs import LogLine
 from shared_store.volume.metrics import history_of
-from worker.accepting import CHANGED_ROBOTS
-from worker.errors import UserError
+from worker.settings.accepted_changes import CHANGED_ROBOTS
+from worker.settings.errors import UserError
 from worker.telemetry.page import Page, need_rerun
 from worker.telemetry.progress import Activity, loading
 from worker.telemetry.rows import Rows

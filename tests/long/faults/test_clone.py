@@ -17,11 +17,11 @@ from tests.support.worker.clones import make_clone
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, tensors, train
-from worker.errors import UserError
 from worker.learning.algorithms import installed
 from worker.learning.loop import Loop
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO
+from worker.settings.errors import UserError
 
 SMALL_SAC = {
     **{"steps": 4, "updates": 2, "batch_size": 16, "replay_steps": 32, "warm_up": 4, "n_step": 1},

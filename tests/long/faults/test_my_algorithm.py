@@ -17,8 +17,8 @@ from tests.conftest import REPOSITORY, run_muster
 from tests.support.worker.loop import iterate, mean_return, setting_of
 from tests.support.worker.point_task import Point, PointConfig
 from tests.support.worker.ranks import run_ranks, training
-from worker.errors import UserError
 from worker.learning.algorithms import find_algorithm, settings
+from worker.settings.errors import UserError
 
 SPEC = "job_specs/my-algorithm.yaml"
 OWN = "job_specs.my_algorithm:Mine"
@@ -37,7 +37,7 @@ def test_the_example_is_as_short_as_a_page_or_two() -> None:
 
 def test_it_learns_cartpole_as_it_is_shipped(mine: type) -> None:
     """By the settings of the YAML and as many iterations; the greatest return that there could be is 30."""
-    from worker.tasks.cartpole import Cartpole, CartpoleConfig
+    from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 
     section = yaml.safe_load((REPOSITORY / SPEC).read_text())["train"]
     assert section["task"] == "Cartpole" and section["algorithm"] == OWN
@@ -100,8 +100,8 @@ def one_of_two() -> int:
     """A rank: three iterations on the point task with worlds of its own; what came of it is the last line of its output."""
     import os
 
-    from worker.distributed import Placement, connect
     from worker.learning.algorithm import Share
+    from worker.learning.distributed import Placement, connect
     from worker.learning.randomness import seed_generators
 
     gang = connect(Placement.from_env(os.environ))

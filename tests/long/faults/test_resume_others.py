@@ -21,12 +21,12 @@ from shared_store.volume.layout import Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
-from worker.errors import UserError
 from worker.learning.loop import Loop
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.settings import RslRlConfig
 from worker.learning.sac.sac import SAC
-from worker.learning.sac.settings import SACConfig
+from worker.settings.errors import UserError
+from worker.settings.rsl_rl import RslRlConfig
+from worker.settings.sac import SACConfig
 
 SAC_RUN: dict[str, Any] = {
     **{"steps": 4, "updates": 2, "batch_size": 16, "replay_steps": 32, "warm_up": 4, "n_step": 1},

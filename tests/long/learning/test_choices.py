@@ -17,7 +17,7 @@ from shared_store.volume.metrics import read_metrics
 from tests.conftest import run_muster
 from tests.support.worker.in_process import call_worker
 from tests.support.worker.ranks import training
-from worker.tasks.gym import TaskVectorEnv
+from worker.tasks.run.gym import TaskVectorEnv
 
 TASK = '''
 import dataclasses
@@ -25,7 +25,7 @@ import dataclasses
 import warp as wp
 
 from worker.tasks import Choice, Reward, RobotArrays, WorldArrays, terms
-from worker.tasks.cartpole import Cartpole
+from worker.tasks.library.cartpole import Cartpole
 
 
 @wp.func

@@ -17,8 +17,8 @@ from tests.support.worker.loop import groups
 from tests.support.worker.rsl_loop import GAUSSIAN, Recall, build, evaluate, train
 from tests.support.worker.rsl_loop import GRU as SMALL_GRU
 from worker.learning.rsl.algorithm import RslRl
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.rsl_rl_env import TaskVecEnv, make
+from worker.learning.rsl.environment import TaskVecEnv, make
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 
 torch.set_num_threads(1)
 warp.config.log_level = warp.LOG_WARNING

@@ -9,7 +9,7 @@ import torch
 from tests.support.worker.loop import iterate, mean_return, setting_of
 from tests.support.worker.point_task import Point, PointConfig
 from worker.learning.sac.sac import SAC
-from worker.learning.sac.settings import SACConfig
+from worker.settings.sac import SACConfig
 
 torch.set_num_threads(1)
 
@@ -43,7 +43,7 @@ def test_it_learns_the_point_task() -> None:
 def test_it_learns_cartpole() -> None:
     """960 steps of 64 worlds, 61 440 in all; the greatest return that there could be is 30."""
     # the ranks below, which import this module too, can do without the simulation
-    from worker.tasks.cartpole import Cartpole, CartpoleConfig
+    from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 
     torch.manual_seed(0)
     task, held_out = Cartpole(CartpoleConfig(), 64, seed=0), Cartpole(CartpoleConfig(), 64, seed=99)

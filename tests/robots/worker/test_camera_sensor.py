@@ -14,9 +14,9 @@ import warp as wp
 
 from tests.support.refusals import refusal
 from tests.support.worker.sensing import Reference, scene
+from worker.settings.task import Randomization
 from worker.simulation.sensors.camera import Camera, CameraSensor
 from worker.simulation.sensors.sensor import SensorContext
-from worker.tasks.config import Randomization
 
 torch.set_num_threads(1)
 

@@ -22,22 +22,22 @@ from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from tests.support.worker.seeing import Seeing, SeeingAlone, SeeingConfig, SeeingDepth
 from tests.support.worker.tasks import put
-from worker.errors import UserError
 from worker.export import export
 from worker.learning import algorithms
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
-from worker.learning.ppo.settings import PPOConfig
-from worker.learning.rsl.settings import RslRlConfig
-from worker.learning.sac.settings import SACConfig
+from worker.settings.errors import UserError
+from worker.settings.ppo import PPOConfig
+from worker.settings.rsl_rl import RslRlConfig
+from worker.settings.sac import SACConfig
+from worker.settings.task import Randomization
 from worker.simulation.sensors.camera import CameraSensor
 from worker.simulation.sensors.imu import Imu
 from worker.tasks.__main__ import describe
-from worker.tasks.config import Randomization
-from worker.tasks.declaration import Declaration, Image, Observation
-from worker.tasks.gym import TaskVectorEnv
-from worker.tasks.images import described
-from worker.tasks.tables import tables
+from worker.tasks.compile.images import described
+from worker.tasks.compile.tables import tables
+from worker.tasks.declare.declaration import Declaration, Image, Observation
+from worker.tasks.run.gym import TaskVectorEnv
 
 torch.set_num_threads(1)
 NAME = "tests.support.worker.seeing:Seeing"

@@ -11,7 +11,7 @@ from benchmarks.peers.conversion import PlainPolicy
 from benchmarks.peers.judging import COMMAND, VelocityErrors, judge
 from tests.support.worker.walkers import Twin, plain
 from worker.tasks import find_task
-from worker.tasks.velocity import Velocity
+from worker.tasks.library.velocity import Velocity
 
 WORLDS, STEPS = 3, 8
 FEET = [[f"{leg}_foot_collision"] for leg in ("FR", "FL", "RR", "RL")]

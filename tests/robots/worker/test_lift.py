@@ -14,11 +14,11 @@ from tests.support.refusals import refusal
 from tests.support.worker.lift_reference import GAINS, HOME, TIPS, reference, stiffness, to_mujoco, touching_pairs
 from tests.support.worker.robots import needs_mjlab
 from tests.support.worker.tasks import observe, play, played_twice, plays_like_its_part, put, same, statistics
-from worker.errors import UserError
 from worker.learning.job import configure
+from worker.settings.errors import UserError
+from worker.settings.lift import LiftCubeConfig
 from worker.tasks import find_task
-from worker.tasks.configs.lift import LiftCubeConfig
-from worker.tasks.lift import LiftCube
+from worker.tasks.library.lift import LiftCube
 
 pytestmark = needs_mjlab
 WORLDS = 4

@@ -15,12 +15,12 @@ from tests.support.refusals import refusal
 from tests.support.worker.lift_reference import HOME, reference, to_mujoco
 from tests.support.worker.robots import needs_mjlab
 from tests.support.worker.tasks import observe, play, played_twice, plays_like_its_part, put, same, statistics
-from worker.errors import UserError
 from worker.learning.job import configure
+from worker.settings.errors import UserError
+from worker.settings.lift import LiftCubesConfig
 from worker.simulation.objects import Box
 from worker.tasks import ObjectSelection, find_task
-from worker.tasks.configs.lift import LiftCubesConfig
-from worker.tasks.lift_cubes import LiftCubes
+from worker.tasks.library.lift_cubes import LiftCubes
 
 pytestmark = needs_mjlab
 WORLDS = 3

@@ -17,9 +17,9 @@ from tests.support.worker.page_tasks import blocks, module
 from tests.support.worker.robots import need_mjlab
 from tests.support.worker.tasks import observe, put
 from worker.learning.job import configure
+from worker.settings.velocity import Go1FlatConfig
 from worker.tasks import find_task
-from worker.tasks.configs.velocity import Go1FlatConfig
-from worker.tasks.declared import DeclaredTask
+from worker.tasks.run.declared import DeclaredTask
 from worker.tasks.settings_page import sketch
 
 SIZES = re.compile(r"(\d+) observations, (\d+) actions?")

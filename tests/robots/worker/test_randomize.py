@@ -16,11 +16,11 @@ from tests.support.refusals import refusal
 from tests.support.worker.randomized_worlds import CONTROL_HZ, build_arm, build_episodes, build_worlds, randomize
 from worker.simulation.actuators import EffortActuator
 from worker.simulation.capture import CapturedStep
+from worker.simulation.declared_randomization import Randomize
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot import Robot
 from worker.simulation.worlds import Worlds
-from worker.tasks.randomize import Randomize
 
 MIXED = {
     "mass": Randomize("mass", bodies="*", range=(0.5, 2.0), distribution="log_uniform"),

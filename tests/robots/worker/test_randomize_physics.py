@@ -10,10 +10,10 @@ import pytest
 
 from tests.support.worker.randomized_worlds import ARM, TIMESTEP, WORLDS, build_arm, build_worlds, randomize
 from worker.simulation.actuators import ExplicitPDActuator
+from worker.simulation.declared_randomization import Randomize
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot import Robot
 from worker.simulation.worlds import Worlds
-from worker.tasks.randomize import Randomize
 
 PAYLOAD_AT = "0.1 0.05 0.02"
 SLED = """<mujoco><worldbody><body name="sled" pos="0 0 0.02"><freejoint/>

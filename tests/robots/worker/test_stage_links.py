@@ -5,9 +5,9 @@ from __future__ import annotations
 import newton
 import numpy as np
 
+from worker.settings.task import TaskConfig
 from worker.simulation.robot import Robot
-from worker.tasks.config import TaskConfig
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 from worker.telemetry.picture import Camera
 from worker.telemetry.stage import Stage
 

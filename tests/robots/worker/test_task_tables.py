@@ -14,7 +14,7 @@ from orchestrator.cli.terminal import Console
 from tests.support.worker.robots import needs_mjlab
 from worker.tasks import BUILT_IN, find_task
 from worker.tasks.__main__ import describe
-from worker.tasks.declaration import Image
+from worker.tasks.declare.declaration import Image
 
 pytestmark = needs_mjlab
 DECLARED = sorted({*BUILT_IN} - {"CartpolePixels"})

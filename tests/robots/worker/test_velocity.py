@@ -16,11 +16,11 @@ from tests.support.refusals import refusal
 from tests.support.worker.tasks import play, put, same
 from tests.support.worker.terms_rig import matrix
 from tests.support.worker.walkers import Twin, plain
+from worker.settings.overrides import Refused
+from worker.settings.velocity import Go1FlatConfig, range_at, widest
 from worker.simulation.terrain import Terrain
 from worker.tasks import find_task
-from worker.tasks.configs.velocity import Go1FlatConfig, range_at, widest
-from worker.tasks.overrides import Refused
-from worker.tasks.velocity import Velocity
+from worker.tasks.library.velocity import Velocity
 
 WORLDS = 6
 FEET = {

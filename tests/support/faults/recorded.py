@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from worker.tasks.cartpole import Cartpole
+from worker.tasks.library.cartpole import Cartpole
 
 
 class Recorded(Cartpole):

@@ -26,8 +26,8 @@ def compile_for(name: str) -> None:
     """The kernels of one task, and of all algorithms."""
     import warp
 
-    from worker.distributed import Gang, Placement, warm_marker
     from worker.learning.algorithms import find_algorithm, installed
+    from worker.learning.distributed import Gang, Placement, warm_marker
     from worker.learning.setup import load_kernels
     from worker.tasks import find_task
 

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 import warp as wp
 
+from worker.settings.cartpole import CartpoleConfig
+from worker.settings.task import reward_weights
 from worker.tasks import Declaration, Observation, Reward, RobotArrays, WorldArrays, terms
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.config import reward_weights
-from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.library.cartpole import Cartpole
 
 
 @wp.func

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.support.worker.broken_task import Rooted
+from worker.settings.cartpole import CartpoleConfig
 from worker.simulation.robot import Robot
-from worker.tasks.configs.cartpole import CartpoleConfig
 
 TASK = f"{__name__}:Changing"
 

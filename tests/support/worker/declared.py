@@ -9,6 +9,7 @@ from typing import Any
 import torch
 import warp as wp
 
+from worker.settings.task import TaskConfig
 from worker.tasks import (
     Action,
     Adaptive,
@@ -28,8 +29,7 @@ from worker.tasks import (
     reward_weights,
     terms,
 )
-from worker.tasks.config import TaskConfig
-from worker.tasks.declared import DeclaredTask
+from worker.tasks.run.declared import DeclaredTask
 
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody><body name="near" pos="0 0 1">
   <joint name="first" type="slide" axis="1 0 0" range="-2 2"/>

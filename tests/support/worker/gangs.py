@@ -23,8 +23,8 @@ from tests.support.waiting import PATIENCE
 from tests.support.worker.collectives import watching
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import run_ranks
-from worker import distributed
-from worker.distributed import Gang, Placement
+from worker.learning import distributed
+from worker.learning.distributed import Gang, Placement
 from worker.learning.randomness import seed_generators
 
 Case = Callable[[Gang, Path], Any]
@@ -89,7 +89,7 @@ def digest(state: Any) -> str:
 def given(gang: Gang, env: dict[str, str]) -> Iterator[None]:
     """``worker``'s commands have ``env``, find the point task, and are in ``gang``, which they do not close."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("worker.distributed.connect", lambda *_, **__: gang)
+        patch.setattr("worker.learning.distributed.connect", lambda *_, **__: gang)
         patch.setattr("worker.tasks.find_task", lambda _: Point)
         patch.setattr(gang, "close", lambda: None)
         for name, value in env.items():

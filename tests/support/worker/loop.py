@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces, Transition
+from worker.learning.distributed import Gang, Placement
 
 
 def alone(device: str = "cpu") -> Gang:

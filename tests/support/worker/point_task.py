@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from worker.learning.ppo.settings import PPOConfig
-from worker.tasks.config import Randomization
-from worker.tasks.telling import Telling
+from worker.settings.ppo import PPOConfig
+from worker.settings.task import Randomization
+from worker.tasks.run.telling import Telling
 
 
 @dataclass(frozen=True)

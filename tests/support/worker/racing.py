@@ -9,8 +9,8 @@ import torch
 
 from worker.racer.presets import make_preset
 from worker.racer.track import Track
-from worker.tasks.configs.racer import RacerConfig
-from worker.tasks.racer import Racer
+from worker.settings.racer import RacerConfig
+from worker.tasks.library.racer import Racer
 
 OVAL = make_preset("oval")
 

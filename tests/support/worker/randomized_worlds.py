@@ -8,13 +8,13 @@ import numpy as np
 import warp as wp
 
 from tests.support.worker.sensing import template_of
+from worker.simulation.declared_randomization import Randomize
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot import Robot
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
-from worker.tasks.randomize import Randomize
 
 WORLDS, TIMESTEP = 2, 0.004
 ARM = """<mujoco><compiler angle="radian"/><default><geom contype="0" conaffinity="0"/></default><worldbody>

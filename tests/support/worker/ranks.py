@@ -81,8 +81,8 @@ def training(store: Path, *, epoch: int = 1, run: str = "run", **train: Any) -> 
 def train() -> int:
     """What ``worker.train`` does, with the test double as the task."""
     from tests.support.worker.point_task import TASK
-    from worker.distributed import Placement, connect, use_cpu_threads
     from worker.learning import leaving
+    from worker.learning.distributed import Placement, connect, use_cpu_threads
     from worker.learning.job import Job, StopRequest
     from worker.learning.loop import Loop
     from worker.learning.training import Training

@@ -14,13 +14,13 @@ from torch import nn
 
 from tests.support.worker.loop import groups, setting_of, transition_of
 from tests.support.worker.point_task import Point, PointConfig
-from worker.distributed import Gang
 from worker.learning import algorithms
 from worker.learning.algorithm import Share
+from worker.learning.distributed import Gang
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.settings import RslRlConfig
-from worker.tasks.config import TaskConfig
+from worker.settings.rsl_rl import RslRlConfig
+from worker.settings.task import TaskConfig
 
 GAUSSIAN = {"class_name": "GaussianDistribution"}
 GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "hidden_dims": [8], "obs_normalization": True}

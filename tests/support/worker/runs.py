@@ -12,7 +12,7 @@ from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.layout import Store
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import TASK
-from worker.distributed import Gang
+from worker.learning.distributed import Gang
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.training import Training

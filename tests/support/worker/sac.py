@@ -9,10 +9,10 @@ import torch
 
 from tests.support.worker.loop import setting_of
 from tests.support.worker.point_task import Point, PointConfig
-from worker.distributed import Gang
 from worker.learning.algorithm import Share
+from worker.learning.distributed import Gang
 from worker.learning.sac.sac import SAC
-from worker.learning.sac.settings import SACConfig
+from worker.settings.sac import SACConfig
 
 SMALL = SACConfig(
     steps=4,

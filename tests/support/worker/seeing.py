@@ -9,17 +9,17 @@ from typing import Any, ClassVar
 import warp as wp
 from pydantic.dataclasses import dataclass
 
-from worker.learning.ppo.settings import PPOConfig
-from worker.learning.rsl.settings import RslRlConfig
+from worker.settings.ppo import PPOConfig
+from worker.settings.rsl_rl import RslRlConfig
+from worker.settings.task import STRICT, TaskConfig, reward_weights
 from worker.simulation.objects import Box
 from worker.simulation.robot import Robot
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.camera import CameraArrays, CameraSensor
 from worker.simulation.worlds import WorldArrays
 from worker.tasks import terms
-from worker.tasks.config import STRICT, TaskConfig, reward_weights
-from worker.tasks.declaration import Action, Declaration, Event, Image, Observation, Reward
-from worker.tasks.declared import DeclaredTask
+from worker.tasks.declare.declaration import Action, Declaration, Event, Image, Observation, Reward
+from worker.tasks.run.declared import DeclaredTask
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from worker.simulation.episodes import STEP
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 
 def put(task: Task, **rows: list[Any]) -> None:

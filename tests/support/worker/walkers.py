@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.support.worker.robots import need_mjlab, reference
 from worker.tasks import find_task
-from worker.tasks.velocity import Velocity
+from worker.tasks.library.velocity import Velocity
 
 SUBSTEPS, PHYSICS, CONTROL = 4, 0.005, 0.02
 """Physics steps of a control step, and the lengths of both [s]."""

@@ -21,9 +21,9 @@ from tests.support.refusals import refusal
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from tests.support.worker.trained import run_in
-from worker.errors import UserError
 from worker.learning.loop import Loop
 from worker.learning.trained import load_learner
+from worker.settings.errors import UserError
 
 
 class Payload:

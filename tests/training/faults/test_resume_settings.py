@@ -16,12 +16,12 @@ from shared_store.volume.layout import Store
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, runner, train
-from worker.errors import UserError
 from worker.learning import algorithms
 from worker.learning.job import configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.errors import UserError
+from worker.settings.ppo import PPOConfig
 
 
 @pytest.fixture(scope="module")

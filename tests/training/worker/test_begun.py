@@ -13,7 +13,7 @@ from shared_store.volume.layout import Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 
 THEN = {**PPOConfig.before, "init_std": 0.05}
 """With so small a deviation today's floor would be seen at once."""

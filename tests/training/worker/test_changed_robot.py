@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-import worker.tasks.cartpole
+import worker.tasks.library.cartpole
 from shared_store.volume import models
 from shared_store.volume.bundles import REPORT, read_contract
 from shared_store.volume.checkpoints import list_checkpoints
@@ -20,7 +20,7 @@ from tests.support.worker.in_process import call_worker
 from tests.support.worker.ranks import placement, training
 from tests.support.worker.runs import runner, train
 from worker import export, repeat_incident
-from worker.errors import TrainingError, UserError
+from worker.settings.errors import TrainingError, UserError
 from worker.telemetry.view import Policy
 
 CHANGE = (
@@ -34,7 +34,7 @@ ACCEPT = "; to go on all the same, add --accept-changed-robot (accept_changed_ro
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "cart.xml"
-    path.write_text(Path(worker.tasks.cartpole.__file__).with_name("cartpole.xml").read_text())
+    path.write_text(Path(worker.tasks.library.cartpole.__file__).with_name("cartpole.xml").read_text())
     monkeypatch.setattr(Changing, "file", path, raising=False)
     return path
 

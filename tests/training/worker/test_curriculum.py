@@ -12,12 +12,12 @@ from tests.support.refusals import refusal
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
 from tests.support.worker.tasks import observe, put
-from worker.errors import UserError
 from worker.learning.job import configure
-from worker.tasks.ant import Ant
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import value_at
-from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+from worker.settings.errors import UserError
+from worker.settings.task import value_at
+from worker.tasks.library.ant import Ant
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.library.quadruped import Quadruped, QuadrupedConfig
 
 
 def test_between_its_points_a_value_changes_in_proportion() -> None:

@@ -20,10 +20,10 @@ from tests.conftest import PATIENCE
 from tests.support.worker.loop import iterate, setting_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
-from worker.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
-from worker.errors import GangError
 from worker.learning.algorithm import Share
+from worker.learning.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
 from worker.learning.ppo.fused import PPO
+from worker.settings.errors import GangError
 
 WORLDS = 7  # two ranks get 3 and 4
 
@@ -151,7 +151,7 @@ def test_ranks_that_torchrun_starts_meet_at_its_store(tmp_path: Path) -> None:
     script = tmp_path / "ranks.py"
     script.write_text(
         "import os, torch\n"
-        "from worker.distributed import Placement, connect\n"
+        "from worker.learning.distributed import Placement, connect\n"
         "gang = connect(Placement.from_env(os.environ), device='cpu')\n"
         "total = gang.sum(torch.tensor([gang.rank + 1.0])).item()\n"
         # one write each: two ranks share this pipe

@@ -22,9 +22,9 @@ from tests.support.worker.point_task import Point, PointConfig, PointPPO, Trippi
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from tests.support.worker.sac import make
-from worker.distributed import Gang
 from worker.evaluation.episodes import play
 from worker.learning.algorithm import Share
+from worker.learning.distributed import Gang
 from worker.learning.job import Job, StopRequest
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO

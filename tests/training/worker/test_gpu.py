@@ -14,9 +14,9 @@ from torch import nn
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.host_copies import HostCopies
 from worker.learning.ppo import linear
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.configs.cartpole import CartpoleConfig
-from worker.tasks.task import Task
+from worker.settings.cartpole import CartpoleConfig
+from worker.tasks.library.cartpole import Cartpole
+from worker.tasks.run.task import Task
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 

@@ -16,9 +16,9 @@ from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner
 from tests.support.worker.tasks import put, statistics
 from worker import repeat_incident
-from worker.errors import TrainingError
 from worker.learning.loop import Loop
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.settings.errors import TrainingError
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 
 STILL = torch.zeros(4, 1)
 

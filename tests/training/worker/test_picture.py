@@ -9,8 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.settings.cartpole import CartpoleConfig
+from worker.tasks.library.cartpole import Cartpole
 from worker.telemetry.picture import Camera, Glance, encode, pace, strip
 from worker.telemetry.stage import Stage
 

@@ -14,11 +14,11 @@ from tests.support.refusals import refusal
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from tests.support.worker.tasks import put
-from worker.errors import UserError
 from worker.export import export
 from worker.learning.job import configure
 from worker.learning.loop import Loop
-from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
+from worker.settings.errors import UserError
+from worker.tasks.library.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
 
 torch.set_num_threads(1)
 SKY = torch.tensor([0x90, 0xB0, 0xD0], dtype=torch.uint8)

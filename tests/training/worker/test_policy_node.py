@@ -30,17 +30,17 @@ from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
 from tests.support.worker.loop import setting_of
 from worker.deploy import bundle
 from worker.deploy.simulated_robot import SimulatedRobot, open_robot, play
-from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.algorithms import find_algorithm
 from worker.learning.setup import spaces_of
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.cartpole_pixels import CartpolePixels
-from worker.tasks.configs.cartpole import CartpolePixelsConfig
-from worker.tasks.configs.racer import FrontCameraConfig, RacerPixelsConfig
-from worker.tasks.policy_contract import policy_contract
-from worker.tasks.racer import RacerPixels
-from worker.tasks.task import Task
+from worker.settings.cartpole import CartpolePixelsConfig
+from worker.settings.errors import UserError
+from worker.settings.racer import FrontCameraConfig, RacerPixelsConfig
+from worker.tasks.compile.policy_contract import policy_contract
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.library.cartpole_pixels import CartpolePixels
+from worker.tasks.library.racer import RacerPixels
+from worker.tasks.run.task import Task
 
 SECONDS, EPISODES, SEED = 2.0, 3, 11
 GAINS = (1.0, 10.0, 1.5, 2.0)
@@ -158,7 +158,7 @@ def test_the_node_sees_a_camera_s_images_as_the_task_does() -> None:
 def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import worker.tasks.policy_contract as contracts
+    import worker.tasks.compile.policy_contract as contracts
     from shared_store.volume.bundles import read_contract
 
     assert isinstance(open_robot(exported, Messages()), SimulatedRobot)

@@ -11,12 +11,12 @@ import warp as wp
 
 from tests.support.refusals import refusal
 from tests.support.worker.tasks import observe, play, put, same
-from worker.errors import UserError
 from worker.learning.job import configure
-from worker.tasks.ant import Ant, AntConfig
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import FACTORS, Randomization
-from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+from worker.settings.errors import UserError
+from worker.settings.task import FACTORS, Randomization
+from worker.tasks.library.ant import Ant, AntConfig
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.library.quadruped import Quadruped, QuadrupedConfig
 
 ALL = Randomization(mass=(0.5, 2.0), friction=(0.5, 1.25), damping=(0.5, 3.0), gains=(0.8, 1.2), gravity=(0.9, 1.1))
 POSE = [0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0, *[0.0, 0.8, -1.6] * 4]

@@ -18,8 +18,8 @@ from PIL import Image
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Run
 from worker.learning.reporter import Gate
-from worker.tasks.cartpole_pixels import CartpolePixels
-from worker.tasks.overrides import configured
+from worker.settings.overrides import configured
+from worker.tasks.library.cartpole_pixels import CartpolePixels
 from worker.telemetry.attending import Attending
 from worker.telemetry.live import record
 from worker.telemetry.progress import Activity

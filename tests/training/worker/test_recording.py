@@ -23,9 +23,9 @@ from PIL import Image
 
 from tests.support.waiting import wait_for
 from tests.support.worker.in_process import call_worker
-from worker.errors import UserError
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.settings.cartpole import CartpoleConfig
+from worker.settings.errors import UserError
+from worker.tasks.library.cartpole import Cartpole
 from worker.telemetry.live import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
@@ -149,7 +149,7 @@ def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached
     rewards = sum(float(rows.rewards[0, 0]) for rows in recorded.rows[:12])
     assert float(episodes[0]["return"]) == pytest.approx(rewards, rel=1e-5)
     assert attached["job.json"] == b"{}"
-    assert attached["robot.xml"] == (REPOSITORY / "worker/tasks/cartpole.xml").read_bytes()
+    assert attached["robot.xml"] == (REPOSITORY / "worker/tasks/library/cartpole.xml").read_bytes()
 
 
 def test_an_episode_of_which_the_beginning_was_not_seen_is_not_complete(recorded: Recorded, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from tests.support.worker.in_process import call_worker
 from tests.training.worker.test_recording import Recorded
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry.live import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
@@ -271,7 +271,7 @@ def test_the_view_shows_what_is_left_of_a_damaged_file(whole: Path, tmp_path: Pa
 
 
 def test_a_recovered_file_of_a_whole_one_is_not_made_and_meshes_take_space_once(whole: Path, tmp_path: Path) -> None:
-    from worker.tasks.go1 import Go1Flat
+    from worker.tasks.library.go1 import Go1Flat
     from worker.telemetry.stage import Stage
 
     sizes = []

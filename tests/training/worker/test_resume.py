@@ -13,7 +13,7 @@ import torch
 from tests.conftest import PATIENCE
 from tests.support.worker.tasks import play, same
 from worker.tasks import BUILT_IN, find_task
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 torch.set_num_threads(1)
 REPOSITORY = Path(__file__).parents[3]

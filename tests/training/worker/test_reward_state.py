@@ -16,11 +16,11 @@ from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner
-from worker.errors import UserError
 from worker.racer.rewards import guard, workers
 from worker.racer.rewards.parameters import TRACK
 from worker.racer.rewards.problems import RewardFailed
-from worker.tasks.racer import Racer
+from worker.settings.errors import UserError
+from worker.tasks.library.racer import Racer
 
 WORLDS = 4
 USE = "def reward_function(params):\n    now = params['x'] + 0.01 * params['steps']\n"

@@ -25,13 +25,13 @@ from tests.support.worker.in_process import call_worker
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import run_ranks, training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
-from worker.distributed import Placement
-from worker.errors import GangError, TrainingError, UserError
 from worker.learning import algorithms
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.distributed import Placement
 from worker.learning.job import StopRequest, configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
+from worker.settings.errors import GangError, TrainingError, UserError
 from worker.tasks import Adaptive
 
 
@@ -61,7 +61,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
 
 def resume_in_a_gang() -> int:
     """Body of a rank: a straight run and a stopped and resumed one, in one gang."""
-    from worker.distributed import connect
+    from worker.learning.distributed import connect
 
     torch.set_num_threads(1)
     gang = connect(Placement.from_env(os.environ))
@@ -303,7 +303,7 @@ def meet_nobody() -> int:
 
 @pytest.mark.parametrize(
     ("body", "kind", "cause"),
-    [(break_down, "ValueError", ""), (diverge, "worker.errors.TrainingError", "its physics")],
+    [(break_down, "ValueError", ""), (diverge, "worker.settings.errors.TrainingError", "its physics")],
 )
 def test_the_supervisor_hears_of_the_fault_that_another_attempt_would_meet(
     tmp_path: Path, body: Callable[[], int], kind: str, cause: str

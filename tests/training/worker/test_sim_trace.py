@@ -26,9 +26,9 @@ from worker.learning.trained import load_policies
 from worker.racer.presets import make_preset
 from worker.racer.sim_trace import SIM_TRACE_COLUMNS
 from worker.racer.training_trace import CARS as MOST_CARS
-from worker.tasks.configs.racer import RacerConfig
-from worker.tasks.overrides import configured
-from worker.tasks.racer import Racer
+from worker.settings.overrides import configured
+from worker.settings.racer import RacerConfig
+from worker.tasks.library.racer import Racer
 
 CARS, STEPS = 4, 24
 SPACE = {"steering_angle": {"low": -30.0, "high": 30.0}, "speed": {"low": 0.5, "high": 2.0}}

@@ -16,8 +16,8 @@ from shared_store.volume.files import read_json, write_json
 from shared_store.volume.layout import Run
 from tests.support.waiting import wait_for
 from worker.learning.reporter import Gate
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.settings.cartpole import CartpoleConfig
+from worker.tasks.library.cartpole import Cartpole
 from worker.telemetry.asking import answer_of, request_of
 from worker.telemetry.attending import Attending
 from worker.telemetry.rows import MARKS, Layout, Rows

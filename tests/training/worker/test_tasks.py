@@ -11,16 +11,16 @@ import pytest
 import torch
 import warp as wp
 
-import worker.tasks.cartpole as cartpole_module
+import worker.tasks.library.cartpole as cartpole_module
 from tests.support.worker.tasks import observe, play, put, same, statistics
+from worker.settings.task import TaskConfig
 from worker.simulation.episodes import STEP
 from worker.tasks import find_task
-from worker.tasks.ant import Ant, AntConfig
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import TaskConfig
-from worker.tasks.humanoid import Humanoid, HumanoidConfig
-from worker.tasks.quadruped import Quadruped
-from worker.tasks.task import Task
+from worker.tasks.library.ant import Ant, AntConfig
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.library.humanoid import Humanoid, HumanoidConfig
+from worker.tasks.library.quadruped import Quadruped
+from worker.tasks.run.task import Task
 
 torch.set_num_threads(1)
 
@@ -228,13 +228,13 @@ def test_random_humanoids_fall_and_stay_finite_within_the_solvers_capacity() -> 
 
 
 def test_tasks_are_found_by_name_or_refused_with_the_nearest() -> None:
-    assert find_task("Cartpole") is Cartpole and find_task("worker.tasks.ant:Ant") is Ant
+    assert find_task("Cartpole") is Cartpole and find_task("worker.tasks.library.ant:Ant") is Ant
     with pytest.raises(ValueError, match="no task is called 'cartpol'; did you mean Cartpole"):
         find_task("cartpol")
     with pytest.raises(ValueError, match="no module 'nowhere'"):
         find_task("nowhere:Thing")
     with pytest.raises(ValueError, match="no class 'Cat'"):
-        find_task("worker.tasks.ant:Cat")
+        find_task("worker.tasks.library.ant:Cat")
 
 
 @pytest.mark.parametrize(

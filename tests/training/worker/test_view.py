@@ -17,7 +17,7 @@ from PIL import Image
 
 from tests.support.refusals import refusal
 from tests.training.worker.test_recording import STEPS, Recorded
-from worker.errors import UserError
+from worker.settings.errors import UserError
 from worker.telemetry.page import Page
 from worker.telemetry.replay import Replay
 from worker.telemetry.screen import Screen

@@ -19,8 +19,6 @@ from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import Point, PointConfig
-from worker.distributed import Gang
-from worker.errors import UserError
 from worker.learning import algorithms
 from worker.learning.algorithm import Share
 from worker.learning.algorithms import (
@@ -32,11 +30,13 @@ from worker.learning.algorithms import (
     installed,
     settings,
 )
+from worker.learning.distributed import Gang
 from worker.learning.job import Job
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo import draws, objective
 from worker.learning.sac import kernels
 from worker.learning.setup import build_algorithm, load_kernels
+from worker.settings.errors import UserError
 
 HERE = "tests.unit.worker.test_algorithms"
 
@@ -195,7 +195,7 @@ def test_an_uninstalled_source_tree_has_its_own_algorithms(monkeypatch: pytest.M
 
 def test_settings_and_the_check_of_a_reward_function_import_neither_torch_nor_warp() -> None:
     code = (
-        "import sys, worker.learning.ppo.settings, worker.learning.sac.settings, worker.learning.rsl.settings, "
+        "import sys, worker.settings.ppo, worker.settings.sac, worker.settings.rsl_rl, "
         "worker.racer.rewards.__main__; print(*sys.modules)"
     )
     command = [sys.executable, "-c", code]

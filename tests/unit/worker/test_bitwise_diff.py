@@ -18,8 +18,8 @@ from shared_store.volume.metrics import read_metrics
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
 from worker import bitwise_diff
-from worker.errors import UserError
 from worker.learning.shards import Shards
+from worker.settings.errors import UserError
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ import torch.distributed as dist
 
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
-from worker.distributed import Gang, Placement
-from worker.errors import UserError
+from worker.learning.distributed import Gang, Placement
 from worker.learning.job import Job
 from worker.learning.teacher import give_teacher
 from worker.learning.trained import choose_checkpoint
+from worker.settings.errors import UserError
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import warp as wp
 
 from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
 from tests.support.worker.tasks import observe, play, put, same, statistics
-from worker.tasks.adapting import adaptive_steps, begin_evaluation
+from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
 
 WORLDS = 6
 

@@ -12,6 +12,7 @@ import warp as wp
 from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from tests.support.refusals import refusal
 from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, far_away, kick, target
+from worker.simulation.declared_randomization import Randomize
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.terrain import Terrain
 from worker.tasks import (
@@ -27,7 +28,6 @@ from worker.tasks import (
     WorldArrays,
     terms,
 )
-from worker.tasks.randomize import Randomize
 
 
 def refused(config: SlidersConfig | None = None, *, beside: Mapping[str, Any] = {}, **changed: Any) -> str:

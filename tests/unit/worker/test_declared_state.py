@@ -25,7 +25,7 @@ from worker.tasks import (
     WorldArrays,
     terms,
 )
-from worker.tasks.functions import reads_poses
+from worker.tasks.declare.functions import reads_poses
 
 
 @wp.func

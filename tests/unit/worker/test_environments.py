@@ -13,17 +13,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from tests.support.worker.rsl_loop import Seen
+from worker.learning.rsl.environment import TaskVecEnv
+from worker.settings.cartpole import CartpoleConfig
 from worker.tasks import BUILT_IN
-from worker.tasks.configs.cartpole import CartpoleConfig
-from worker.tasks.gym import TaskVectorEnv
-from worker.tasks.rsl_rl_env import TaskVecEnv
+from worker.tasks.run.gym import TaskVectorEnv
 
 WORLDS = 8
 
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[VectorEnv]:
-    made = gymnasium.make_vec("worker.tasks.gym:Muster/Cartpole-v0", num_envs=WORLDS, episode_seconds=0.5)
+    made = gymnasium.make_vec("worker.tasks.run.gym:Muster/Cartpole-v0", num_envs=WORLDS, episode_seconds=0.5)
     yield made
     made.close()
 
@@ -134,7 +134,7 @@ def test_gymnasiums_own_wrappers_work(env: VectorEnv) -> None:
 
 def test_every_built_in_task_has_its_id() -> None:
     assert {f"Muster/{name}-v0" for name in BUILT_IN} <= set(gymnasium.registry)
-    made = gymnasium.make_vec("worker.tasks.gym:Muster/Quadruped-v0", num_envs=3, randomize={"mass": [0.5, 2.0]})
+    made = gymnasium.make_vec("worker.tasks.run.gym:Muster/Quadruped-v0", num_envs=3, randomize={"mass": [0.5, 2.0]})
     observations, _ = made.reset(seed=1)
     assert observations.shape == (3, 48) and made.action_space.shape == (3, 12)
     assert made.metadata["render_fps"] == 50.0

@@ -27,11 +27,11 @@ from worker.evaluation.evaluation import best_words, result_of
 from worker.evaluation.statistics import Sample, difference, share
 from worker.evaluation.table import write_table
 from worker.learning.randomness import held_out_seed
+from worker.settings.cartpole import CartpoleConfig
 from worker.tasks import terms
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.configs.cartpole import CartpoleConfig
-from worker.tasks.declaration import Declaration, Metric
-from worker.tasks.ended import Ended
+from worker.tasks.declare.declaration import Declaration, Metric
+from worker.tasks.library.cartpole import Cartpole
+from worker.tasks.run.ended import Ended
 
 GANG = alone()
 

@@ -29,14 +29,14 @@ from worker.deploy.leapp_description import leapp_description
 from worker.deploy.model import OnnxPolicy, metadata_of, to_onnx
 from worker.deploy.parity import Recording
 from worker.deploy.rollouts import judge
-from worker.errors import TrainingError, UserError
 from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
-from worker.tasks.ant import Ant
-from worker.tasks.cartpole import Cartpole
-from worker.tasks.go1 import Go1Flat
-from worker.tasks.policy_contract import policy_contract
+from worker.settings.errors import TrainingError, UserError
+from worker.tasks.compile.policy_contract import policy_contract
+from worker.tasks.library.ant import Ant
+from worker.tasks.library.cartpole import Cartpole
+from worker.tasks.library.go1 import Go1Flat
 
 torch.set_num_threads(1)
 FACTS = {"task": "Point", "algorithm": "mine:Mine", "policy": {"groups": {"policy": [2]}, "action_size": 2}}

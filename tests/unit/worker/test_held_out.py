@@ -20,7 +20,7 @@ from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.state import Progress
 from worker.learning.training import Training
-from worker.tasks.cartpole import Cartpole
+from worker.tasks.library.cartpole import Cartpole
 
 
 def scores(iterations: list[tuple[int, float]], **settings: int) -> list[float | None]:

@@ -11,15 +11,15 @@ import torch
 import warp as wp
 
 from tests.support.worker.tasks import observe, put
-from worker.errors import UserError
 from worker.learning.job import configure
 from worker.learning.setup import describe
 from worker.learning.training import Training
+from worker.settings.errors import UserError
 from worker.tasks import BUILT_IN, find_task
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.declared import DeclaredTask
-from worker.tasks.interface import Interface
-from worker.tasks.task import Task
+from worker.tasks.declare.interface import Interface
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 WORLDS = 4
 QUIET = {"start_angle_noise": 0.0, "start_velocity_noise": 0.0}

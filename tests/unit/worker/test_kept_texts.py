@@ -12,10 +12,10 @@ from shared_store.volume import texts
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import digest_of
 from tests.support.refusals import refusal
-from worker.errors import UserError
 from worker.learning.job import Job
 from worker.racer.rewards.kept import RewardFile, reward_file
-from worker.tasks.overrides import Refused
+from worker.settings.errors import UserError
+from worker.settings.overrides import Refused
 
 TEXT = "def reward_function(params):\n    return 1.0\n"
 REFERENCE = {"file": "mine.py", "sha256": digest_of(TEXT)}

@@ -13,14 +13,14 @@ import torch
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import TASK as POINT
 from tests.support.worker.point_task import PointConfig
-from worker.errors import UserError, is_out_of_memory
 from worker.learning import memory
 from worker.learning.algorithms import find_algorithm
 from worker.learning.ppo.fused import PPO
-from worker.learning.rsl.settings import RslRlConfig
-from worker.learning.sac.settings import SACConfig
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import Randomization
+from worker.settings.errors import UserError, is_out_of_memory
+from worker.settings.rsl_rl import RslRlConfig
+from worker.settings.sac import SACConfig
+from worker.settings.task import Randomization
+from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 
 torch.set_num_threads(1)
 HERE = alone()

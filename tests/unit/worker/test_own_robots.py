@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.support.worker.tasks import observe, play, put, statistics
-from worker.tasks.ant import Ant, AntConfig
-from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+from worker.tasks.library.ant import Ant, AntConfig
+from worker.tasks.library.quadruped import Quadruped, QuadrupedConfig
 
 STAND = [0.0, 0.8, -1.6] * 4
 

@@ -27,9 +27,9 @@ from benchmarks.peers.inside.clock import Clock
 from benchmarks.processor import contradictions
 from benchmarks.stock import stock_runner
 from benchmarks.tasks import LOADED
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 from worker.tasks import find_task
-from worker.tasks.interface import Action, Interface, Observation
+from worker.tasks.declare.interface import Action, Interface, Observation
 
 
 def record(peer: str, rate: float, seed: int = 0, **more: Any) -> dict[str, Any]:

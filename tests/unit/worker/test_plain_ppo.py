@@ -19,8 +19,8 @@ from tensordict import TensorDict
 from tests.support.refusals import refusal
 from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
-from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.distributed import Gang, Placement
 from worker.learning.plain_ppo import Network, PlainPPO
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.loss import LOSSES

@@ -18,9 +18,9 @@ from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from shared_store.contract.policy import Contract, read
 from shared_store.contract.policy_changes import differences, robot_changes
 from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
-from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.setup import check_contract
+from worker.settings.errors import UserError
 from worker.tasks import (
     Action,
     Declaration,
@@ -38,9 +38,9 @@ from worker.tasks import (
     reward_weights,
     terms,
 )
-from worker.tasks.interface import Interface, motor
-from worker.tasks.interface import Observation as Seen
-from worker.tasks.policy_contract import policy_contract
+from worker.tasks.compile.policy_contract import policy_contract
+from worker.tasks.declare.interface import Interface, motor
+from worker.tasks.declare.interface import Observation as Seen
 
 WORLDS = 4
 

@@ -21,8 +21,8 @@ from worker.learning.ppo import linear
 from worker.learning.ppo.fused import METRICS, PPO
 from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
 from worker.learning.ppo.objective import Objective
-from worker.learning.ppo.settings import PPOConfig
 from worker.learning.randomness import mix_seed
+from worker.settings.ppo import PPOConfig
 
 
 def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bool = False, **settings: object) -> PPO:

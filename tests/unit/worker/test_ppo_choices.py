@@ -16,7 +16,7 @@ from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.loss import Clipping, Samples, clipped_loss
 from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 
 SMALL: dict[str, Any] = {"channels": (4, 6), "kernel_sizes": (3, 2), "strides": (2, 1), "hidden_sizes": (8,)}
 IMAGES = Spaces({"policy": (3, 7, 9)}, 2)

@@ -20,7 +20,7 @@ from tests.support.waiting import wait_for
 from worker.learning import reporter as reporting
 from worker.learning.report import Report
 from worker.learning.reporter import Fence, Gate, Reporter
-from worker.plot import plot_reward
+from worker.telemetry.reward_plot import plot_reward
 
 
 @pytest.fixture

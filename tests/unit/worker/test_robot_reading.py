@@ -11,7 +11,7 @@ import pytest
 from newton.solvers import SolverMuJoCo
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, SITE, mjcf, read, twins
-from worker.accepting import CHANGED_ROBOTS
+from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import robot_judge
 from worker.simulation.robot import Robot
 from worker.simulation.robot_identity import identity

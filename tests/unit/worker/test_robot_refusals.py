@@ -15,8 +15,8 @@ from newton.solvers import SolverMuJoCo
 
 from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from tests.support.refusals import refusal
-from worker.errors import UserError
 from worker.learning.job import user_errors
+from worker.settings.errors import UserError
 from worker.simulation.actuators import (
     DCMotorActuator,
     EffortActuator,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from newton.solvers import SolverMuJoCo
 
-from worker.accepting import CHANGED_ROBOTS
+from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation.robot import Robot
 from worker.simulation.robot_reading import Reading
 from worker.simulation.robot_view import RobotView

@@ -12,9 +12,9 @@ import pytest
 import rsl_rl.algorithms
 
 from tests.support.worker.rsl_loop import settings
-from worker.errors import UserError
-from worker.learning.rsl import checks
-from worker.learning.rsl.settings import REFUSED, RslRlConfig
+from worker.settings import rsl_rl_checks as checks
+from worker.settings.errors import UserError
+from worker.settings.rsl_rl import REFUSED, RslRlConfig
 
 
 def test_a_section_with_a_class_is_used_unchanged_and_one_without_overrides_the_defaults() -> None:

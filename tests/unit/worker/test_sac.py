@@ -15,12 +15,12 @@ from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces
 from tests.support.worker.onnx import onnx_of
 from tests.support.worker.point_task import Point, PointConfig
 from tests.support.worker.sac import SMALL, make, point, same
-from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.distributed import Gang, Placement
 from worker.learning.host_copies import HostCopies
 from worker.learning.sac.sac import SAC, SAVED
-from worker.learning.sac.settings import SACConfig
+from worker.settings.sac import SACConfig
 
 torch.set_num_threads(1)
 

@@ -19,7 +19,7 @@ from worker.learning.sac.learner import LOSSES
 from worker.learning.sac.networks import Actor, Critics
 from worker.learning.sac.replay import Batch
 from worker.learning.sac.sac import SAC
-from worker.learning.sac.settings import SACConfig
+from worker.settings.sac import SACConfig
 
 torch.set_num_threads(1)
 

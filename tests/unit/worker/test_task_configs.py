@@ -16,18 +16,18 @@ import pytest
 
 from job_specs.my_task import Pendulum, PendulumConfig
 from tests.support.refusals import refusal
-from worker.errors import UserError
 from worker.learning.job import configure
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.camera import CameraConfig
+from worker.settings.errors import UserError
+from worker.settings.overrides import Refused, configured, from_mapping
+from worker.settings.ppo import PPOConfig
+from worker.settings.task import STRICT, Randomization, TaskConfig, reward_weights
 from worker.tasks import find_task
 from worker.tasks.__main__ import describe
-from worker.tasks.ant import Ant, AntConfig
-from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
-from worker.tasks.config import STRICT, Randomization, TaskConfig, reward_weights
-from worker.tasks.configs.camera import CameraConfig
-from worker.tasks.mistakes import TaskMistake, task_mistakes
-from worker.tasks.overrides import Refused, configured, from_mapping
-from worker.tasks.quadruped import Quadruped
+from worker.tasks.library.ant import Ant, AntConfig
+from worker.tasks.library.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
+from worker.tasks.library.quadruped import Quadruped
+from worker.tasks.run.mistakes import TaskMistake, task_mistakes
 
 
 def bits(value: Any) -> Any:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.worker.tasks import observe, put
 from worker.tasks import find_task
-from worker.tasks.task import Task
+from worker.tasks.run.task import Task
 
 WORLDS = 48
 

@@ -19,7 +19,7 @@ from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.sensors.imu import Imu
 from worker.tasks import Action, Choice, Command, Event, Metric, Observation, Robot, Term, WorldArrays, terms
-from worker.tasks.binding import has_columns
+from worker.tasks.compile.binding import has_columns
 
 TURN = (-1.0, 1.0)
 VELOCITIES: Mapping[str, Any] = {"names": ("a", "b", "c"), "forward": TURN, "left": TURN, "turn": TURN}

@@ -12,8 +12,8 @@ import pytest
 import warp as wp
 
 from tests.conftest import REPOSITORY
+from worker.simulation.declared_randomization import QUANTITIES
 from worker.tasks import terms
-from worker.tasks.randomize import QUANTITIES
 from worker.tasks.terms.__main__ import main
 from worker.tasks.terms.catalogue import ELSEWHERE, entries, porting, reference, split
 

@@ -13,9 +13,9 @@ from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
 from shared_store.volume.learning_metrics import in_log, in_words
 from shared_store.volume.metrics import read_metrics, warnings_of
-from worker.learning.ppo.settings import PPOConfig
 from worker.learning.report import Report
 from worker.learning.watch import Watch
+from worker.settings.ppo import PPOConfig
 
 
 def watch(iterations: int = 1000, **settings: Any) -> Watch:

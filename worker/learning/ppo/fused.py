@@ -35,8 +35,8 @@ from worker.learning.ppo.heads import Categorical, Gaussian, Head
 from worker.learning.ppo.loss import LOSSES, Clipping
 from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
 from worker.learning.ppo.rollout import Rollout, View
-from worker.learning.ppo.settings import PPOConfig
 from worker.learning.totals import Totals
+from worker.settings.ppo import PPOConfig
 
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within its limits."""

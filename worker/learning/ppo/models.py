@@ -17,7 +17,7 @@ from torch import nn
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
 from worker.learning.observations import made_up, to_numbers
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 
 
 class PixelModel(CNNModel):

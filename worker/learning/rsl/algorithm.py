@@ -20,9 +20,9 @@ from tensordict import TensorDict
 from worker.learning.algorithm import POLICY, Policy, Setting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.rsl import building
+from worker.learning.rsl.environment import as_floats
 from worker.learning.rsl.policy import RslRlPolicy
-from worker.learning.rsl.settings import NETWORKS, RslRlConfig
-from worker.tasks.rsl_rl_env import as_floats
+from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 
 
 class RslRl:

@@ -20,11 +20,11 @@ from tensordict import TensorDict
 from torch import nn
 
 from shared_store.contract.error_text import Refused, kind_of
-from worker.errors import is_out_of_memory
 from worker.learning.algorithm import Setting, Share, Spaces
-from worker.learning.rsl.checks import check_gradient_length, check_networks
-from worker.learning.rsl.settings import NETWORKS, RslRlConfig
-from worker.tasks.rsl_rl_env import as_floats
+from worker.learning.rsl.environment import as_floats
+from worker.settings.errors import is_out_of_memory
+from worker.settings.rsl_rl import NETWORKS, RslRlConfig
+from worker.settings.rsl_rl_checks import check_gradient_length, check_networks
 
 
 class Surroundings(VecEnv):

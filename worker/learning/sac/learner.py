@@ -10,13 +10,13 @@ import torch
 from torch import nn
 from torch.nn.functional import log_softmax
 
-from worker.distributed import Gang
 from worker.learning.algorithm import Share
+from worker.learning.distributed import Gang
 from worker.learning.optimizers import load_optimizer
 from worker.learning.sac import kernels
 from worker.learning.sac.networks import Actor, Critics, make_normalizer
 from worker.learning.sac.replay import Batch
-from worker.learning.sac.settings import SACConfig
+from worker.settings.sac import SACConfig
 
 BETAS = (0.9, 0.95)
 """Decays of AdamW's moments: shorter than usual, since the targets move (arXiv:2512.01996)."""

@@ -16,7 +16,7 @@ from torch.nn.functional import softplus
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
 from worker.learning.observations import made_up
-from worker.learning.sac.settings import LOG_STD, SACConfig
+from worker.settings.sac import LOG_STD, SACConfig
 
 HEAD_SCALE = 0.01
 """Scale of the last layers' initial weights, relative to torch's: the first policy is centred, and the first critics predict 0."""

@@ -30,7 +30,7 @@ from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
 from worker.learning.sac.networks import Actor, SquashedPolicy, check_spaces, size_of
 from worker.learning.sac.replay import Replay
-from worker.learning.sac.settings import SACConfig
+from worker.settings.sac import SACConfig
 
 SAVED = {"cpu": 64 << 20, "cuda": 4 << 20}
 """With ``save_replay: auto``, a rank's replay up to this size [bytes] is part of its checkpoints. A GPU's iteration takes milliseconds,

@@ -13,8 +13,8 @@ from worker.racer.geometry import project
 from worker.racer.naming import RANDOM, resolve
 from worker.racer.rewards.parameters import MOST_OBJECTS
 from worker.racer.rewards.samples import FINE_OVAL, Course, Placed
-from worker.tasks.configs.racer import RacerConfig
-from worker.tasks.overrides import configured
+from worker.settings.overrides import configured
+from worker.settings.racer import RacerConfig
 
 
 def courses_of(circuit: Circuit) -> tuple[Course, ...]:

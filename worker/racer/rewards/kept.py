@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 from shared_store.contract.error_text import Refused
 from worker.racer.rewards.guard import LARGEST, read, read_file
 from worker.racer.rewards.problems import RewardRefused
-from worker.tasks.config import STRICT
+from worker.settings.task import STRICT
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from worker.errors import UserError
+from worker.settings.errors import UserError
 
 LARGEST_REWARD = 1e5
 """Rewards are from minus this to this, as in AWS's check and in its simulator."""

@@ -32,7 +32,7 @@ from worker.simulation.sensors.places import Place, find_places, only_one, place
 from worker.simulation.sensors.sensor import SensorContext, views_of
 
 if TYPE_CHECKING:
-    from worker.tasks.config import Randomization
+    from worker.settings.task import Randomization
 
 wp.set_module_options({"enable_backward": False})
 
@@ -149,7 +149,7 @@ def _stack_masks(
 class CameraSensor:
     """A pinhole camera in every world, on a body, on a site, or fixed in the world.
 
-    :class:`worker.tasks.declaration.Image` makes an observation group of its images; terms read :class:`CameraArrays`. Bytes of each kind:
+    :class:`worker.tasks.declare.declaration.Image` makes an observation group of its images; terms read :class:`CameraArrays`. Bytes of each kind:
 
     - ``color``: red, green and blue in sRGB; the background is light blue.
     - ``grey``: the luma of the colour image.

@@ -13,7 +13,7 @@ from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.ik_kernels import IkArrays
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 

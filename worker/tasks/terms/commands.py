@@ -20,7 +20,7 @@ from worker.simulation.kinematics import (
 )
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.placing import between
 
 wp.set_module_options({"enable_backward": False})

@@ -12,7 +12,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.sensors.contact import ContactArrays, first_air, first_contact, steps_above, strongest_contact
 from worker.simulation.sensors.frames import FrameArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.commands import command_speed
 
 wp.set_module_options({"enable_backward": False})

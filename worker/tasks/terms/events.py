@@ -14,7 +14,7 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.sensors.wrench import LASTING_FROM_NOW, WrenchArrays
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.placing import NONE, between, place_root, set_joint, within_limits
 
 wp.set_module_options({"enable_backward": False})

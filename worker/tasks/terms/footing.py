@@ -15,7 +15,7 @@ from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.sensors.contact import ContactArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.commands import command_speed
 from worker.tasks.terms.contacts import planar_speed, swing_error
 

@@ -17,7 +17,7 @@ from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.simulation.terrain_arrays import TerrainArrays, ground_height, on_terrain, terrain_origin
 from worker.simulation.terrain_levels import walked_levels
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.commands import TARGET, command_speed, planar_pose_command, steer_planar_pose_command
 from worker.tasks.terms.contacts import planar_speed, swing_error
 from worker.tasks.terms.placing import NONE, between, place_root, set_joint

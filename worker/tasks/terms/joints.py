@@ -10,7 +10,7 @@ import warp as wp
 from worker.simulation.kinematics import wrapped_angle
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 

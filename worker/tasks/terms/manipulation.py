@@ -21,7 +21,7 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.commands import command_rotation, command_vector
 
 wp.set_module_options({"enable_backward": False})

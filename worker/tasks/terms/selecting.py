@@ -13,7 +13,7 @@ from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.selection import SelectionArrays, chosen_one, object_at
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms import manipulation
 
 wp.set_module_options({"enable_backward": False})

@@ -9,7 +9,7 @@ from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
 from worker.simulation.sensors.rays import RayArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 

@@ -21,7 +21,7 @@ from worker.simulation.kinematics import (
 )
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.term_needs import needs
+from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms.frame_sampling import drawn_frame
 from worker.tasks.terms.motion import MotionArrays
 from worker.tasks.terms.placing import between, set_joint, within_limits

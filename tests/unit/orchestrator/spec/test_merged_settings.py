@@ -16,10 +16,10 @@ from orchestrator.spec.file import load
 from orchestrator.spec.model import ALGORITHMS, validate
 from tests.support.refusals import refusal
 from tests.support.waiting import PATIENCE
-from worker.errors import UserError
 from worker.learning.algorithms import find_algorithm, installed
 from worker.learning.algorithms import settings as settings_of
-from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.settings.cartpole import CartpoleConfig
+from worker.settings.errors import UserError
 
 WRONG = {
     "Ant ppo learning_rate_limits: [0.1, 0.001]": "learning_rate_limits: expected the least, then the greatest",

@@ -20,7 +20,7 @@ from orchestrator.spec.file import load, read
 from orchestrator.spec.model import Spec, validate
 from orchestrator.spec.values import known_tasks
 from tests.support.refusals import refusal
-from worker.learning.ppo.settings import PPOConfig
+from worker.settings.ppo import PPOConfig
 
 pytestmark = pytest.mark.usefixtures("installed_once")
 REPOSITORY = Path(__file__).parents[4]

@@ -19,10 +19,10 @@ from orchestrator.spec.model import validate
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import known_tasks
 from tests.support.refusals import refusal
-from worker.errors import UserError
 from worker.learning.job import configure
+from worker.settings.errors import UserError
+from worker.settings.overrides import configured
 from worker.tasks import find_task
-from worker.tasks.overrides import configured
 
 TWO_FACTORS = "expected [least, greatest], two factors"
 WRONG = {
@@ -119,7 +119,7 @@ def test_no_simulation_is_imported_to_check() -> None:
         "print(*sys.modules)"
     )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert "worker.tasks.configs.running" in loaded
+    assert "worker.settings.running" in loaded
     assert not {"torch", "warp", "newton", "numpy", "mujoco", "gymnasium"} & set(loaded)
 
 
@@ -153,7 +153,7 @@ def submit(task: str, config: dict[str, object]) -> None:
 REACH = """
 from collections.abc import Mapping
 from dataclasses import dataclass
-from worker.tasks.config import TaskConfig, reward_weights
+from worker.settings.task import TaskConfig, reward_weights
 
 @dataclass(frozen=True)
 class ReachConfig(TaskConfig):

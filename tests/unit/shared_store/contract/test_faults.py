@@ -32,10 +32,10 @@ def test_a_fault_is_the_place_where_the_exception_was_raised(tmp_path: Path) -> 
 
 
 def test_one_line_that_raises_for_unlike_causes_makes_unlike_faults() -> None:
-    text = f"{FRAME}worker.errors.TrainingError: 3 resets\n"
+    text = f"{FRAME}worker.settings.errors.TrainingError: 3 resets\n"
     falls, spins = (fault_in(text, Path("/job"), cause) for cause in ("its reward term fall", "its physics"))
     assert falls is not None and falls != spins and falls == fault_from(asdict(falls))
-    assert str(falls) == "worker.errors.TrainingError in train.py, line 7 (its reward term fall)"
+    assert str(falls) == "worker.settings.errors.TrainingError in train.py, line 7 (its reward term fall)"
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_what_comes_from_outside_the_program_is_no_fault(tmp_path: Path, text: s
         "botocore.exceptions.EndpointConnectionError",
         "urllib3.exceptions.MaxRetryError",
         "concurrent.futures.process.BrokenProcessPool",
-        "worker.errors.GangError",
+        "worker.settings.errors.GangError",
         "shared_store.volume.epoch.StaleEpoch",
         "shared_store.volume.layout.StoreError",
         "shared_store.volume.checkpoints.DamagedCheckpoint",
@@ -97,7 +97,7 @@ def test_what_comes_from_outside_the_program_is_no_fault(tmp_path: Path, text: s
 )
 def test_types_of_memory_networks_peers_and_volumes_are_none(name: str) -> None:
     assert fault_in(f"{FRAME}{name}: why\n", Path("/job")) is None
-    assert fault_in(f"{FRAME}worker.errors.TrainingError: why\n", Path("/job")) is not None
+    assert fault_in(f"{FRAME}worker.settings.errors.TrainingError: why\n", Path("/job")) is not None
 
 
 def test_an_exception_that_a_collective_raised_is_none_whatever_it_says() -> None:

@@ -12,8 +12,8 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.spec.model import validate
 from worker.racer.car_arrays import CarArrays
 from worker.racer.circuit import BOX
-from worker.tasks.configs.racer import LidarConfig, ObstacleConfig, RacerConfig, RacerPixelsAndStateConfig
-from worker.tasks.racer import Racer, RacerPixelsAndState
+from worker.settings.racer import LidarConfig, ObstacleConfig, RacerConfig, RacerPixelsAndStateConfig
+from worker.tasks.library.racer import Racer, RacerPixelsAndState
 
 BOXES = tuple(ObstacleConfig(float(along), lane) for along in range(1, 17) for lane in ("inner", "outer"))
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 0, -30)]

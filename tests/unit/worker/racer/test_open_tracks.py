@@ -25,8 +25,8 @@ from worker.racer.rewards.parameters import NUMBER_COLUMNS
 from worker.racer.route_file import from_bytes, to_bytes
 from worker.racer.scenery import _roads, _strip
 from worker.racer.track import Track
-from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
-from worker.tasks.racer import Racer, RacerPixels
+from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
+from worker.tasks.library.racer import Racer, RacerPixels
 
 HORSESHOE = open_track()
 END = HORSESHOE.length

@@ -25,9 +25,9 @@ from worker.racer.geometry import place_at, project
 from worker.racer.naming import keep
 from worker.racer.resets import COUNTS
 from worker.racer.trace import COLUMNS
-from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from worker.tasks.overrides import configured
-from worker.tasks.racer import Racer, RacerPixels
+from worker.settings.overrides import configured
+from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
+from worker.tasks.library.racer import Racer, RacerPixels
 
 
 class Driver:

@@ -14,15 +14,15 @@ from orchestrator.spec.model import validate
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, counted, known, racer, straight
-from worker.errors import UserError
 from worker.learning.job import configure
 from worker.learning.report import figures_of, shown_of
 from worker.racer.generator import make_random
 from worker.racer.geometry import on_road, place_at
 from worker.racer.naming import keep
-from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from worker.tasks.policy_contract import policy_contract
-from worker.tasks.racer import Racer, RacerPixels, RacerPixelsAndState
+from worker.settings.errors import UserError
+from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
+from worker.tasks.compile.policy_contract import policy_contract
+from worker.tasks.library.racer import Racer, RacerPixels, RacerPixelsAndState
 
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]
 DISCRETE = {"action_space": FIVE, "action_space_type": "discrete", "sensor": ["FRONT_FACING_CAMERA"], "version": "5"}

@@ -24,7 +24,7 @@ from worker.racer.rewards.guard import check_source
 from worker.racer.rewards.parameters import row_of
 from worker.racer.rewards.samples import FINE_OVAL, Line, oval, random_sample
 from worker.racer.track import Track
-from worker.tasks.configs.racer import ObstacleConfig, RewardFile
+from worker.settings.racer import ObstacleConfig, RewardFile
 
 NEXT = """def reward_function(params):
     _, ahead = params["closest_objects"]

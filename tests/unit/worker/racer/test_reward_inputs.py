@@ -21,8 +21,8 @@ from worker.racer.rewards import parameters
 from worker.racer.rewards.problems import Failure, RewardFailed
 from worker.racer.rewards.samples import oval, samples
 from worker.racer.rewards.workers import Workers
-from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
-from worker.tasks.racer import Racer, RacerPixels
+from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
+from worker.tasks.library.racer import Racer, RacerPixels
 
 BOXES = (ObstacleConfig(1.5, "inner"), ObstacleConfig(6.0, "outer"), ObstacleConfig(9.0, "center"))
 STEER = """

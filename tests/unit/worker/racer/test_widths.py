@@ -23,8 +23,8 @@ from worker.racer.road import road_arrays
 from worker.racer.route_file import from_bytes, to_bytes
 from worker.racer.scenery import _roads, _strip
 from worker.racer.track import Track
-from worker.tasks.configs.racer import ObstacleConfig, RacerConfig
-from worker.tasks.racer import Racer
+from worker.settings.racer import ObstacleConfig, RacerConfig
+from worker.tasks.library.racer import Racer
 
 
 def ring(radius: float, turned: float = 0.0, count: int = 120) -> np.ndarray:

@@ -1,0 +1,348 @@
+"""A gang of ranks: who is there, the process group, and the few collectives that training needs.
+
+:func:`connect` first lets every rank report to the main rank's TCP store (cheap, before anything slow) so that a rank that never
+came is *named*, then opens the process group (NCCL on CUDA, Gloo elsewhere) and proves it with one all-reduce.
+A gang of one rank has neither store nor group, and its collectives cost nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib import metadata
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+
+from worker.learning.deferred_compiler import defer_compiler
+from worker.settings.errors import GangError
+
+REPORT_SECONDS = 60.0
+"""Longest time between the first and the last report of a gang's ranks [s]."""
+COLLECTIVE_SECONDS = 600.0
+"""After how long without an answer a collective fails [s]; a peer that *died* is noticed at once, by its closed connection."""
+BUILD_SECONDS = 1800.0
+"""Longest time that one rank may compile kernels while others wait for its cache [s]."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """This process's place in its gang (torchrun's variables)."""
+
+    rank: int = 0
+    local_rank: int = 0
+    world_size: int = 1
+    local_world_size: int = 1
+    master_address: str = "127.0.0.1"
+    master_port: int = 29500
+    epoch: int = 0
+    """Fencing number of the attempt: ranks of two attempts never meet in one group."""
+    has_store: bool = False
+    """Whether a launcher (torchrun) keeps the TCP store already, at the master's address and port."""
+
+    @classmethod
+    def from_env(cls, env: Mapping[str, str]) -> Placement:
+        """Read ``RANK``, ``WORLD_SIZE`` and their kin. Raises ValueError naming one that is malformed."""
+
+        def integer(name: str, default: int) -> int:
+            value = env.get(name) or str(default)
+            if not value.isdecimal():
+                raise ValueError(
+                    f"{name} is {value!r}, not a whole number; ranks are started by worker.supervisor or by torchrun"
+                )
+            return int(value)
+
+        has_store = env.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+        placement = cls(
+            rank=integer("RANK", 0),
+            local_rank=integer("LOCAL_RANK", 0),
+            world_size=integer("WORLD_SIZE", 1),
+            local_world_size=integer("LOCAL_WORLD_SIZE", 1),
+            master_address=env.get("MASTER_ADDR") or "127.0.0.1",
+            master_port=integer("MASTER_PORT", 29500),
+            # torchrun's store outlives its ranks
+            epoch=integer("MUSTER_EPOCH", integer("TORCHELASTIC_RESTART_COUNT", 0) if has_store else 0),
+            has_store=has_store,
+        )
+        if not 0 <= placement.rank < placement.world_size:
+            raise ValueError(f"RANK is {placement.rank} in a WORLD_SIZE of {placement.world_size}; ranks count from 0")
+        return placement
+
+    @property
+    def device(self) -> str:
+        """``cuda:<local rank>`` where there is CUDA, else ``cpu``."""
+        return f"cuda:{self.local_rank}" if torch.cuda.is_available() else "cpu"
+
+    def describe(self, rank: int) -> str:
+        """``rank 5 (node 2)``; every node of a gang has the same number of ranks."""
+        return f"rank {rank} (node {rank // self.local_world_size})"
+
+
+class Gang:
+    """The ranks of one attempt, connected. Collectives work in place and are no-ops in a gang of one."""
+
+    def __init__(self, placement: Placement, device: str, store: dist.Store | None, sites: list[str]) -> None:
+        self.placement, self.device, self.store = placement, device, store
+        self.rank, self.size, self.is_main = placement.rank, placement.world_size, placement.rank == 0
+        self._sites = sites
+        self._messages = 0
+
+    def sum(self, tensor: torch.Tensor) -> torch.Tensor:
+        """Sum ``tensor`` over the ranks, in place; all ranks end with the same bits."""
+        if self.size > 1:
+            dist.all_reduce(tensor)
+        return tensor
+
+    def broadcast(self, tensor: torch.Tensor) -> torch.Tensor:
+        """Overwrite ``tensor`` with the main rank's."""
+        if self.size > 1:
+            dist.broadcast(tensor, src=0)
+        return tensor
+
+    def greatest(self, value: int) -> int:
+        """The greatest ``value`` that any rank gave. Waits for all of them."""
+        if self.size == 1:
+            return value
+        tensor = torch.tensor([value], device=self.device)
+        dist.all_reduce(tensor, op=dist.ReduceOp.MAX)
+        return int(tensor.item())
+
+    def tell(self, text: str | None) -> str | None:
+        """The main rank's ``text``, on every rank. Raises GangError if the main rank has ended."""
+        if self.store is None:
+            return text
+        self._messages += 1
+        key = f"told/{self._messages}"
+        if self.is_main:
+            self.store.set(key, "-" if text is None else f"+{text}")
+            return text
+        with _needs_main_rank():
+            answer = self.store.get(key).decode()
+        return answer[1:] if answer.startswith("+") else None
+
+    @contextlib.contextmanager
+    def build_in_turn(self, warm: Path | None = None, what: str = "task") -> Iterator[None]:
+        """Compile kernels once a cache: the first rank of each (host, cache) builds, then the others, which find it warm.
+
+        Args:
+            what: What is built; only the first time of each is in turn.
+            warm: A marker in the cache that says that this was built before: then nobody waits, since all builds are quick.
+                The marker is a hint. Where it is wrong, kernels are compiled several times, and nothing else happens.
+
+        Raises:
+            GangError: The main rank has ended, or a build took longer than ``BUILD_SECONDS``.
+        """
+        first = self._sites.index(self._sites[self.rank])
+        if self.store is not None and self._sites.count(self._sites[self.rank]) > 1:
+            with _needs_main_rank():
+                if self.rank == first:
+                    self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
+                elif self.store.get(f"warm/{what}/{first}") == b"0":
+                    self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
+        try:
+            yield
+            if warm is not None and self.rank == first:
+                with contextlib.suppress(OSError):
+                    warm.mkdir(parents=True, exist_ok=True)
+        finally:
+            if self.store is not None and self.rank == first:
+                with _needs_main_rank():
+                    self.store.set(f"built/{what}/{first}", "1")
+
+    def close(self) -> None:
+        """Leave the process group."""
+        if self.size > 1 and dist.is_initialized():
+            dist.destroy_process_group()
+
+
+@contextlib.contextmanager
+def _needs_main_rank() -> Iterator[None]:
+    """Raise GangError where the gang's store, which the main rank holds, fails or does not answer in time."""
+    try:
+        yield
+    except dist.DistError as error:
+        raise GangError("the main rank ended or did not answer in time; its log gives the reason") from error
+
+
+def require_gpus(visible: str, local_rank: int) -> None:
+    """Check that PyTorch can use the GPU of this rank, which would train on the CPU otherwise.
+
+    Args:
+        visible: ``CUDA_VISIBLE_DEVICES``, in which engines name the GPUs of a node; empty for none.
+        local_rank: The rank's number on its node, which is that of its GPU.
+
+    Raises:
+        ValueError: It can't.
+    """
+    if visible.strip() not in ("", "-1", "NoDevFiles") and torch.cuda.device_count() <= local_rank:
+        raise ValueError(
+            f"this node has GPU {visible}, and PyTorch {torch.__version__} can use {torch.cuda.device_count() or 'none'} of them; "
+            "install a PyTorch with CUDA and a driver that fits it, or set resources.gpus to 0"
+        )
+
+
+def connect(placement: Placement, *, device: str | None = None, report_seconds: float = REPORT_SECONDS) -> Gang:
+    """Form the gang: report, process group, one all-reduce. Every rank calls it.
+
+    Raises:
+        GangError: Ranks did not report within ``report_seconds``, or can't reach each other.
+    """
+    defer_compiler()  # before anything that would import it
+    device = device or placement.device
+    if device.startswith("cuda"):
+        torch.cuda.set_device(device)
+        torch.cuda.set_stream(torch.cuda.Stream())  # the default stream can't be recorded
+        torch.set_float32_matmul_precision("high")  # TF32 products, sums in float32, as Isaac Lab trains
+    if placement.world_size == 1:
+        return Gang(placement, device, None, ["here"])
+    store = dist.PrefixStore(f"muster/{placement.epoch}", _open_store(placement, report_seconds))
+    sites = _report(placement, store, report_seconds)
+    cuda = device.startswith("cuda")
+    try:
+        dist.init_process_group(
+            "nccl" if cuda else "gloo",
+            store=dist.PrefixStore("group", store),
+            rank=placement.rank,
+            world_size=placement.world_size,
+            timeout=timedelta(seconds=COLLECTIVE_SECONDS),
+            device_id=torch.device(device) if cuda else None,
+        )
+        probe = torch.tensor([float(placement.rank + 1)], device=device)
+        dist.all_reduce(probe)
+    except RuntimeError as error:
+        interface = os.environ.get("NCCL_SOCKET_IFNAME" if cuda else "GLOO_SOCKET_IFNAME", "chosen by itself")
+        raise GangError(
+            f"{placement.describe(placement.rank)} reached the main node but not its peers (network interface: {interface}): {error}"
+        ) from error
+    if round(probe.item()) != placement.world_size * (placement.world_size + 1) // 2:
+        raise GangError(f"the first all-reduce gave {probe.item():g}: two ranks have the same number")
+    store.set_timeout(timedelta(seconds=COLLECTIVE_SECONDS))
+    return Gang(placement, device, store, sites)
+
+
+def _open_store(placement: Placement, seconds: float) -> dist.TCPStore:
+    """The main rank's TCP store, listening on the main node's address alone; or the one that is there."""
+    address, port = placement.master_address, placement.master_port
+    if placement.rank == 0 and not placement.has_store:
+        # without a socket of ours torch would listen on every interface
+        descriptor = _listen(address, port)
+        return dist.TCPStore(
+            address, port, None, True, timedelta(seconds=seconds), wait_for_workers=False, master_listen_fd=descriptor
+        )
+    try:
+        return dist.TCPStore(address, port, None, False, timedelta(seconds=seconds), wait_for_workers=False)
+    except RuntimeError as error:
+        raise GangError(
+            f"{placement.describe(placement.rank)} could not reach rank 0 (node 0) at {address}:{port} within {seconds:g} s: "
+            "is the main node up, and is the port open between the nodes?"
+        ) from error
+
+
+def _listen(address: str, port: int) -> int:
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        try:
+            listener.bind((address, port))
+        except OSError as error:
+            if error.errno != errno.EADDRNOTAVAIL:
+                raise
+            listener.bind(("", port))  # the node has its public address by translation only
+        listener.listen(2048)
+    except OSError as error:
+        listener.close()
+        raise GangError(
+            f"rank 0 can't listen on {address}:{port} ({error.strerror}); free the port or set MASTER_PORT"
+        ) from error
+    return listener.detach()
+
+
+def _report(placement: Placement, store: dist.Store, seconds: float) -> list[str]:
+    """Every rank says that it is there; returns each rank's (host, kernel cache)."""
+    site = f"{socket.gethostname()}:{os.environ.get('WARP_CACHE_PATH', '')}"
+    store.set(f"here/{placement.rank}", site)
+    if placement.rank == 0:
+        missing = _await_reports(placement.world_size, store, seconds)
+        verdict = _missing(placement, missing, seconds) if missing else ""
+        store.set("verdict", verdict)
+        if missing:
+            _let_them_read(store, placement.world_size - len(missing) - 1)
+    else:
+        try:
+            store.wait(["verdict"], timedelta(seconds=seconds + 10))
+            verdict = store.get("verdict").decode()
+        except RuntimeError as error:
+            raise GangError(f"rank 0 (node 0) answered no more while the gang was forming: {error}") from error
+        if verdict:
+            store.add("read", 1)
+    if verdict:
+        raise GangError(verdict)
+    return [store.get(f"here/{rank}").decode() for rank in range(placement.world_size)]
+
+
+def _await_reports(count: int, store: dist.Store, seconds: float) -> list[int]:
+    deadline = time.monotonic() + seconds
+    missing = list(range(count))
+    while missing:
+        missing = [rank for rank in missing if not store.check([f"here/{rank}"])]
+        if missing and time.monotonic() > deadline:
+            break
+        time.sleep(0.02)
+    return missing
+
+
+def _missing(placement: Placement, missing: list[int], seconds: float) -> str:
+    names = ", ".join(placement.describe(rank) for rank in missing)
+    return (
+        f"{names} did not report within {seconds:g} s: {placement.world_size - len(missing)} of {placement.world_size} ranks are here. "
+        f"Look at the log of that node; it must reach {placement.master_address}:{placement.master_port}"
+    )
+
+
+def _let_them_read(store: dist.Store, readers: int) -> None:
+    """The store ends with this process: give the others a moment to read why."""
+    deadline = time.monotonic() + 3.0
+    while store.add("read", 0) < readers and time.monotonic() < deadline:
+        time.sleep(0.02)
+
+
+def use_cpu_threads(env: Mapping[str, str]) -> None:
+    """Give torch ``OMP_NUM_THREADS`` threads; without it, this rank's share of the host."""
+    given = env.get("OMP_NUM_THREADS", "")
+    share = len(os.sched_getaffinity(0)) // max(1, int(env.get("LOCAL_WORLD_SIZE", "1")))
+    torch.set_num_threads(int(given) if given.isdecimal() and int(given) > 0 else max(1, share))
+
+
+def warm_marker(task: type, device: str) -> Path | None:
+    """The marker for :meth:`Gang.build_in_turn` of ``task``'s kernels in ``WARP_CACHE_PATH``; None where that is not set.
+
+    Its name changes with the task's source, the simulation's versions and the kind of GPU. ``wp.clear_kernel_cache`` deletes it
+    with the kernels, since it begins with ``wp_``.
+    """
+    cache = os.environ.get("WARP_CACHE_PATH")
+    if not cache:
+        return None
+    parts = [f"{task.__module__}:{task.__qualname__}", device.partition(":")[0]]
+    if device.startswith("cuda"):
+        parts.append(torch.cuda.get_device_name(device))
+    for package in ("warp-lang", "newton", "mujoco-warp"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            parts.append(metadata.version(package))
+    with contextlib.suppress(TypeError, OSError):
+        import inspect
+
+        # its kernels may lie in the modules of its bases
+        parts.extend(Path(inspect.getfile(each)).read_text() for each in task.__mro__ if each is not object)
+    version = metadata.version(
+        "warp-lang"
+    )  # below it Warp keeps its own; a folder of this name beside it would make it warn
+    return Path(cache) / version / f"wp_muster_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"

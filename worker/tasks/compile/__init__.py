@@ -1,0 +1,1 @@
+"""Compilation: from a declaration and its robots to kernels, tables and the policy contract."""

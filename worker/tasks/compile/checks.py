@@ -1,0 +1,158 @@
+"""Checks of a task's arguments, interface and declaration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from shared_store.contract.error_text import nearest, shown
+from worker.tasks.compile.numbers import flat
+from worker.tasks.declare.interface import Interface, Observation, deviations
+
+if TYPE_CHECKING:
+    from worker.simulation.declared_randomization import Randomize
+    from worker.tasks.declare import declaration
+    from worker.tasks.run.task import Task
+
+
+def check_arguments(kind: type[Task], config: Any, world_count: int, seed: int, first_world: int) -> None:
+    """Raise ValueError of one sentence for an argument of a task that is not valid."""
+    task = kind.__name__
+    if not isinstance(config, kind.config_type):
+        raise ValueError(
+            f"task {task} takes a {kind.config_type.__name__}, not a {type(config).__name__}; "
+            f"make one with {kind.config_type.__name__}(...)"
+        )
+    if not kind.reward_terms:
+        raise ValueError(
+            f"task {task} has no reward terms; give {kind.config_type.__name__} a field "
+            "`rewards: Mapping[str, float] = reward_weights(name=weight, ...)`"
+        )
+    for name in config.curriculum:
+        if "." in name and not hasattr(kind, "declare"):
+            raise ValueError(f"task {task}: curriculum: it has no number {name}; declared tasks have such")
+    if world_count < 1:
+        raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")
+    if first_world < 0:
+        raise ValueError(f"task {task}: first_world is {first_world}; use an index >= 0")
+    if seed < 0:
+        raise ValueError(f"task {task}: seed is {seed}; use an integer >= 0")
+
+
+def checked_interface(task: Task) -> Interface:
+    """The task's interface, or the names of its observations alone.
+
+    Raises:
+        ValueError: Its names or their order differ from the task's.
+    """
+    interface = task.interface() or Interface(tuple(map(Observation, task.observation_names)), ())
+    for what, declared, names in (
+        ("observations", interface.observations, task.observation_names),
+        ("actions", interface.actions, task.action_names),
+    ):
+        if declared and tuple(item.name for item in declared) != tuple(names):
+            raise ValueError(
+                f"task {type(task).__name__}: interface() has other {what} than the task, or in another order; "
+                f"they are {', '.join(names)}"
+            )
+    return interface
+
+
+def noise_of(task: Task) -> list[float]:
+    """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
+    interface = checked_interface(task)
+    try:
+        return deviations(task.config.randomize.observation_noise, interface.observations)
+    except ValueError as error:
+        raise ValueError(f"config.randomize.observation_noise: {error}") from error
+
+
+def assert_replays(task: Task, steps: Sequence[Callable[[], None]]) -> bool:
+    """Replay the captured step once and check that it writes rewards, since an empty graph would step without an error; returns True.
+
+    Raises:
+        RuntimeError: The replay left a reward as it was.
+    """
+    task.rewards.fill_(float("nan"))
+    for launch in steps:
+        launch()
+    if task.rewards.isnan().any():
+        raise RuntimeError(f"the captured step of task {type(task).__name__} does not replay on {task.device}")
+    return True
+
+
+def check_observation(place: str, term: declaration.Observation, columns: int) -> None:
+    """Raise ValueError for invalid options of an observation, or options that do not fit its columns."""
+    if term.noise_kind not in ("uniform", "normal") or not _is_number(term.noise) or term.noise < 0:
+        found = term.noise if term.noise_kind == "uniform" else (term.noise_kind, term.noise)
+        raise ValueError(
+            f'{place}: noise is {shown(found)}; give half the width, 0 or more, or ("normal", standard deviation)'
+        )
+    delay = term.delay
+    if not _is_pair(delay) or not all(map(_is_whole, delay)) or not 0 <= delay[0] <= delay[1]:
+        raise ValueError(
+            f"{place}: delay is {shown(delay)}; give whole control steps, from 0 up, or two, the lesser first"
+        )
+    if not _is_whole(term.history) or term.history < 1:
+        raise ValueError(f"{place}: history is {shown(term.history)}; it counts the present step, so it is 1 or more")
+    if not isinstance(term.unit, str) and len(term.unit) != columns:
+        raise ValueError(f"{place}: {len(term.unit)} units for {columns} columns; give one for all, or one for each")
+
+
+def check_command(place: str, term: declaration.Command) -> None:
+    """Raise ValueError for invalid names or units of a command."""
+    if not term.names or not all(isinstance(name, str) for name in term.names):
+        raise ValueError(f"{place}: names are {shown(term.names)}; name each number that the policy is told")
+    if len(term.units) != len(term.names):
+        raise ValueError(f"{place}: {len(term.units)} units for {len(term.names)} numbers; give one for each")
+    if not _is_whole(term.hidden) or term.hidden < 0:
+        raise ValueError(f"{place}: hidden is {shown(term.hidden)}; give how many numbers, from 0 up")
+
+
+def check_randomized(
+    entries: Mapping[str, Randomize], place: str, value: Any, where: str, *, fill: bool = False
+) -> None:
+    """Check the numbers that a job sets at a place of ``randomize``.
+
+    Args:
+        entries: As declared.
+        place: Such as ``randomize.mass.range``.
+        value: The numbers.
+        where: Their source, for the error.
+        fill: Whether all numbers of the place become ``value``.
+
+    Raises:
+        ValueError: The place does not exist, or the entry can't have these numbers.
+    """
+    name, _, own = place.removeprefix("randomize.").partition(".")
+    known = [f"randomize.{key}.{each}" for key, entry in entries.items() for each in entry.places]
+    if place not in known:
+        raise ValueError(f"{where}: the task has no number {shown(place)}; {nearest(place, known) or 'it has none'}")
+    count = entries[name].places[own]
+    numbers = flat(f"{where}.{place}", [value] * count if fill else value, count)
+    try:
+        entries[name].check_numbers(own, numbers)
+    except ValueError as error:
+        raise ValueError(f"{where}.{place}: {error}") from error
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2
+
+
+@contextmanager
+def placed(where: str) -> Iterator[None]:
+    """Prefix a ValueError with its place in the task."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error

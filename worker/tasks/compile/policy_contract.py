@@ -1,0 +1,196 @@
+"""The policy contract of a task: :class:`shared_store.contract.policy.Contract`, made from its declaration and its interface."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from shared_store import __version__
+from shared_store.contract.policy import Command, Contract, Group, Image, RobotModel, State, Term
+from worker.tasks.compile.contract import described, range_of
+from worker.tasks.compile.images import described as images_of
+from worker.tasks.compile.measured import frame_of, is_library
+from worker.tasks.compile.tables import settings
+
+if TYPE_CHECKING:
+    from worker.learning.algorithm import ExportedPolicy
+    from worker.simulation.robot_reading import Reading
+    from worker.tasks.compile.plan import Plan, Seen
+    from worker.tasks.run.task import Task
+
+CHANNELS = ("red", "green", "blue")
+"""Name of the camera that the configuration adds to any task."""
+
+
+def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = None) -> Contract:
+    """The contract of a policy of ``task``: inputs, outputs and recurrent state.
+
+    Args:
+        task: The task, with its worlds.
+        name: Name of the task in a job's YAML.
+        exported: The policy as a function of tensors, with its input groups and its recurrent state. Without it, the contract has all
+            groups of the task and no state.
+    """
+    groups = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items()}
+    inputs = {group: group for group in groups}
+    states: list[State] = []
+    if exported is not None:
+        inputs = dict(zip(map(str, exported.sample.keys()), exported.inputs, strict=False))
+        states = [State(each, f"{each}_out", tuple(exported.inputs[each].shape[1:])) for each in exported.states]
+    interface = task.interface()
+    actions = interface.actions if interface else ()
+    return Contract(
+        task=name,
+        muster=__version__,
+        control_hz=float(task.config.control_hz),
+        groups=tuple(_group(task, group, each, groups[group]) for group, each in inputs.items()),
+        actions=tuple(actions),
+        action_names=tuple(task.action_names),
+        commands=_commands(getattr(task, "plan", None)),
+        states=tuple(states),
+        discrete=bool(task.discrete),
+        robots=robots_of(task),
+        normalizer="unknown" if exported is None else "inside",
+    )
+
+
+def readings_of(task: Task) -> Mapping[str, Reading]:
+    """How the file of each robot of a task was read, by its name; a task of kernels by hand keeps none."""
+    readings: Mapping[str, Reading] = getattr(task, "readings", {})
+    return readings
+
+
+def robots_of(task: Task) -> tuple[RobotModel, ...]:
+    """The robots of a task as they were loaded."""
+    return tuple(dataclasses.replace(reading.identity, name=name) for name, reading in readings_of(task).items())
+
+
+def _group(task: Task, name: str, given: str, shape: tuple[int, ...]) -> Group:
+    if len(shape) > 1:
+        return Group(name, given, shape, "uint8", image=_image(task, name))
+    terms = _terms(task, name)
+    fits = sum(term.size for term in terms) == shape[0]
+    return Group(name, given, shape, "float32", terms=terms if fits else ())
+
+
+def _image(task: Task, group: str) -> Image | None:
+    camera: dict[str, Any] = dict(images_of(task).get(group, {}))
+    if not camera:
+        return None
+    frames, channels = int(camera.pop("frames", 1)), camera.pop("channels", CHANNELS)
+    shown = tuple(
+        channels if channels is CHANNELS else channels[: len(channels) // frames]
+    )  # a sensor names the channels of all frames
+    return Image(shown, frames, _texts(camera))
+
+
+def _texts(value: Any) -> Any:
+    """Settings as plain values, since JSON has neither tuples nor classes."""
+    if isinstance(value, Mapping):
+        return {str(key): _texts(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_texts(each) for each in value]
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
+
+
+def _terms(task: Task, group: str) -> tuple[Term, ...]:
+    """The terms of a group of numbers; none if unknown."""
+    plan: Plan | None = getattr(task, "plan", None)
+    if plan is None:
+        return _columns(task) if group in ("policy", "critic") else ()
+    # if the policy sees only an image, the plan has the critic's terms in its place
+    there = "policy" if group == "critic" and (group not in plan.groups or "policy" in plan.images) else group
+    first, found = 0, []
+    for seen in plan.groups.get(there, ()):
+        found.append(_term(plan, seen, first))
+        first += found[-1].size
+    return tuple(found)
+
+
+def _columns(task: Task) -> tuple[Term, ...]:
+    """The observations of a task with hand-written kernels, each as a term: from its interface, or else with their names only."""
+    interface = task.interface()
+    if interface is None:
+        names = tuple(task.observation_names)
+        return tuple(Term(name, "measured", i, (name,), ("",), (1.0,), (0.0,)) for i, name in enumerate(names))
+    return tuple(
+        Term(
+            name=seen.name,
+            kind=seen.kind,
+            first=index,
+            names=(seen.name,),
+            units=(seen.unit,),
+            scale=(seen.scale,),
+            offset=(seen.offset,),
+            clip=seen.clip,
+            ranges=(seen.range,) if seen.kind == "command" else (),
+        )
+        for index, seen in enumerate(interface.observations)
+    )
+
+
+def _term(plan: Plan, seen: Seen, first: int) -> Term:
+    columns, bound, term = described(plan, seen), seen.bound, seen.term
+    signature = bound.signature
+    places = plan.numbers.places
+    numbers = {name: places[f"{bound.place}.{name}"] for name in (signature.numbers() if signature else ())}
+    command = ""
+    if bound.takes("command"):
+        command = str(term.parameters.get("command") or next(iter(plan.declaration.commands)))
+    sensors = [value.removeprefix("sensor_") for value in bound.arguments.values() if value.startswith("sensor_")]
+    return Term(
+        name=bound.name,
+        kind=columns[0].kind,
+        first=first,
+        names=tuple(column.name for column in columns),
+        units=tuple(column.unit for column in columns),
+        scale=tuple(column.scale for column in columns),
+        offset=tuple(column.offset for column in columns),
+        clip=columns[0].clip,
+        ranges=tuple(column.range for column in columns) if columns[0].kind == "command" else (),
+        history=term.history,
+        delay=(term.delay[0], term.delay[-1]) if seen.past >= 0 else (0, 0),
+        quantity=term.function_name,
+        parameters={name: tuple(plan.numbers.values[at : at + count]) for name, (at, count) in numbers.items()},
+        robot=term.robot,
+        element=(signature.element or "") if signature else "",
+        elements=tuple(bound.element_names) if bound.elements is not None else (),
+        sensors={name: _sensor(plan.declaration.sensors[name]) for name in sensors},
+        command=command,
+        library=is_library(term),
+        frame=frame_of(plan, term, sensors),
+    )
+
+
+def _sensor(declared: Any) -> str:
+    """A sensor in one line, such as ``ImuSensor, site imu``, or its ``meaning`` if it has one."""
+    if meaning := getattr(declared, "meaning", ""):
+        return str(meaning)
+    return ", ".join(filter(None, (type(declared).__name__, settings(declared))))
+
+
+def _commands(plan: Plan | None) -> tuple[Command, ...]:
+    if plan is None:
+        return ()
+    found = []
+    for told in plan.commands:
+        name, command = told.bound.name, plan.declaration.commands[told.bound.name]
+        ranges: Sequence[Any] = [range_of(plan, name, command, column) for column in command.names]
+        seconds = (plan.numbers.values[told.seconds], plan.numbers.values[told.seconds + 1])
+        drawn = (command.function_name, is_library(command))
+        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), seconds, *drawn))
+    return tuple(found)
+
+
+def same_policy(contract: Contract, of: Contract) -> Contract:
+    """``contract`` with the algorithm's parts (inputs and recurrent state) of ``of``.
+
+    A task alone doesn't know these parts. They can't differ, since they follow from the settings with which a policy is loaded.
+    """
+    groups = []
+    for told in of.groups:
+        group = contract.group(told.name)
+        if group is not None:
+            groups.append(dataclasses.replace(group, input=told.input))
+    return dataclasses.replace(contract, groups=tuple(groups), states=of.states, normalizer=of.normalizer)

@@ -1,0 +1,1 @@
+"""Declarations: what the author of a task writes."""

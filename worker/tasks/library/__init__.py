@@ -1,0 +1,1 @@
+"""The library: the tasks and robots that come with Muster."""

@@ -1,0 +1,124 @@
+"""Unitree's Go1 follows velocity commands on a plane and on rough ground: mjlab 1.6's ``Mjlab-Velocity-{Flat,Rough}-Unitree-Go1``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from worker.settings.velocity import Go1FlatConfig, Go1RoughConfig, VelocityConfig
+from worker.simulation.declared_randomization import Randomize
+from worker.simulation.sensors.contact import ContactSensor
+from worker.simulation.sensors.height_scan import RingPattern
+from worker.tasks import terms
+from worker.tasks.declare.declaration import Reward, Termination
+from worker.tasks.library.robots.go1 import ACTION_SCALE, FEET, go1
+from worker.tasks.library.velocity import Velocity, Walker, rate
+
+GO1 = Walker(
+    robot=go1,
+    action_scale=ACTION_SCALE,
+    base="trunk",
+    torso="trunk",
+    imu="imu",
+    soles=("FR", "FL", "RR", "RL"),
+    touching=ContactSensor(geoms=FEET, fine=True),
+    ring=RingPattern(radius=0.04, count=4, center=True),
+    tolerances=terms.Tolerances(standing={"*_calf_joint": 0.1, "*": 0.05}, walking={"*_calf_joint": 0.6, "*": 0.3}),
+    randomize={
+        "foot_friction_slide": Randomize(
+            "friction", geoms=FEET, axes=("slide",), range=(0.3, 1.5), operation="set", shared=True
+        ),
+        "foot_friction_spin": Randomize(
+            "friction",
+            geoms=FEET,
+            axes=("torsion",),
+            range=(1e-4, 2e-2),
+            operation="set",
+            distribution="log_uniform",
+            shared=True,
+        ),
+        "foot_friction_roll": Randomize(
+            "friction",
+            geoms=FEET,
+            axes=("roll",),
+            range=(1e-5, 5e-3),
+            operation="set",
+            distribution="log_uniform",
+            shared=True,
+        ),
+        "encoder_bias": Randomize("encoder_bias", joints="*", range=(-0.015, 0.015), operation="add"),
+        "base_com": Randomize(
+            "center_of_mass",
+            bodies="trunk",
+            range={"x": (-0.025, 0.025), "y": (-0.025, 0.025), "z": (-0.03, 0.03)},
+            operation="add",
+        ),
+    },
+)
+
+
+class Go1Flat(Velocity):
+    """Go1 on a plane: 48 observations, 12 actions, 50 control steps a second, episodes of 20 s."""
+
+    config_type = Go1FlatConfig
+    walker = GO1
+    solver_options = {
+        "integrator": "implicitfast",
+        "cone": "elliptic",
+        "impratio": 10.0,
+        "tolerance": 1.0e-8,
+        "ls_tolerance": 0.01,
+        "ccd_iterations": 50,
+        # In 8 worlds x 30 steps of random, zero, held and far too large random actions there were at most 5 contacts and 27 rows;
+        # six rows for each foot, one for each joint's limit and 40 for everything else that may touch are 76.
+        "nconmax": 24,
+        "njmax": 100,
+    }
+
+
+class Go1Rough(Velocity):
+    """Go1 on stairs, slopes and rough ground, which it sees: 235 observations, 12 actions, 50 control steps a second, episodes of 20 s."""
+
+    config_type = Go1RoughConfig
+    walker = GO1
+    rough = True
+    solver_options = {
+        **Go1Flat.solver_options,
+        "ccd_iterations": 500,
+        # In 8 worlds x 60 steps, as above, at most 8 contacts and 48 rows. Several corners of the ground may touch one foot.
+        "nconmax": 40,
+        "njmax": 160,
+    }
+
+    def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
+        """Also contacts of other parts with the ground, and of the robot with itself."""
+
+        def hits(against: str = "ground", **what: Any) -> ContactSensor:
+            return ContactSensor(against=against, fine=True, together=True, **what)
+
+        return {
+            **super().sensors_of(config),
+            "self_contacts": hits("robot", bodies="*"),
+            "thighs": hits(geoms="*_thigh_collision[123]"),
+            "shanks": hits(geoms="*_calf_collision[12]"),
+            "trunk_head": hits(geoms=("trunk_collision", "head_collision")),
+        }
+
+    def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
+        """Upright relative to the slope of the ground, with costs of contacts other than the feet's."""
+        return {
+            **super().rewards_of(config),
+            "upright": rate(
+                terms.body_upright_on_ground, bodies=self.walker.torso, scan="terrain_scan", std=math.sqrt(0.2)
+            ),
+            "self_collisions": rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0),
+            "shank_collision": rate(terms.hard_contact_steps, contacts="shanks", force=10.0),
+            "trunk_head_collision": rate(terms.hard_contact_steps, contacts="trunk_head", force=10.0),
+        }
+
+    def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
+        """Contact of a thigh with the ground, instead of a tilt limit."""
+        ends = dict(super().terminations_of(config))
+        del ends["fell_over"]
+        return {**ends, "illegal_contact": Termination(terms.illegal_contact, contacts="thighs", force=10.0)}
