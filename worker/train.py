@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import TYPE_CHECKING
 
 from worker.learning.job import Job, StopRequest, run_command, user_errors
 from worker.settings.errors import UserError
 from worker.telemetry.tracking import Tracking
+
+if TYPE_CHECKING:
+    from worker.learning.hooks import Hook
+    from worker.tasks.run.task import Task
+    from worker.telemetry.picture import Glance
 
 SWITCH_SECONDS = 0.0005
 """Longest time for which a reporting or saving thread may hold the interpreter, while the training thread's device may be idle [s]."""
@@ -49,10 +55,23 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
     loop: Loop | None = None
     # All memory is allocated in the first iterations; a later out-of-memory error has another cause.
     with within_memory(task_type, training.config, learner, worlds, gang, lambda: loop is None or loop.iterated < 3):
-        loop = Loop(training, gang, stop)
+        loop = Loop(training, gang, stop, hooks())
         code = train(loop, stop)
     loop.close()
     return code
+
+
+def hooks() -> list[Hook]:
+    """What watches a training, and what follows its end."""
+    from worker.evaluation.final_evaluation import FinalEvaluation
+    from worker.telemetry.attending import LiveTap
+
+    def draw(worlds: Task) -> Glance:
+        from worker.telemetry.picture import Glance  # it takes a while, and most jobs of a sweep draw nothing
+
+        return Glance(worlds)
+
+    return [LiveTap(), FinalEvaluation(None if os.environ.get("MUSTER_PICTURE") == "0" else draw)]
 
 
 if __name__ == "__main__":

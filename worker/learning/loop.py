@@ -1,9 +1,10 @@
-"""The training loop: collect, learn, log, checkpoint, exit on request, evaluate at the end."""
+"""The training loop: collect, learn, log, checkpoint, exit on request."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from shared_store.contract.error_text import counted
@@ -22,6 +23,7 @@ from worker.learning.distributed import Gang
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
 from worker.learning.faults import die, kill_at
+from worker.learning.hooks import Hook
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup, user_errors
 from worker.learning.leaving import patience_of
@@ -43,7 +45,6 @@ from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
 from worker.settings.errors import TrainingError, UserError
 from worker.settings.task import value_at
-from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
     from worker.tasks.run.step_log import StepLog
@@ -59,7 +60,7 @@ EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
 class Loop:
     """Trains one task on the worlds of one rank, in step with the other ranks."""
 
-    def __init__(self, training: Training, gang: Gang, stop: StopRequest) -> None:
+    def __init__(self, training: Training, gang: Gang, stop: StopRequest, hooks: Sequence[Hook] = ()) -> None:
         """Build worlds and learner, and resume from the run's newest checkpoint, if any. All ranks call it.
 
         Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
@@ -67,6 +68,7 @@ class Loop:
         training, self._begun = as_begun(training, gang)
         job = training.job
         self.training, self.job, self.config, self.gang, self.stop = training, job, training.config, gang, stop
+        self._hooks = hooks
         self.share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
         self._kill_at = kill_at(os.environ, job) if gang.is_main else None
         self.cadence = Cadence(training.save_every)
@@ -137,14 +139,15 @@ class Loop:
         """
         progress = self.state.progress
         report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
-        attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
         self.say("\n".join(filter(None, [*self.task.notes(), self._beginning(), self._begun])))
         self._stopwatch.begin()
         self.beacon.tell(phase=Phase.TRAINING)
         try:
+            for hook in self._hooks:
+                hook.begin(self)
             while progress.iteration < self.training.iterations:
-                if attending and attending.attend():
-                    self._collecting.release()  # the rollout is recorded anew, with the tap
+                if any([hook.before_iteration() for hook in self._hooks]):  # each is asked
+                    self._collecting.release()
                 record, signals = self._iterate()
                 if progress.iteration == self._kill_at:
                     die()
@@ -156,15 +159,18 @@ class Loop:
                 if self._handle(signals):
                     self.say(f"asked to stop: left after iteration {progress.iteration} of {self.training.iterations}")
                     return EX_TEMPFAIL
-            complete(self)
+            checkpoint = complete(self)
+            self.failures.tell(again=True)
+            for hook in self._hooks:
+                hook.trained(self, checkpoint)
             return 0
         finally:
             if report:
                 self.reporter.do(report.close)
             self.reporter.close()
             self.fence.close()
-            if attending:
-                attending.close()
+            for hook in self._hooks:
+                hook.close()
 
     def close(self) -> None:
         """Leave the gang and end the saver; the loop can't train afterwards."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from shared_store.volume.files import read_json, write_json
 from shared_store.volume.layout import Run
+from worker.learning.hooks import Hook
 from worker.learning.reporter import Gate
 from worker.simulation.episodes import WATCHED
 from worker.telemetry.asking import answer_of, is_alive, request_of
@@ -22,6 +23,7 @@ from worker.telemetry.segment import Segment
 from worker.telemetry.tap import Reading, Tap
 
 if TYPE_CHECKING:
+    from worker.learning.loop import Loop
     from worker.tasks.run.task import Task
 
 LOOK_SECONDS = 1.0
@@ -133,3 +135,22 @@ class Attending:
         request = read_json(request_of(self._run)) or {}
         if (request.get("host"), request.get("process")) == self._reader:  # else it is the next reader's
             request_of(self._run).unlink(missing_ok=True)
+
+
+class LiveTap(Hook):
+    """Has a training answer requests for its tap."""
+
+    def __init__(self) -> None:
+        self._attending: Attending | None = None
+
+    def begin(self, loop: Loop) -> None:
+        if loop.gang.is_main:
+            self._attending = Attending(loop.job.run, loop.task, loop.gate)
+
+    def before_iteration(self) -> bool:
+        """Open the tap where it was asked for."""
+        return self._attending is not None and self._attending.attend()
+
+    def close(self) -> None:
+        if self._attending is not None:
+            self._attending.close()

@@ -184,10 +184,10 @@ TESTS = {
     f"{file}:{function}": f"test_{case}"
     for case, files in {
         "a_training_is_the_same_on_all_ranks_to_its_end": {
-            "distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
+            "learning/distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
             "evaluation/evaluation.py": "evaluate",
+            "evaluation/final_evaluation.py": "FinalEvaluation.trained",
             "learning/begun.py": "as_begun",
-            "learning/completion.py": "complete",
             "learning/exchange.py": "Exchange.gather",
             "learning/leaving.py": "train",
             "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._build Loop._iterate Loop.train",
@@ -207,8 +207,10 @@ TESTS = {
         "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/adoption.py": "adopt"},
         "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/teacher.py": "_learnt give_teacher"},
         "worlds_that_do_not_fit_are_refused_by_all_ranks": {"learning/memory.py": "_taken measure within_memory"},
-        "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {"learning/completion.py": "held_out_worlds"},
-        "a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop": {"learning/completion.py": "_save"},
+        "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {
+            "evaluation/final_evaluation.py": "held_out_worlds"
+        },
+        "a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop": {"learning/completion.py": "complete"},
         "a_loss_that_is_not_finite_ends_all_ranks_after_their_saves": {"learning/loop.py": "Loop._failure"},
         "too_many_resets_on_one_rank_end_all_after_it_has_written_why": {"learning/loop.py": "Loop._judge_resets"},
         "start_frames_follow_the_failures_of_all_ranks": {"learning/loop.py": "Loop._begin_iteration"},

@@ -86,12 +86,13 @@ def train() -> int:
     from worker.learning.job import Job, StopRequest
     from worker.learning.loop import Loop
     from worker.learning.training import Training
+    from worker.train import hooks
 
     stop = StopRequest().listen()
     job = Job.from_env(os.environ, "train")
     use_cpu_threads(os.environ)
     gang = connect(Placement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60")))
-    code = leaving.train(Loop(Training.of(job, TASK), gang, stop), stop)
+    code = leaving.train(Loop(Training.of(job, TASK), gang, stop, hooks()), stop)
     gang.close()
     return code
 

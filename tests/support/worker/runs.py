@@ -16,6 +16,7 @@ from worker.learning.distributed import Gang
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.training import Training
+from worker.train import hooks
 
 
 def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None, task: Any = TASK) -> Loop:
@@ -23,7 +24,7 @@ def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | No
     job = Job.from_env(env, "train")
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
-    return Loop(Training.of(job, task), gang or alone(), stop or StopRequest())
+    return Loop(Training.of(job, task), gang or alone(), stop or StopRequest(), hooks())
 
 
 def train(env: dict[str, str], gang: Gang | None = None, task: Any = TASK) -> Loop:

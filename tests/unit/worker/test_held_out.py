@@ -15,7 +15,7 @@ from tests.support.worker.loop import alone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
 from worker.evaluation.evaluation import evaluate
-from worker.learning.completion import held_out_worlds
+from worker.evaluation.final_evaluation import held_out_worlds
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.state import Progress

@@ -1,4 +1,4 @@
-"""The learning curve of a run as a PNG file."""
+"""The reward plot of a run: its learning curve as a PNG file."""
 
 from __future__ import annotations
 

@@ -1,0 +1,91 @@
+"""The final evaluation of a training: the policy is evaluated, the curve plotted, a picture drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from shared_store.contract.phases import Phase
+from shared_store.volume.files import write_atomic
+from worker.evaluation.evaluation import best_words, evaluate
+from worker.evaluation.reward_plot import plot_reward
+from worker.learning.algorithm import Share
+from worker.learning.hooks import Hook
+from worker.learning.randomness import held_out_seed
+from worker.learning.setup import build_task
+from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
+
+if TYPE_CHECKING:
+    from worker.learning.loop import Loop
+    from worker.settings.task import TaskConfig
+    from worker.tasks.run.task import Task
+
+
+EVALUATED = 256
+"""Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
+
+
+class Drawing(Protocol):
+    """Watches worlds while a policy is evaluated in them, and draws what it saw."""
+
+    def picture(self, config: TaskConfig) -> bytes: ...
+
+
+class FinalEvaluation(Hook):
+    """Evaluates the policy of the last checkpoint.
+
+    Args:
+        draw: Begins a drawing of the evaluation's worlds, on the main rank; None for a training without a picture.
+    """
+
+    def __init__(self, draw: Callable[[Task], Drawing] | None = None) -> None:
+        self._draw = draw
+
+    def trained(self, loop: Loop, checkpoint: str) -> None:
+        """Evaluate the policy, plot the curve, print the paths."""
+        loop.say(f"evaluating checkpoint {checkpoint}")
+        worlds = held_out_worlds(loop)
+        drawing = self._draw(worlds) if self._draw and loop.gang.is_main else None
+        loop.beacon.tell(phase=Phase.EVALUATING)
+        result = evaluate(worlds, loop.algorithm.policy(), loop.gang, checkpoint=checkpoint)
+        loop.say(str(result))
+        if not loop.gang.is_main:
+            return
+        run, plot = loop.job.run, None
+        loop.beacon.tell(phase=Phase.WRITING)
+        try:
+            result.write(run, iteration=loop.state.progress.iteration, config={})
+            plot = plot_reward(run)
+        except (OSError, ValueError) as error:
+            loop.say(f"warning: the evaluation or the plot could not be written ({error})")
+        loop.say(f"last checkpoint: {run.checkpoints / checkpoint}")
+        if best := best_words(run):
+            loop.say(best)
+        if plot:
+            loop.say(f"reward plot: {plot}")
+        if drawing:
+            loop.beacon.tell(phase=Phase.DRAWING)
+            _show(loop, drawing, run.metrics / "policy.png")
+
+
+def held_out_worlds(loop: Loop) -> Task:
+    """The worlds of the evaluation: those of training, or, if worlds are drawn at random, others with another seed."""
+    worlds, progress = loop.task, loop.state.progress
+    if loop.config.randomize.draws_worlds:
+        total = min(loop.share.total, EVALUATED * loop.gang.size)
+        share = Share.of(loop.gang.rank, loop.gang.size, total)
+        seed = held_out_seed(loop.training.seed)
+        worlds = build_task(type(loop.task), loop.config, share, loop.gang, seed, loop.beacon)
+    last = max(0, progress.iteration - 1)
+    begin_evaluation(worlds, last, progress.reward, progress.episode_length, adaptive_steps(loop.task))
+    return worlds
+
+
+def _show(loop: Loop, drawing: Drawing, path: Path) -> None:
+    """Write the picture. An error here does not fail the training."""
+    try:
+        write_atomic(path, drawing.picture(loop.config))
+        loop.say(f"picture of the policy: {path}")
+    except Exception as error:
+        loop.say(f"warning: the picture of the policy could not be made ({type(error).__name__}: {error})")
