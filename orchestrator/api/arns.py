@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from orchestrator.api.errors import ClientError
 from orchestrator.control.account import DEFAULT, Account
+from orchestrator.services.errors import ClientError
 
 _here = DEFAULT
 

@@ -15,8 +15,6 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.arns import plain_name
 from orchestrator.api.damaged import DamagedRow
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain import reasons
@@ -25,6 +23,8 @@ from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, JobsOf, Operation
 from shared_store.contract.error_text import nearest
 from shared_store.volume.initial_weights import NewRun, TeacherCopy, WeightsCopy
 from shared_store.volume.layout import Run, StoreError
@@ -88,6 +88,7 @@ class Context:
 
     session: Session
     reconciler: Reconciler
+    actor: Actor
     idempotency_key: str | None = None
     making: NewRun | None = None
     """The run that a submission makes, of a clone."""
@@ -117,7 +118,7 @@ class Context:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
         queue = self.session.get(JobQueue, plain_name(reference, "job-queue"))
         if queue is None or (queue.deleting and not deleting):
-            there = ", ".join(queue_names(self.session)[:5]) or "none yet"
+            there = ", ".join(queue_names(self.session, self.actor)[:5]) or "none yet"
             raise ClientError(f"Job queue {reference[:300]} does not exist; there is {there}")
         return queue
 
@@ -153,6 +154,12 @@ class Context:
         return self.reconciler.admission.reason(job).aws or None
 
 
+def actor_of(request: Request) -> Actor:
+    """Who has sent the request, as the guard has found."""
+    actor: Actor = request.state.actor
+    return actor
+
+
 def reconciler_of(request: Request) -> Reconciler:
     """The controller that the application serves."""
     reconciler: Reconciler = request.app.state.reconciler
@@ -165,17 +172,17 @@ def named_definition(session: Session, arn: str) -> JobDefinition | None:
     return session.get(JobDefinition, (name, int(revision)))
 
 
-def queue_names(session: Session) -> list[str]:
-    """The queues whose jobs the caller may see, by name."""
+def queue_names(session: Session, actor: Actor) -> list[str]:
+    """The queues whose jobs the actor may see, by name."""
     names = session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
-    return [name for name in names if is_visible(JobsOf(name))]
+    return [name for name in names if actor.may_see(JobsOf(name))]
 
 
-def find_run(reconciler: Reconciler, name: str) -> Run:
+def find_run(reconciler: Reconciler, actor: Actor, name: str) -> Run:
     """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run; StoreSilent."""
     run = _run(reconciler, name)
     if run.description() is None:
-        raise _absent(reconciler, name)
+        raise _absent(reconciler, actor, name)
     return run
 
 
@@ -206,24 +213,24 @@ def _run(reconciler: Reconciler, name: str) -> Run:
         raise ClientError(str(error)) from None
 
 
-def _absent(reconciler: Reconciler, name: str) -> ClientError:
-    """The caller sees no run called ``name``; what it may see is named. Raises StoreSilent."""
+def _absent(reconciler: Reconciler, actor: Actor, name: str) -> ClientError:
+    """The actor sees no run called ``name``; what it may see is named. Raises StoreSilent."""
     reconciler.check_store()
     with reconciler.database.session() as session:
         query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
         job = session.scalars(query.limit(1)).first()
-        if job is not None and is_visible(job) and job.kind == "array":
+        if job is not None and actor.may_see(job) and job.kind == "array":
             return ClientError(f"run {name} does not exist: {_runs_of_array(session, job)}", 404)
-        if job is not None and is_visible(job):
+        if job is not None and actor.may_see(job):
             over = Status(job.status).is_terminal
             what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
             return ClientError(f"run {name} does not exist: job {reasons.named(job.name, job.id)} {what}", 404)
-        named = find_job(session, name, visible_queues())
+        named = find_job(session, name, actor.queues)
         if named is not None and named.kind == "array":
             return ClientError(f"{name} is a job, not a run; {_runs_of_array(session, named)}", 404)
         if named is not None:
             return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
-    runs = [each.name for each in visible_runs(reconciler, most=_COMPARED)]
+    runs = [each.name for each in visible_runs(reconciler, actor, most=_COMPARED)]
     others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
     hint = nearest(name, runs, others, cutoff=0.3)
     return ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
@@ -241,14 +248,14 @@ def _runs_of_array(session: Session, array: Job) -> str:
     return f"job {reasons.named(array.name, array.id)} is an array; its children have the runs {array.run}-0 to {array.run}-{last}; {such}"
 
 
-def permitted_run(reconciler: Reconciler, name: str, operation: Operation) -> Run:
-    """The run called ``name``, where the caller may do this to it; another's is as if it did not exist. Raises ClientError."""
+def permitted_run(reconciler: Reconciler, actor: Actor, name: str, operation: Operation) -> Run:
+    """The run called ``name``, where the actor may do this to it; another's is as if it did not exist. Raises ClientError."""
     owner = owner_of_run(reconciler, _run(reconciler, name))
     if owner is not None:
-        if not is_visible(owner):
-            raise _absent(reconciler, name)
-        check(operation, owner)
-    return find_run(reconciler, name)
+        if not actor.may_see(owner):
+            raise _absent(reconciler, actor, name)
+        actor.check(operation, owner)
+    return find_run(reconciler, actor, name)
 
 
 def owner_of_run(reconciler: Reconciler, run: Run) -> RunRecord | None:
@@ -260,21 +267,23 @@ def owner_of_run(reconciler: Reconciler, run: Run) -> RunRecord | None:
 
 def visible_runs(
     reconciler: Reconciler,
+    actor: Actor,
     after: str = "",
     most: int | None = None,
     search: str = "",
     among: Callable[[Run], bool] = lambda run: True,
 ) -> list[Run]:
-    """The runs of the store that the caller may see, by name.
+    """The runs of the store that the actor may see, by name.
 
     Args:
         reconciler: The controller.
+        actor: Who asks.
         after: Those behind this name.
         most: At most so many.
         search: Those with this text in their names.
         among: Those of which this is true; it may read the store.
     """
-    restricted = visible_queues() is not None
+    restricted = actor.queues is not None
     wanted = search.lower()
     found = reconciler.store.runs(
         after, None if restricted else most, lambda run: wanted in run.name.lower() and among(run)
@@ -284,4 +293,4 @@ def visible_runs(
     with reconciler.database.session() as session:
         recorded = {record.name: record for record in session.scalars(select(RunRecord))}
     owned = ((run, recorded.get(run.name) or owner_of_run(reconciler, run)) for run in found)
-    return list(islice((run for run, owner in owned if owner is not None and is_visible(owner)), most))
+    return list(islice((run for run, owner in owned if owner is not None and actor.may_see(owner)), most))

@@ -7,14 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from orchestrator.api import permissions
 from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
 from orchestrator.control.kept_texts import references_of
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import now
 from orchestrator.persistence.own_models import KeptText
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor
 from shared_store.volume.layout import Run
 from shared_store.volume.texts import Reference, TextError, beside, read, references, resolved_spec
 
@@ -26,14 +26,14 @@ def check_texts(context: Context, gang: GangSpec) -> None:
         row.used_at = now()
 
 
-def keep_again(reconciler: Reconciler, run: Run, spec: Mapping[str, Any] | None) -> None:
+def keep_again(reconciler: Reconciler, actor: Actor, run: Run, spec: Mapping[str, Any] | None) -> None:
     """Keep the texts of a job that continues or clones a run, where the store has them not or no more. On a thread of the store.
 
     Raises TextRefused, Unavailable. What the run lacks, too, is refused when the job is submitted.
     """
     short, long = beside(spec or {})
     for text in long.values():  # beside a change it has no room in the definition any more
-        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
+        reconciler.texts.keep(text.encode(), actor.name)
     for reference in references(short):
         with reconciler.database.session() as session:
             source = reconciler.texts.source(session, reference)
@@ -45,7 +45,7 @@ def keep_again(reconciler: Reconciler, run: Run, spec: Mapping[str, Any] | None)
             text = read(run.texts, reference)
         except (TextError, OSError):
             continue
-        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
+        reconciler.texts.keep(text.encode(), actor.name)
 
 
 def with_texts(reconciler: Reconciler, run: str, spec: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,17 +9,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from orchestrator.api import permissions
 from orchestrator.api.context import Context, archived, permitted_run, release
-from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
-from orchestrator.api.permissions import Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.contents import is_archived
@@ -82,17 +81,17 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
         context.reconciler.run_users.check(source.run)
         if not is_waiting:
             try:
-                found = partial(permitted_run, context.reconciler, source.run, Operation.SUBMIT_JOB)
+                found = partial(permitted_run, context.reconciler, context.actor, source.run, Operation.SUBMIT_JOB)
                 version = context.reconciler.run_users.version(source.run)
                 run = context.read(("find", source.run, version), found)
                 if not is_teacher and context.read(("archived", source.run, version), partial(is_archived, run)):
                     raise archived(source.run)
             except ClientError as error:
                 raise ClientError(f"{source.key}: {error}" if is_teacher else str(error), error.status) from None
-        if permissions.visible_queues() is not None:
+        if context.actor.queues is not None:
             owner = owner_of(context.session, context.found(source.run))
-            if owner is None or not permissions.is_visible(owner):  # another's is as one that does not exist yet
-                permissions.check(Operation.SUBMIT_JOB, RunRecord(name=source.run, queue=""))
+            if owner is None or not context.actor.may_see(owner):  # another's is as one that does not exist yet
+                context.actor.check(Operation.SUBMIT_JOB, RunRecord(name=source.run, queue=""))
         if source.key in ("evaluate", "race") and not is_waiting:
             evaluated = partial(check_evaluation, store, context.run(source.run), spec or {}, source.key)
             context.read((source.key, source.run), evaluated)

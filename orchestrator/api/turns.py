@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 
 
 class Turns:

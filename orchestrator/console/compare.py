@@ -10,14 +10,14 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import permitted_run, reconciler_of, visible_runs
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of, visible_runs
 from orchestrator.api.native import run_routes
-from orchestrator.api.permissions import Operation, current_identity
 from orchestrator.console.curves import number
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest
 from shared_store.volume.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
 from shared_store.volume.metrics import sampled
@@ -94,7 +94,7 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     """The names that the patterns match, in the order of the patterns, which may be separated by spaces. Raises ClientError."""
     chosen: dict[str, None] = {}
     known: list[str] | None = None
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     given = [part for each in patterns for part in each.split()]
     if len(given) > MOST:
         raise ClientError(
@@ -105,7 +105,7 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
             chosen[pattern] = None
             continue
         if known is None:
-            known = [run.name for run in visible_runs(reconciler)]
+            known = [run.name for run in visible_runs(reconciler, actor)]
         fitting = [name for name in known if fnmatchcase(name, pattern)]
         if not fitting:
             raise ClientError(f"no run is called like {pattern[:128]}; the page of runs has their names", 404)
@@ -117,13 +117,14 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
 
 def _groups(request: Request, names: Sequence[str]) -> list[Group]:
     """The runs in groups; pages of the same runs share the result. Raises ClientError for a run that does not exist, or that the caller may not see."""
-    key = (id(reconciler_of(request)), current_identity.get(), tuple(names))
+    actor = actor_of(request)
+    key = (id(reconciler_of(request)), actor, tuple(names))
     return _recent.get(key, lambda: grouped(map(partial(_facts, request), names)))
 
 
 def _facts(request: Request, name: str) -> RunFacts:
     described = run_routes.run_detail(request, name)
-    run = permitted_run(reconciler_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_METRICS)
     try:
         records = sampled(run, _RECORDS)
     except OSError as error:

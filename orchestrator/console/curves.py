@@ -25,11 +25,11 @@ from typing import Any
 
 from fastapi import Query, Request
 
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.console.live import Recent
 from orchestrator.console.routing import page_router
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import finite, history_of, sampled
 
@@ -53,7 +53,7 @@ def run_curves(
     points: int = Query(default=POINTS, ge=2, le=_MOST_POINTS),
 ) -> dict[str, Any]:
     """A window of a run's metrics."""
-    run = permitted_run(reconciler_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_METRICS)
     key = (str(run.path), tuple(names), begin, end, points)
     try:
         return _recent.get(key, partial(curves_of, run, names, begin, end, points))

@@ -17,9 +17,9 @@ from fastapi.responses import JSONResponse, RedirectResponse
 from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Refusal
 from orchestrator.console.pages import form_token, render, wants_page
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Refusal
 from shared_store.contract.error_text import explain, path_of
 
 TOKEN = "form_token"

@@ -12,11 +12,9 @@ from fastapi import Request, Response
 from fastapi.responses import RedirectResponse
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.api.kept_texts import with_texts
 from orchestrator.api.native.routes import job_detail
-from orchestrator.api.permissions import Operation, current_identity
 from orchestrator.console.curves import columns
 from orchestrator.console.job_config import before_it, code_of, differences
 from orchestrator.console.job_facts import attempts_of, checkpoints_of, child_of, facts_of
@@ -30,6 +28,8 @@ from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.reasons import short_id
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
 from shared_store.volume.learning_metrics import LEARNING
@@ -45,18 +45,18 @@ _RECORDS = 200
 @router.get("/jobs/{reference}")
 def job(request: Request, reference: str) -> Response:
     """The page; a name or the start of an id is redirected to it. Without the store it has what the database knows."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     detail = job_detail(request, reference)
     if detail["id"] != reference:
         return RedirectResponse(f"/jobs/{detail['id']}", 303)
-    described = batch.call(reconciler, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
+    described = batch.call(reconciler, actor, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
     array = described.get("arrayProperties", {})
     spec = detail["spec"] or {}
     is_visible = detail["results"] is not None
     before, files, checkpoints = None, list[File](), dict[str, Any]()
     if detail["storeProblem"] is None:
         try:
-            spec, before, files, checkpoints = reconciler.calls.call(partial(_read, reconciler, detail))
+            spec, before, files, checkpoints = reconciler.calls.call(partial(_read, reconciler, actor, detail))
         except StoreSilent as error:
             detail["storeProblem"] = str(error)
     view = views.state(detail["id"])
@@ -94,8 +94,8 @@ def job(request: Request, reference: str) -> Response:
 @_stored.get("/jobs/{reference}/stream")
 def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     """The changes of the page and the new lines of its log, as events. The id of an event is the page's position in both."""
-    reconciler = reconciler_of(request)
-    key = (id(reconciler), current_identity.get(), chosen.job)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    key = (id(reconciler), actor, chosen.job)
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
     iteration, places = _had(last_id(request))
     log = LiveLog(reconciler.logs, chosen, chosen.end() if places is None else places)
@@ -103,24 +103,25 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 
 
 def _read(
-    reconciler: Reconciler, detail: Mapping[str, Any]
+    reconciler: Reconciler, actor: Actor, detail: Mapping[str, Any]
 ) -> tuple[Mapping[str, Any], tuple[str, str, Mapping[str, Any]] | None, list[File], dict[str, Any]]:
     """What the page has from the store: the spec with its texts, the other side of the comparison, the run's files, and its checkpoints."""
     spec = with_texts(reconciler, detail["run"], detail["spec"] or {})
-    files = _files(reconciler, detail["run"]) if detail["results"] is not None else []
-    return spec, before_it(reconciler, detail), files, _checkpoints(reconciler, detail)
+    files = _files(reconciler, actor, detail["run"]) if detail["results"] is not None else []
+    return spec, before_it(reconciler, actor, detail), files, _checkpoints(reconciler, actor, detail)
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:
     """The parts of the page that change; open pages of the same job share them."""
+    actor = actor_of(request)
     detail = job_detail(request, job_id)
     facts = {**facts_of(detail), "view": views.state(job_id, is_seen=True).text}
-    checkpoints = _checkpoints(reconciler_of(request), detail)
+    checkpoints = _checkpoints(reconciler_of(request), actor, detail)
     return {"facts": facts, "attempts": attempts_of(detail), "checkpoints": checkpoints}
 
 
-def _checkpoints(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:
-    return checkpoints_of(reconciler, detail["run"]) if detail["results"] is not None else {}
+def _checkpoints(reconciler: Reconciler, actor: Actor, detail: Mapping[str, Any]) -> dict[str, Any]:
+    return checkpoints_of(reconciler, actor, detail["run"]) if detail["results"] is not None else {}
 
 
 @dataclass
@@ -183,9 +184,9 @@ def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
     return None, None
 
 
-def _files(reconciler: Reconciler, name: str) -> list[File]:
+def _files(reconciler: Reconciler, actor: Actor, name: str) -> list[File]:
     try:
-        return files_of(permitted_run(reconciler, name, Operation.READ_RUN))
+        return files_of(permitted_run(reconciler, actor, name, Operation.READ_RUN))
     except (ClientError, DamagedFile, OSError):
         return []
 

@@ -7,22 +7,21 @@ from typing import Any, Literal
 
 from fastapi import Depends, Request, Response
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.api.native import clones, continuing, routes, runs
 from orchestrator.api.native.continuing import Changes
 from orchestrator.api.native.model_routes import RegisterRequest, register_model
 from orchestrator.api.native.routes import permitted_job
-from orchestrator.api.permissions import Operation
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.reasons import short_id
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.volume.checkpoints import list_checkpoints
@@ -35,11 +34,12 @@ _Wanted = int | Literal["best", "latest"] | None
 @router.post("/jobs/{reference}/stop")
 def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Stop the job."""
+    actor = actor_of(request)
     job, name, _, _ = _job(request, reference, Operation.TERMINATE_JOB)
     text = "A training saves a checkpoint before it leaves, and can be resumed. A waiting job is cancelled."
     form.confirm(Question(f"Stop {name}?", text, "Stop"))
-    reason = f"stopped in the console by {permissions.current_identity.get().name}"
-    batch.call(reconciler_of(request), "TerminateJob", {"jobId": job, "reason": reason})
+    reason = f"stopped in the console by {actor.name}"
+    batch.call(reconciler_of(request), actor, "TerminateJob", {"jobId": job, "reason": reason})
     return done(request, f"/jobs/{job}", f"{name} is asked to stop")
 
 
@@ -56,6 +56,7 @@ def save(request: Request, reference: str) -> Response:
 @_stored.post("/jobs/{reference}/resume")
 def resume(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that continues the run."""
+    actor = actor_of(request)
     run, directory = _run(request, reference, Operation.RESUME_RUN)
     wanted = _checkpoint(form)
     chosen = choose(run, wanted)
@@ -68,16 +69,17 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
     changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepted(form) else []))
-    answer = runs.resume(reconciler_of(request), run, Changes(iteration, changes, directory))
+    answer = runs.resume(reconciler_of(request), actor, run, Changes(iteration, changes, directory))
     return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
 
 
 @_stored.post("/jobs/{reference}/clone")
 def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that begins a new run with the weights of a checkpoint."""
+    actor = actor_of(request)
     run, directory = _run(request, reference, Operation.CLONE_RUN)
     name = _named(form, "the new run")
-    told = clones.clone(reconciler_of(request), run, name, Changes(_checkpoint(form), _changes(form), directory))
+    told = clones.clone(reconciler_of(request), actor, run, name, Changes(_checkpoint(form), _changes(form), directory))
     parent = told["parent"]
     return done(request, f"/jobs/{told['jobId']}", f"cloned {parent['run']}@{parent['iteration']} as run {told['run']}")
 
@@ -130,32 +132,35 @@ def _beside(request: Request, reference: str, form: Form, kind: str) -> Response
 
 def _submitted(request: Request, document: Mapping[str, Any], directory: str, what: str) -> Response:
     """Submit a job and go to its page. Raises ClientError."""
+    actor = actor_of(request)
     try:
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    answer = continuing.submit_alone(reconciler_of(request), spec, directory, what)
+    answer = continuing.submit_alone(reconciler_of(request), actor, spec, directory, what)
     return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']}")
 
 
 def _job(request: Request, reference: str, operation: Operation) -> tuple[str, str, str, str]:
     """Id, title, run and working directory of a job with which the caller may do this. Raises ClientError."""
+    actor = actor_of(request)
     with reconciler_of(request).database.session() as session:
-        job = permitted_job(session, reference, operation)
+        job = permitted_job(session, actor, reference, operation)
         return job.id, f"{job.name} ({short_id(job.id)})", job.run, job.gang.options.directory
 
 
 def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, str]:
     """The run of a job, with which the caller may do this, and the job's working directory. Raises ClientError."""
     _, _, run, directory = _job(request, reference, Operation.READ_JOB)
-    return permitted_run(reconciler_of(request), run, operation), directory
+    return permitted_run(reconciler_of(request), actor_of(request), run, operation), directory
 
 
 def _trained(request: Request, run: Run) -> Mapping[str, Any]:
+    actor = actor_of(request)
     reconciler: Reconciler = reconciler_of(request)
     found = facts_of(run)
     with reconciler.database.session() as session:
-        spec = runs.spec_of(session, found) or {}
+        spec = runs.spec_of(session, actor, found) or {}
     if not spec.get("train"):
         raise ClientError(f"run {run.name} is no training, so it has no policy")
     return spec

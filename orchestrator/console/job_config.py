@@ -9,16 +9,15 @@ from typing import Any
 import yaml
 from sqlalchemy import select
 
-from orchestrator.api import permissions
 from orchestrator.api.context import permitted_run
 from orchestrator.api.damaged import reading
-from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import with_texts
 from orchestrator.api.native import runs
-from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.persistence.models import Job
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.files import DamagedFile
 
 _ABSENT = object()
@@ -76,12 +75,14 @@ def _shown(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"
 
 
-def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, str, Mapping[str, Any]] | None:
+def before_it(
+    reconciler: Reconciler, actor: Actor, detail: Mapping[str, Any]
+) -> tuple[str, str, Mapping[str, Any]] | None:
     """The other side of the configuration's comparison: a title, an address and a spec; None where there is none.
 
     That is the job before it in its run, else the run whose weights a clone began with.
     """
-    queues = permissions.visible_queues()
+    queues = actor.queues
     with reconciler.database.session() as session:
         query = select(Job).where(
             Job.run == detail["run"], Job.created_at < detail["createdAt"], Job.id != detail["id"]
@@ -94,17 +95,17 @@ def before_it(reconciler: Reconciler, detail: Mapping[str, Any]) -> tuple[str, s
                 spec = earlier.gang.spec
             if spec:
                 spec = with_texts(reconciler, detail["run"], spec)
-                return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", permissions.shown(spec)
+                return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", actor.shown(spec)
     parent = (detail["results"] or {}).get("parent") or {}
     name = parent.get("run")
     if not isinstance(name, str):
         return None
     try:
-        run = facts_of(permitted_run(reconciler, name, Operation.READ_RUN))
+        run = facts_of(permitted_run(reconciler, actor, name, Operation.READ_RUN))
         with reconciler.database.session() as session:
-            spec = runs.spec_of(session, run)
+            spec = runs.spec_of(session, actor, run)
     except (ClientError, DamagedFile, OSError):
         return None  # deleted, or another's
     if not spec:
         return None
-    return f"its parent {name}", f"/runs/{name}", permissions.shown(with_texts(reconciler, name, spec))
+    return f"its parent {name}", f"/runs/{name}", actor.shown(with_texts(reconciler, name, spec))

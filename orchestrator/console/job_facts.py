@@ -8,13 +8,13 @@ from functools import lru_cache
 from typing import Any
 
 from orchestrator.api.context import permitted_run
-from orchestrator.api.errors import ClientError
 from orchestrator.api.native import runs
-from orchestrator.api.permissions import Operation
 from orchestrator.console import words
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase
 from shared_store.volume.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
@@ -167,10 +167,10 @@ def _automatic(told: Mapping[str, Any] | None) -> str:
     return "; ".join([*parts, *([told["problem"]] if told["problem"] else [])])
 
 
-def checkpoints_of(reconciler: Reconciler, run: str) -> dict[str, dict[str, Any]]:
+def checkpoints_of(reconciler: Reconciler, actor: Actor, run: str) -> dict[str, dict[str, Any]]:
     """The rows of a run's newest checkpoints and its best one, by name, the newest first; none where they can't be seen."""
     try:
-        found = permitted_run(reconciler, run, Operation.READ_CHECKPOINTS)
+        found = permitted_run(reconciler, actor, run, Operation.READ_CHECKPOINTS)
         return _checkpoints(found)
     except (ClientError, OSError):
         return {}

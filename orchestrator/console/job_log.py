@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.http.following import PIECE
 from orchestrator.api.native.log_stream import positions_of
 from orchestrator.api.native.routes import permitted_job
-from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Event
 from orchestrator.console.routing import page_router
 from orchestrator.control.log_hub import LogHub
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.volume.log_view import Chosen, LogView, Places
 from shared_store.volume.log_windows import LINES_A_WINDOW, Window, first_error, lines_after, lines_before, search
 from shared_store.volume.logs import LogLine
@@ -39,9 +39,9 @@ def chosen_log(
     attempt: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
 ) -> Chosen:
     """The lines of the job that are asked for; empty numbers mean all. Raises ClientError."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     with reconciler.database.session() as session:
-        job = permitted_job(session, reference, Operation.READ_JOB_LOGS)
+        job = permitted_job(session, actor, reference, Operation.READ_JOB_LOGS)
         run, job_id = reconciler.store.run(job.run), job.id
     numbers = (int(each) if each else None for each in (node, rank, attempt))
     return Chosen(run, job_id, *numbers)

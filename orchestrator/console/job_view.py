@@ -19,13 +19,13 @@ from urllib.parse import urlsplit
 from fastapi import Request, Response
 
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.native.routes import job_detail
-from orchestrator.api.permissions import Operation
 from orchestrator.console.forms import done
 from orchestrator.console.routing import page_router
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.process.tether import start_tied
 
 router = page_router()
@@ -145,7 +145,7 @@ def show(request: Request, reference: str) -> Response:
         raise ClientError(f"job {detail['name']} is no training that runs; its checkpoints can be recorded", CONFLICT)
     if find_spec("newton") is None:
         raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
-    run = permitted_run(reconciler_of(request), detail["run"], Operation.READ_RUN)
+    run = permitted_run(reconciler_of(request), actor_of(request), detail["run"], Operation.READ_RUN)
     command = [sys.executable, "-P", "-m", "worker.telemetry.view", "--training", str(run.path), "--job", detail["id"]]
     views.start(detail["id"], [*command, "--port", "0", "--framed-by", _origin(request)])
     return done(request, f"/jobs/{detail['id']}", "the live view starts")

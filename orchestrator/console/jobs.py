@@ -10,12 +10,9 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import queue_names, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, queue_names, reconciler_of
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
-from orchestrator.api.permissions import current_identity
 from orchestrator.console import words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Recent, Rows, stream
@@ -24,6 +21,8 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.reasons import short_id
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor
 from shared_store.contract.error_text import counted
 
 router = page_router()
@@ -71,10 +70,11 @@ def _choice(
 @router.get("/")
 def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The table."""
+    actor = actor_of(request)
     reconciler, chosen = reconciler_of(request), choice.filter
-    rows, totals = _window(reconciler, choice)
+    rows, totals = _window(reconciler, actor, choice)
     with reconciler.database.session() as session:
-        queues = queue_names(session)
+        queues = queue_names(session, actor)
     return render(
         request,
         "jobs.html",
@@ -92,7 +92,8 @@ def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
 @router.get("/jobs/stream")
 def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The changes in a window of the table, as events."""
-    table, look = Rows(), partial(_window, reconciler_of(request), choice)
+    actor = actor_of(request)
+    table, look = Rows(), partial(_window, reconciler_of(request), actor, choice)
 
     def changes() -> Sequence[Event]:
         return table.changes(*look())
@@ -103,11 +104,11 @@ def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Respons
 @router.post("/jobs/stop")
 def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Stop the jobs that were chosen, or all that the filter finds."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     if form.one("all") == "yes":
         wanted = _wanted(form.one("state"), form.one("queue"), form.one("search"))
         with reconciler.database.session() as session:
-            ids = ids_of(session, wanted)
+            ids = ids_of(session, actor, wanted)
     else:
         ids = form.every("job")
     if not ids:
@@ -116,9 +117,11 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     text = "Trainings save a checkpoint before they leave, and can be resumed. Waiting jobs are cancelled."
     form.confirm(Question(f"Stop {several}?", text, f"Stop {several}"))
     errors = []
-    reason = f"stopped in the console by {current_identity.get().name}"
+    reason = f"stopped in the console by {actor.name}"
     for start in range(0, len(ids), _AT_ONCE):
-        answer = batch.call(reconciler, "TerminateJobs", {"jobs": ids[start : start + _AT_ONCE], "reason": reason})
+        answer = batch.call(
+            reconciler, actor, "TerminateJobs", {"jobs": ids[start : start + _AT_ONCE], "reason": reason}
+        )
         errors += answer["errors"]
     if errors:
         raise ClientError(f"{len(errors)} of {several} can't be stopped: {errors[0]['message']}", 403)
@@ -135,15 +138,17 @@ def _wanted(state: str, queue: str, search: str) -> Wanted:
     return Wanted(GROUPS[state], queue, search)
 
 
-def _window(reconciler: Reconciler, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def _window(reconciler: Reconciler, actor: Actor, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Rows of a page of the table, by id, and the totals; open pages of all who see the same queues share them."""
-    seen = permissions.visible_queues()
+    seen = actor.queues
     key = (id(reconciler), None if seen is None else tuple(sorted(seen)), choice.wanted, choice.after, choice.before)
-    return _recent.get(key, partial(_read_window, reconciler, choice))
+    return _recent.get(key, partial(_read_window, reconciler, actor, choice))
 
 
-def _read_window(reconciler: Reconciler, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    found = page_of_jobs(reconciler, choice.wanted, ROWS, choice.after, choice.before)
+def _read_window(
+    reconciler: Reconciler, actor: Actor, choice: _Choice
+) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    found = page_of_jobs(reconciler, actor, choice.wanted, ROWS, choice.after, choice.before)
     rows = {job["id"]: _row(job) for job in found["jobs"]}
     counts, more = found["counts"], "+" if found["areMore"] else ""
     totals = {

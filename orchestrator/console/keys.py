@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from fastapi import Depends, Request, Response
 
 from orchestrator.api.arns import here
-from orchestrator.api.context import queue_names, reconciler_of
+from orchestrator.api.context import actor_of, queue_names, reconciler_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
-from orchestrator.api.permissions import current_identity
 from orchestrator.console import words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Rows, stream
@@ -24,9 +23,10 @@ _INTERVAL = 1.0
 @router.get("/keys")
 def keys(request: Request) -> Response:
     """The list."""
+    actor = actor_of(request)
     rows = _rows(request)
     with reconciler_of(request).database.session() as session:
-        queues = queue_names(session)
+        queues = queue_names(session, actor)
     blank = dict.fromkeys(("name", "id", "rights", "created", "own"), "")
     return render(
         request, "keys.html", rows=list(rows.values()), blank=blank, queues=queues, writable=is_writable(request)
@@ -46,7 +46,8 @@ def keys_stream(request: Request) -> Response:
 
 def _rows(request: Request) -> dict[str, dict[str, str]]:
     """The texts of each key's row, by its name. Raises ClientError."""
-    own = current_identity.get().name
+    actor = actor_of(request)
+    own = actor.name
     return {
         key.name: {
             "name": key.name,
@@ -73,10 +74,11 @@ def create(request: Request, form: Form = Depends(sent_form)) -> Response:
 @router.post("/keys/delete")
 def delete(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Delete a key."""
+    actor = actor_of(request)
     name = form.one("name")
     there = {key.name for key in list_keys(request)}
     notes = ["Whoever uses it is refused from the next request on."]
-    if current_identity.get().name == f"key {name}":
+    if actor.name == f"key {name}":
         notes.append("It is your own: you are logged out.")
     if there == {name}:
         notes.append(

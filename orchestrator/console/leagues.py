@@ -10,13 +10,11 @@ from typing import Any
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.native import league_routes as api
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.league_routes import LEAGUE_TAG, MODEL_TAG
 from orchestrator.api.native.model_routes import list_models
-from orchestrator.api.permissions import current_identity
 from orchestrator.console.forms import Form, Question, body_of, done, sent_form
 from orchestrator.console.live import Recent, Rows, stream
 from orchestrator.console.pages import render
@@ -24,6 +22,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import races as races_of
 from orchestrator.console.tracks import track_names
 from orchestrator.domain.job import Status
+from orchestrator.services.errors import ClientError
 from shared_store.contract.error_text import counted
 from shared_store.leagues import moment
 from shared_store.races import clock
@@ -90,12 +89,11 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
 @router.get("/leagues/{name}/stream")
 def race_stream(request: Request, name: str) -> Response:
     """The changes in the list of races, as events."""
+    actor = actor_of(request)
     rows = Rows()
     look = partial(_races, request, name)
     api.read_league(request, name)
-    return stream(
-        request, lambda: rows.changes(_recent.get((current_identity.get(), name), look), {}), _INTERVAL, stored=True
-    )
+    return stream(request, lambda: rows.changes(_recent.get((actor, name), look), {}), _INTERVAL, stored=True)
 
 
 @router.post("/leagues/{name}/races")
@@ -210,12 +208,12 @@ def _rules(league: Mapping[str, Any]) -> dict[str, Any]:
 
 def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
     """The newest races of a league that the caller may see, by job, without those that are entered."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
-    jobs = page_of_jobs(reconciler, Wanted(search=begins), _READ)["jobs"]
+    jobs = page_of_jobs(reconciler, actor, Wanted(search=begins), _READ)["jobs"]
     if not jobs:
         return {}
-    described = batch.call(reconciler, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
+    described = batch.call(reconciler, actor, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
     entered = api.entered_jobs(request, name)
     ours = [job for job in jobs if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered]

@@ -16,14 +16,13 @@ from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import format_sse_event
 
-from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.following import Following, looked_patiently
-from orchestrator.api.permissions import current_identity
 from orchestrator.console.pages import session
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.errors import Unavailable
+from orchestrator.services.errors import ClientError
 from shared_store.volume.files import DamagedFile
 
 INTERVAL = 0.5
@@ -74,8 +73,9 @@ def stream(
     It also ends where its reader would not be admitted any more: a deleted key, a session that is over. The browser comes back, and is
     sent to the login.
     """
+    actor = actor_of(request)
     access: Access = request.app.state.access
-    identity = current_identity.get()
+    identity = actor
     given = "" if "authorization" in request.headers else session(request)
 
     def admitted() -> bool:

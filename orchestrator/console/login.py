@@ -10,10 +10,10 @@ from fastapi.responses import RedirectResponse
 from orchestrator.api.http.access import SESSION, Access
 from orchestrator.api.http.auth import LOGIN, LOGOUT, cookie_name
 from orchestrator.api.http.limits import RateLimit
-from orchestrator.api.permissions import Refusal
 from orchestrator.console.forms import Form, sent_form
 from orchestrator.console.pages import render, session
 from orchestrator.console.routing import page_router
+from orchestrator.services.permissions import Refusal
 
 router = page_router()
 

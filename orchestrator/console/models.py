@@ -7,13 +7,13 @@ from typing import Any
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.errors import ClientError
 from orchestrator.api.native.model_routes import list_models, read_model
 from orchestrator.api.native.run_routes import run_detail
 from orchestrator.console.lineage import drawing
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import written
+from orchestrator.services.errors import ClientError
 from shared_store.volume.files import DamagedFile
 
 router = page_router(stored=True)

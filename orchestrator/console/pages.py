@@ -11,10 +11,11 @@ from fastapi import Request, Response
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
+from orchestrator.api.context import actor_of
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import error_response, session_of
-from orchestrator.api.permissions import current_identity
 from orchestrator.console import assets, words
+from orchestrator.services.permissions import Actor
 from shared_store import __version__
 
 POLICY = (
@@ -75,10 +76,11 @@ def render(request: Request, template: str, status: int = 200, frame: str = "", 
 
     ``frame``: the one other origin whose page it shows in a frame.
     """
+    actor = actor_of(request)
     theme = request.cookies.get(THEME)
     shared: dict[str, Any] = {
-        "identity": current_identity.get(),
-        "may_change": may_change(),
+        "actor": actor,
+        "may_change": may_change(actor),
         "navigation": _navigation(request),
         "here": request.url.path,
         "theme": theme if theme in ("light", "dark") else "",
@@ -92,9 +94,9 @@ def render(request: Request, template: str, status: int = 200, frame: str = "", 
     return HTMLResponse(text, status, headers)
 
 
-def may_change() -> bool:
+def may_change(actor: Actor) -> bool:
     """Whether the caller may change anything at all: a read-only key sees no buttons that would be refused."""
-    return not current_identity.get().read_only
+    return not actor.read_only
 
 
 def form_token(request: Request) -> str:
@@ -112,8 +114,9 @@ def session(request: Request) -> str:
 
 def _navigation(request: Request) -> list[Entry]:
     """The pages that are there, without those that would be refused."""
-    refused = set() if may_change() else {"/submit"}
-    if current_identity.get().queues is not None:
+    actor = actor_of(request)
+    refused = set() if may_change(actor) else {"/submit"}
+    if actor.queues is not None:
         refused.add("/keys")
     there: set[str] = request.app.state.console_paths
     return [entry for entry in NAVIGATION if entry.path in there - refused]

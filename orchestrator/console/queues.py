@@ -10,9 +10,8 @@ from urllib.parse import urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import reconciler_of
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.native.queue_overview import FIRST, overview
-from orchestrator.api.permissions import current_identity
 from orchestrator.console import words
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
@@ -20,6 +19,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import short_id, title
+from orchestrator.services.permissions import Actor
 from shared_store.contract.error_text import counted
 
 router = page_router()
@@ -32,7 +32,8 @@ _recent = Recent()
 @router.get("/queues")
 def queues(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """All tables, or those of one queue with more of its jobs."""
-    tables = _tables(reconciler_of(request), queue)
+    actor = actor_of(request)
+    tables = _tables(reconciler_of(request), actor, queue)
     return render(
         request,
         "queues.html",
@@ -47,7 +48,8 @@ def queues(request: Request, queue: str = Query(default="", max_length=128)) -> 
 @router.get("/queues/stream")
 def queues_stream(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """The changes in the tables, as events."""
-    look = partial(_tables, reconciler_of(request), queue)
+    actor = actor_of(request)
+    look = partial(_tables, reconciler_of(request), actor, queue)
     known = {name: Rows(name) for name in _ROWS}
 
     def changes() -> Sequence[Event]:
@@ -56,14 +58,14 @@ def queues_stream(request: Request, queue: str = Query(default="", max_length=12
     return stream(request, changes)
 
 
-def _tables(reconciler: Reconciler, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+def _tables(reconciler: Reconciler, actor: Actor, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
     """The rows of every table, by key; open pages of the same queue share them."""
-    key = (id(reconciler), current_identity.get(), queue)
-    return _recent.get(key, partial(_read_tables, reconciler, queue))
+    key = (id(reconciler), actor, queue)
+    return _recent.get(key, partial(_read_tables, reconciler, actor, queue))
 
 
-def _read_tables(reconciler: Reconciler, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
-    found = overview(reconciler, queue)
+def _read_tables(reconciler: Reconciler, actor: Actor, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+    found = overview(reconciler, actor, queue)
     waiting = [
         {**job, "queue": each["name"], "place": place}
         for each in found["queues"]

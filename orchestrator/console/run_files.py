@@ -14,10 +14,10 @@ from urllib.parse import quote
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.console.routing import page_router
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.volume.files import DamagedFile, open_inside
 from shared_store.volume.layout import NAME, Run
 
@@ -85,8 +85,8 @@ def _walk(directory: Path, depth: int) -> Iterator[Path]:
 @router.get("/runs/{name}/files/{path:path}")
 def file(request: Request, name: str, path: str) -> Response:
     """A file of a run: pictures are shown, other files are downloaded."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.READ_RUN)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.READ_RUN)
     parts = path.split("/")
     if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):
         raise ClientError(f"run {run.name} shows no file {path[:100]!r}", 404)

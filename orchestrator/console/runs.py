@@ -8,10 +8,9 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import reconciler_of
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.native import run_routes
 from orchestrator.api.native.runs import last_metrics, list_runs
-from orchestrator.api.permissions import current_identity
 from orchestrator.console import words
 from orchestrator.console.curves import number
 from orchestrator.console.live import Event, Recent, Rows, stream
@@ -19,6 +18,7 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.reasons import short_id
+from orchestrator.services.permissions import Actor
 from shared_store.volume.evaluations import told_changes
 from shared_store.volume.learning_metrics import LEARNING, in_words
 from shared_store.volume.metrics import finite, warnings_of
@@ -46,7 +46,8 @@ def runs(
     request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
 ) -> Response:
     """The list, by name, a page at a time."""
-    rows = _window(reconciler_of(request), search, after)
+    actor = actor_of(request)
+    rows = _window(reconciler_of(request), actor, search, after)
     is_full = len(rows) == ROWS
     return render(
         request,
@@ -65,8 +66,9 @@ def runs_stream(
     request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
 ) -> Response:
     """The changes in a page of the list, as events."""
+    actor = actor_of(request)
     table, reconciler = Rows(), reconciler_of(request)
-    return stream(request, lambda: table.changes(_window(reconciler, search, after), {}), _INTERVAL, stored=True)
+    return stream(request, lambda: table.changes(_window(reconciler, actor, search, after), {}), _INTERVAL, stored=True)
 
 
 @router.get("/runs/{name}")
@@ -109,17 +111,19 @@ def run_stream(request: Request, name: str) -> Response:
     return stream(request, changes, stored=True)
 
 
-def _window(reconciler: Reconciler, search: str, after: str) -> dict[str, dict[str, Any]]:
+def _window(reconciler: Reconciler, actor: Actor, search: str, after: str) -> dict[str, dict[str, Any]]:
     """Rows of a page of the list, by the run's name; open pages with the same choice share them."""
 
     def look() -> dict[str, dict[str, Any]]:
-        return {each["run"]: _row(each) for each in list_runs(reconciler, after, ROWS, search)}
+        return {each["run"]: _row(each) for each in list_runs(reconciler, actor, after, ROWS, search)}
 
-    return _listed.get((id(reconciler), current_identity.get(), search, after), look)
+    return _listed.get((id(reconciler), actor, search, after), look)
 
 
 def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, dict[str, dict[str, Any]]]]:
     """A run as the API describes it, and the rows of the page's tables; open pages of the same run share them. Raises ClientError."""
+
+    actor = actor_of(request)
 
     def look() -> tuple[dict[str, Any], dict[str, dict[str, dict[str, Any]]]]:
         described = run_routes.run_detail(request, name)
@@ -130,7 +134,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, di
         }
         return described, {key: {row["key"]: row for row in map(of, given[key])} for key, of in _TABLES.items()}
 
-    return _recent.get((id(reconciler_of(request)), current_identity.get(), name), look)
+    return _recent.get((id(reconciler_of(request)), actor, name), look)
 
 
 def _row(run: Mapping[str, Any]) -> dict[str, Any]:

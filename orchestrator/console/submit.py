@@ -11,15 +11,12 @@ from typing import Any
 from fastapi import Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import queue_names, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, queue_names, reconciler_of
 from orchestrator.api.kept_texts import with_texts
 from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.api.native.plan_routes import PlanRequest
-from orchestrator.api.permissions import Operation
 from orchestrator.api.turns import Turns
 from orchestrator.console.forms import TOKEN, Form, done, sent_form
 from orchestrator.console.live import Recent
@@ -29,6 +26,9 @@ from orchestrator.console.submit_fields import Group, document, filled, groups, 
 from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
 from orchestrator.console.tracks import track_names
 from orchestrator.domain.errors import SpecError
+from orchestrator.services import permissions
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
@@ -58,7 +58,8 @@ _checks = Turns("other jobs are being checked")
 @router.get("/submit")
 def choose(request: Request) -> Response:
     """The page on which the task is chosen."""
-    permissions.check(Operation.SUBMIT_JOB)
+    actor = actor_of(request)
+    actor.check(Operation.SUBMIT_JOB)
     racers = {name: about for name, about in tasks().items() if races(name)}
     others = {name: about for name, about in tasks().items() if name not in racers}
     return render(request, "submit.html", racers=racers, tasks=others)
@@ -97,7 +98,8 @@ def plain_again(request: Request, form: Form = Depends(sent_form)) -> Response:
 @router.post("/submit/check")
 def check(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML of the filled fields, its problem, and help for a line; ``whole`` also tries a reward function."""
-    permissions.check(Operation.SUBMIT_JOB)
+    actor = actor_of(request)
+    actor.check(Operation.SUBMIT_JOB)
     text, _ = _text(request, form)
     spec, problem = _checked(request, text, form.one("whole") == "yes")
     line = form.one("line")
@@ -114,7 +116,8 @@ def check(request: Request, form: Form = Depends(sent_form)) -> Response:
 @_stored.post("/submit/review")
 def review(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML with the hosts on which its nodes would start; or the form again, with its problem."""
-    permissions.check(Operation.SUBMIT_JOB)
+    actor = actor_of(request)
+    actor.check(Operation.SUBMIT_JOB)
     text, task = _text(request, form)
     spec, problem = _checked(request, text, whole=True)
     plan: dict[str, Any] = {}
@@ -147,8 +150,9 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
 @_stored.post("/submit")
 def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Submit the job of a YAML, as ``muster submit`` does; a form that is sent again leads to the job that it made."""
-    permissions.check(Operation.SUBMIT_JOB)
-    sender, once, is_new = permissions.current_identity.get().name, form.one("once"), False
+    actor = actor_of(request)
+    actor.check(Operation.SUBMIT_JOB)
+    sender, once, is_new = actor.name, form.one("once"), False
 
     def make() -> tuple[str, str]:
         nonlocal is_new
@@ -167,14 +171,14 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     definition = compile_definition(spec, "")
     if unfit := _unfit(request, spec, PlanRequest(definition=definition, queue=spec.queue)):
         raise ClientError(unfit.message)
     for text in long_texts(spec):
-        reconciler.texts.keep(text.encode(), permissions.current_identity.get().name)
-    registered = batch.call(reconciler, "RegisterJobDefinition", definition)
-    answer = batch.call(reconciler, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
+        reconciler.texts.keep(text.encode(), actor.name)
+    registered = batch.call(reconciler, actor, "RegisterJobDefinition", definition)
+    answer = batch.call(reconciler, actor, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
     return answer["jobId"], answer["jobName"]
 
 
@@ -199,7 +203,8 @@ def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, Pro
     A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys the text of a reward function
     is checked here, and the job's ranks try it.
     """
-    tries = whole and permissions.current_identity.get().queues is None
+    actor = actor_of(request)
+    tries = whole and actor.queues is None
     try:
         with (_turns if tries else _checks).turn():
             store = str(reconciler_of(request).store.path)
@@ -225,16 +230,18 @@ def _lines(text: str) -> str:
 
 
 def _groups(request: Request, task: str) -> list[Group]:
-    permissions.check(Operation.SUBMIT_JOB)
+    actor = actor_of(request)
+    actor.check(Operation.SUBMIT_JOB)
     if task not in tasks():
         raise ClientError(f"no task is called {task[:100]!r}; {nearest(task, list(tasks()))}", 404)
     with reconciler_of(request).database.session() as session:
-        return groups(task, queue_names(session))
+        return groups(task, queue_names(session, actor))
 
 
 def _wizard(
     request: Request, task: str, found: Sequence[Group], problem: Problem | None, status: int = 200
 ) -> Response:
+    actor = actor_of(request)
     text = written(document(task, found))
     there, missing = track_names(request) if races(task) else ([], "")
     names = [each.name for group in found for each in group.fields]
@@ -250,7 +257,7 @@ def _wizard(
         no_tracks=missing,
         problem=problem,
         wrong_name=_nearest_field(problem.key, names) if problem else "",
-        tries=permissions.current_identity.get().queues is None,
+        tries=actor.queues is None,
     )
 
 
@@ -260,7 +267,8 @@ def _nearest_field(key: str, names: Sequence[str]) -> str:
 
 
 def _editor(request: Request, text: str, problem: Problem | None, status: int = 200) -> Response:
-    permissions.check(Operation.SUBMIT_JOB)
+    actor = actor_of(request)
+    actor.check(Operation.SUBMIT_JOB)
     return render(request, "submit_yaml.html", status, text=text, problem=problem, help=help_at(text, 1))
 
 

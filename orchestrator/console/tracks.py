@@ -9,15 +9,14 @@ from urllib.parse import quote
 
 from fastapi import Depends, Query, Request, Response
 
-from orchestrator.api import permissions
-from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.native.track_routes import MakeRequest, list_tracks, make_track, picture
-from orchestrator.api.permissions import Operation, current_identity
 from orchestrator.console.forms import Form, body_of, done, sent_form
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store import tracks as stored
 from shared_store.contract.error_text import nearest
 
@@ -34,9 +33,10 @@ _recent = Recent(60.0)
 @router.get("/tracks")
 def tracks(request: Request, name: str = Query(default="", max_length=130)) -> Response:
     """All tracks; with ``name`` that one, so that any seed can be looked at."""
+    actor = actor_of(request)
     if name:
         return track(request, name)
-    may_make = current_identity.get().queues is None
+    may_make = actor.queues is None
     shown = [facts(each) for each in known(request)]
     return render(request, "tracks.html", tracks=shown, may_make=may_make, presets=stored.PRESETS)
 
@@ -72,15 +72,16 @@ def outline(request: Request, name: str) -> Response:
 @router.get("/tracks/{name}/picture.png")
 def large(request: Request, name: str) -> Response:
     """The picture that ``muster tracks show`` draws."""
-    permissions.check(Operation.LIST_TRACKS)
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    actor.check(Operation.LIST_TRACKS)
     key = ("picture", str(reconciler.store.path), name)
     return _picture(_recent.get(key, partial(picture, reconciler, name)), "image/png")
 
 
 def known(request: Request) -> Sequence[Mapping[str, Any]]:
     """All tracks with their measures and borders. Raises ClientError."""
-    permissions.check(Operation.LIST_TRACKS)
+    actor = actor_of(request)
+    actor.check(Operation.LIST_TRACKS)
     store = reconciler_of(request).store
     try:
         names = tuple(stored.names(store))

@@ -9,17 +9,16 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation, Shared
 from orchestrator.control.compute_environments import is_built_in
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation, Shared
 
 _MOST_COMPUTE_ENVIRONMENTS = 50
 _SERVICE_ROLE = "/aws-service-role/batch.amazonaws.com/AWSServiceRoleForBatch"
@@ -27,7 +26,7 @@ _SERVICE_ROLE = "/aws-service-role/batch.amazonaws.com/AWSServiceRoleForBatch"
 
 def create_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CreateComputeEnvironment. Subnets, instance types and the like are kept and shown, and mean nothing to the engine."""
-    permissions.check(Operation.CREATE_COMPUTE_ENVIRONMENT, Shared())
+    context.actor.check(Operation.CREATE_COMPUTE_ENVIRONMENT, Shared())
     name = request["computeEnvironmentName"]
     rules.check_name("computeEnvironmentName", name)
     rules.check_tags(request.get("tags") or {})
@@ -62,7 +61,7 @@ def describe_compute_environments(context: Context, request: dict[str, Any]) -> 
 def update_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateComputeEnvironment: state and resources; running jobs are left alone."""
     compute_environment = _compute_environment(context, request["computeEnvironment"])
-    permissions.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, compute_environment)
+    context.actor.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, compute_environment)
     _check_members(request)
     if (state := request.get("state")) is not None:
         compute_environment.state = _state(state)
@@ -92,7 +91,7 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
 
 def delete_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteComputeEnvironment of one that is DISABLED and in no queue."""
-    permissions.check(Operation.DELETE_COMPUTE_ENVIRONMENT, Shared())
+    context.actor.check(Operation.DELETE_COMPUTE_ENVIRONMENT, Shared())
     compute_environment = context.session.get(
         ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment")
     )
@@ -110,7 +109,7 @@ def delete_compute_environment(context: Context, request: dict[str, Any]) -> dic
 
 def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CreateSchedulingPolicy with a fairsharePolicy."""
-    permissions.check(Operation.CREATE_SCHEDULING_POLICY, Shared())
+    context.actor.check(Operation.CREATE_SCHEDULING_POLICY, Shared())
     name = request["name"]
     rules.check_name("name", name)
     rules.check_tags(request.get("tags") or {})
@@ -148,7 +147,7 @@ def list_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[
 def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateSchedulingPolicy: the fairsharePolicy is replaced."""
     policy = _policy(context, request["arn"])
-    permissions.check(Operation.UPDATE_SCHEDULING_POLICY, policy)
+    context.actor.check(Operation.UPDATE_SCHEDULING_POLICY, policy)
     if request.get("quotaSharePolicy"):
         raise ClientError(f"Scheduling policy {policy.name} has a fairsharePolicy; its kind can't change")
     if (fairshare := request.get("fairsharePolicy")) is not None:
@@ -160,7 +159,7 @@ def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
 def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteSchedulingPolicy of one that no queue uses."""
     policy = _policy(context, request["arn"])
-    permissions.check(Operation.DELETE_SCHEDULING_POLICY, policy)
+    context.actor.check(Operation.DELETE_SCHEDULING_POLICY, policy)
     user = context.session.scalars(select(JobQueue).where(JobQueue.policy == policy.name).limit(1)).first()
     if user is not None:
         raise ClientError(f"Scheduling policy {policy.name} is used by job queue {user.name}; delete that first")

@@ -6,17 +6,17 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, plain_name
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import check_texts
-from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import JobDefinition
+from orchestrator.services import permissions
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 
@@ -50,7 +50,7 @@ def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any],
     newest = context.session.execute(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
     revision = newest.revision + 1 if newest else 1
     # the name stays its owner's when a key with all queues adds a revision
-    owner = (newest.owner if newest else None) or permissions.current_identity.get().name
+    owner = (newest.owner if newest else None) or context.actor.name
     document = {key: value for key, value in request.items() if key != "tags"}
     context.session.add(
         JobDefinition(name=name, revision=revision, document=document, owner=owner, tags=request.get("tags") or {})
@@ -71,7 +71,7 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
             if any(each.name == name and revision in ("", str(each.revision)) for name, _, revision in wanted)
             and request.get("status") in (None, each.status)
         ]
-        return {"jobDefinitions": [_describe(each) for each in found]}
+        return {"jobDefinitions": [_describe(context.actor, each) for each in found]}
     if name := request.get("jobDefinitionName"):
         query = query.where(JobDefinition.name == plain_name(name, "job-definition").partition(":")[0])
     if status := request.get("status"):
@@ -79,7 +79,7 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
     found_page, token = page(
         context.session, query, request, page_size(request, 100), (JobDefinition.name, JobDefinition.revision)
     )
-    return {"jobDefinitions": [_describe(each) for each in found_page], **token}
+    return {"jobDefinitions": [_describe(context.actor, each) for each in found_page], **token}
 
 
 def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -98,14 +98,14 @@ def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict
 
 def _check_owner(context: Context, name: str, operation: Operation) -> None:
     """Refuse a name that another key has registered: jobs are submitted by the bare name."""
-    caller = permissions.current_identity.get().name
+    caller = context.actor.name
     foreign = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.owner.is_distinct_from(caller))
-    permissions.check(operation, *context.session.scalars(foreign.limit(1)))
+    context.actor.check(operation, *context.session.scalars(foreign.limit(1)))
 
 
-def _describe(definition: JobDefinition) -> dict[str, Any]:
+def _describe(actor: Actor, definition: JobDefinition) -> dict[str, Any]:
     document = definition.document
-    if not permissions.is_visible(definition):
+    if not actor.may_see(definition):
         document = permissions.without_values(document)
     shown = {
         "containerOrchestrationType": "ECS",

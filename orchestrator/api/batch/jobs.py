@@ -8,18 +8,17 @@ from typing import Any
 from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import selectinload
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, queue_arn, split_reference
 from orchestrator.api.batch.describe import array_properties, describe_damaged, describe_job, node_status, summarize
 from orchestrator.api.batch.paging import decode, encode, page, page_size
 from orchestrator.api.context import Context
 from orchestrator.api.damaged import DamagedRow, reading
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import JobsOf, Operation
 
 
 def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -29,7 +28,7 @@ def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     jobs = {job.id: job for job in context.session.scalars(query)}
     for job_id, node in wanted:
         job = jobs.get(job_id)
-        if job is None or not permissions.is_visible(job):
+        if job is None or not context.actor.may_see(job):
             continue
         reason = context.reason(job)
         try:
@@ -60,7 +59,7 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     if array := request.get("arrayJobId"):
         job_id, _ = split_reference(array)
         if (parent := context.session.get(Job, job_id)) is not None:
-            permissions.check(Operation.LIST_JOBS, parent)
+            context.actor.check(Operation.LIST_JOBS, parent)
         status = request.get("jobStatus", Status.RUNNING)
         query = select(Job).where(Job.parent == job_id, Job.status == status).order_by(Job.array_index, Job.id)
         query = query.options(selectinload(Job.attempts))
@@ -69,7 +68,7 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         )
     else:
         queue = context.queue(request["jobQueue"], deleting=True)
-        permissions.check(Operation.LIST_JOBS, JobsOf(queue.name))
+        context.actor.check(Operation.LIST_JOBS, JobsOf(queue.name))
         conditions = _conditions(request)
         query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
         query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))
@@ -91,7 +90,7 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     job = context.session.get(Job, split_reference(request["multiNodeJobId"])[0])
     if job is None or job.kind != "multinode":
         return {"jobSummaryList": []}
-    permissions.check(Operation.LIST_JOBS, job)
+    context.actor.check(Operation.LIST_JOBS, job)
     wanted, reason = request.get("jobStatus", Status.RUNNING), context.reason(job)
     with reading(job):
         nodes = [node for node in range(len(job.gang.nodes)) if node_status(job, node) == wanted]
@@ -221,7 +220,7 @@ def _target(context: Context, reference: str, operation: Operation) -> ColumnEle
     job = context.session.get(Job, job_id)
     if job is None:
         raise UnknownJob(f"Job {reference[:300]} does not exist")
-    permissions.check(operation, job)
+    context.actor.check(operation, job)
     return or_(Job.id == job.id, Job.parent == job.id) if job.kind == "array" else Job.id == job.id
 
 

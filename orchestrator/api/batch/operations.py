@@ -7,21 +7,21 @@ model can't say.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
 from orchestrator.api.batch.service_model import service_model
 from orchestrator.api.context import Context, Known, with_store
-from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
-from orchestrator.api.permissions import Operation
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.initial_weights import TeacherCopy
 
 OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
@@ -84,7 +84,9 @@ def validate(operation: str, request: object) -> dict[str, Any]:
     return request
 
 
-def call(reconciler: Reconciler, operation: str, request: object, idempotency_key: str | None = None) -> dict[str, Any]:
+def call(
+    reconciler: Reconciler, actor: Actor, operation: str, request: object, idempotency_key: str | None = None
+) -> dict[str, Any]:
     """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Reconciler.check_writable`)."""
     handler = OPERATIONS.get(operation)
     if handler is None:
@@ -96,22 +98,24 @@ def call(reconciler: Reconciler, operation: str, request: object, idempotency_ke
         )
     checked = validate(operation, request)
     permitted = Operation(operation)
-    permissions.check(permitted)
+    actor.check(permitted)
     if permitted.reads:
         with reconciler.database.session() as session:
-            answer: dict[str, Any] = permissions.shown(handler(Context(session, reconciler), checked))
+            answer: dict[str, Any] = actor.shown(handler(Context(session, reconciler, actor), checked))
             return answer
 
     def carry_out(known: Known) -> dict[str, Any]:
         with reconciler.writing, reconciler.database.session() as session:
-            return handler(Context(session, reconciler, idempotency_key, known=known), checked)
+            return handler(Context(session, reconciler, actor, idempotency_key, known=known), checked)
 
     def submit(teacher: TeacherCopy | None) -> dict[str, Any]:
         def call(known: Known) -> dict[str, Any]:
-            context = partial(
-                Context, reconciler=reconciler, idempotency_key=idempotency_key, teacher=teacher, known=known
-            )
-            return reconciler.submissions.call(lambda session: handler(context(session), checked))
+            def handle(session: Session) -> dict[str, Any]:
+                return handler(
+                    Context(session, reconciler, actor, idempotency_key, teacher=teacher, known=known), checked
+                )
+
+            return reconciler.submissions.call(handle)
 
         return with_store(reconciler, call)
 

@@ -7,18 +7,17 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import JobsOf, Operation, Shared
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import JobsOf, Operation, Shared
 
 _MOST_COMPUTE_ENVIRONMENTS, _MOST_QUEUES = 3, 50
 _REASONS = (
@@ -33,7 +32,7 @@ def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
     name = request["jobQueueName"]
     rules.check_name("jobQueueName", name)
     rules.check_tags(request.get("tags") or {})
-    permissions.check(Operation.CREATE_JOB_QUEUE, Shared())
+    context.actor.check(Operation.CREATE_JOB_QUEUE, Shared())
     if context.session.get(JobQueue, name):
         raise ClientError(f"Job queue {name} exists already; UpdateJobQueue changes it")
     if len(context.session.scalars(select(JobQueue.name)).all()) >= _MOST_QUEUES:
@@ -66,7 +65,7 @@ def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, 
 def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateJobQueue; a scheduling policy can be replaced, but neither added nor removed, as on AWS."""
     queue = context.queue(request["jobQueue"])
-    permissions.check(Operation.UPDATE_JOB_QUEUE, queue)
+    context.actor.check(Operation.UPDATE_JOB_QUEUE, queue)
     if (policy := request.get("schedulingPolicyArn")) is not None:
         if queue.policy is None:
             raise ClientError(
@@ -80,7 +79,7 @@ def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 
 def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteJobQueue of a queue that is DISABLED: its jobs are ended, and with the last one it is gone."""
-    permissions.check(Operation.DELETE_JOB_QUEUE, Shared())
+    context.actor.check(Operation.DELETE_JOB_QUEUE, Shared())
     queue = context.session.get(JobQueue, plain_name(request["jobQueue"], "job-queue"))
     if queue is None or queue.deleting:
         return {}
@@ -94,7 +93,7 @@ def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and the resources in use."""
     queue = context.queue(request["jobQueue"], deleting=True)
-    permissions.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
+    context.actor.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
     order, times = context.reconciler.admission.front(queue.name, 100)
     jobs = [{"jobArn": job_arn(job), "earliestTimeAtPosition": times.get(job, now())} for job in order]
     return {

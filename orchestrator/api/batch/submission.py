@@ -11,14 +11,11 @@ from typing import Any
 from sqlalchemy import BigInteger, ColumnElement, String, cast, insert, literal, select
 from sqlalchemy.orm import Session
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.api.context import Context, archived
-from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import check_texts
-from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import check_sources, hold_teacher, uses_of
 from orchestrator.control.compute_environments import environments_of, queue_engines
 from orchestrator.domain import reasons
@@ -32,6 +29,9 @@ from orchestrator.persistence.job_counts import Place, note_rows
 from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import note_changed
+from orchestrator.services import permissions
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, JobsOf, Operation
 from orchestrator.spec.evaluations import place_of, wanted_of
 from shared_store.volume.contents import is_archived
 from shared_store.volume.layout import NAME
@@ -55,13 +55,13 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     rules.check_tags(request.get("tags") or {})
     queue = _queue(context, request)
     definition = context.definition(request["jobDefinition"])
-    permissions.check(Operation.SUBMIT_JOB, definition)
+    context.actor.check(Operation.SUBMIT_JOB, definition)
     job, gang = _job(context, request, queue, definition)
     _check_automatic(context, request, gang)
     is_array, is_waiting = bool(request.get("arrayProperties")), bool(request.get("dependsOn"))
     check_texts(context, gang)
     teacher = check_sources(context, gang, is_waiting)
-    job.idempotency_key = _scoped(context.idempotency_key)
+    job.idempotency_key = _scoped(context.actor, context.idempotency_key)
     if is_array:
         _add_array(context, job, request)
     else:
@@ -78,7 +78,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 def answered(context: Context) -> Job | None:
     """The job that an earlier call with the same idempotency key has submitted."""
-    key = _scoped(context.idempotency_key)
+    key = _scoped(context.actor, context.idempotency_key)
     return context.session.scalars(select(Job).where(Job.idempotency_key == key)).first() if key else None
 
 
@@ -86,18 +86,18 @@ def answer(job: Job) -> dict[str, Any]:
     return {"jobArn": job_arn(job.id), "jobName": job.name, "jobId": job.id}
 
 
-def _scoped(key: str | None) -> str | None:
+def _scoped(actor: Actor, key: str | None) -> str | None:
     """Two callers never share a key."""
     if key is None:
         return None
     if not _KEY.fullmatch(key):
         raise ClientError("the idempotency key: 1 to 128 printable characters without spaces")
-    return f"{permissions.current_identity.get().name}/{key}"
+    return f"{actor.name}/{key}"
 
 
 def _queue(context: Context, request: Mapping[str, Any]) -> JobQueue:
     queue = context.queue(request["jobQueue"])
-    permissions.check(Operation.SUBMIT_JOB, JobsOf(queue.name))
+    context.actor.check(Operation.SUBMIT_JOB, JobsOf(queue.name))
     if queue.state != "ENABLED":
         raise ClientError(f"Job queue {queue.name} is DISABLED and takes no jobs")
     share, priority = request.get("shareIdentifier"), request.get("schedulingPriorityOverride")
@@ -142,7 +142,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     fargate.check_platform(document, properties, f"job definition {definition.name}")
     fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     _check_secrets(context, queue, gang)
-    log_groups.check_room(context.session, gang.log_groups, permissions.current_identity.get().name)
+    log_groups.check_room(context.session, gang.log_groups, context.actor.name)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     copy = context.making or context.teacher
@@ -155,7 +155,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
         id=job_id,
         name=name,
         queue=queue.name,
-        owner=permissions.current_identity.get().name,
+        owner=context.actor.name,
         definition=definition_arn(definition.name, definition.revision),
         kind="array" if is_array else document["type"],
         request=request,
@@ -230,14 +230,14 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     """
     if not NAME.fullmatch(run):
         raise ClientError(f"MUSTER_RUN {run[:100]!r}: a run is named with letters, digits, '.', '_' and '-'")
-    restricted = named and permissions.visible_queues() is not None
+    restricted = named and context.actor.queues is not None
     if restricted and (owner := owner_of(context.session, context.found(run))):
-        permissions.check(Operation.SUBMIT_JOB, owner)
+        context.actor.check(Operation.SUBMIT_JOB, owner)
     context.reconciler.run_users.check(run)
     if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
         raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
-    if holder and not permissions.is_visible(holder):
+    if holder and not context.actor.may_see(holder):
         raise ClientError(f"run {run} is being written by another job; choose another name")
     if holder:
         raise ClientError(
@@ -372,7 +372,7 @@ def _dependencies(context: Context, request: Mapping[str, Any], size: int | None
         job = context.session.get(Job, on_id)
         if job is None or node is not None:
             raise ClientError(f"dependsOn: Job {reference[:200]} does not exist")
-        permissions.check(Operation.SUBMIT_JOB, job)
+        context.actor.check(Operation.SUBMIT_JOB, job)
         if kind == "N_TO_N" and job.array_size != size:
             raise ClientError(f"dependsOn N_TO_N: {reference[:200]} is not an array of the same size ({size})")
         found[on_id] = Dependency(on_id=on_id, kind=kind if kind == "N_TO_N" else None)

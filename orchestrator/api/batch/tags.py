@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import split_arn
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation
 from orchestrator.persistence.models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 
 _TABLES = {
     "job": Job,
@@ -46,7 +45,7 @@ def list_tags_for_resource(context: Context, request: dict[str, Any]) -> dict[st
 def _resource(context: Context, arn: str, operation: Operation) -> Any:
     """The resource, where the caller may do this to it. Raises ClientError."""
     resource = _find(context, arn)
-    permissions.check(operation, resource)
+    context.actor.check(operation, resource)
     return resource
 
 

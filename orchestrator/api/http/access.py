@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 
 from orchestrator.api.http.callers import user_name
-from orchestrator.api.permissions import THIS_PROCESS, Identity, Refusal
 from orchestrator.keys import Key, KeyStore
+from orchestrator.services.permissions import CONTROLLER, Actor, Refusal
 
 SESSION = 12 * 3600
 """Seconds for which a login to the console lasts."""
@@ -57,10 +57,10 @@ class Access:
         with_token = " or MUSTER_TOKEN" if self.token else ""
         return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
 
-    def bearer(self, given: str) -> Identity:
+    def bearer(self, given: str) -> Actor:
         """The owner of this token, or of ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""
         if self.own_token and hmac.compare_digest(given.encode(), self.own_token.encode()):
-            return THIS_PROCESS
+            return CONTROLLER
         return self._proven(given)[1]
 
     def sign_in(self, given: str) -> str:
@@ -69,7 +69,7 @@ class Access:
         claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
         return f"{claim}.{self._seal(name, claim)}"
 
-    def session(self, given: str) -> Identity | None:
+    def session(self, given: str) -> Actor | None:
         """The owner of this session; None where it has expired, was closed, or its key is gone."""
         claim, _, seal = given.rpartition(".")
         name, _, rest = claim.partition(".")
@@ -78,16 +78,16 @@ class Access:
             return None
         if int(rest.partition(".")[0]) < time.time():
             return None
-        return Identity("MUSTER_TOKEN") if name == _TOKEN else identity_of(self.known()[name])
+        return Actor("MUSTER_TOKEN") if name == _TOKEN else actor_of_key(self.known()[name])
 
-    def still_admits(self, identity: Identity, session: str) -> bool:
-        """Whether a caller who was admitted as ``identity`` would be admitted now; ``session``: the caller's, empty without one."""
+    def still_admits(self, actor: Actor, session: str) -> bool:
+        """Whether a caller who was admitted as ``actor`` would be admitted now; ``session``: the caller's, empty without one."""
         if session:
-            return self.session(session) == identity
-        if not self.demanded() or identity == THIS_PROCESS:
+            return self.session(session) == actor
+        if not self.demanded() or actor == CONTROLLER:
             return True
-        of_token = self.token is not None and identity == Identity("MUSTER_TOKEN")
-        return of_token or any(identity_of(key) == identity for key in self.known().values())
+        of_token = self.token is not None and actor == Actor("MUSTER_TOKEN")
+        return of_token or any(actor_of_key(key) == actor for key in self.known().values())
 
     def sign_out(self, given: str) -> None:
         """Close a session; a restart of the server forgets that, and the session's own end does not."""
@@ -110,14 +110,14 @@ class Access:
             return None
         return hmac.new(self.console_secret, f"session\0{secret}\0{claim}".encode(), sha256).hexdigest()
 
-    def _proven(self, given: str) -> tuple[str, Identity]:
+    def _proven(self, given: str) -> tuple[str, Actor]:
         """The credential's name in sessions, and its owner. Raises Refusal."""
         if self.token and hmac.compare_digest(given.encode(), self.token.encode()):
-            return _TOKEN, Identity("MUSTER_TOKEN")
+            return _TOKEN, Actor("MUSTER_TOKEN")
         access_key_id, _, secret = given.partition(":")
         key = self.known().get(access_key_id)
         if key and hmac.compare_digest(secret.encode(), key.secret.encode()):
-            return access_key_id, identity_of(key)
+            return access_key_id, actor_of_key(key)
         raise Refusal(
             "UnrecognizedClientException",
             "this token is not known here: set MUSTER_TOKEN to the server's token, or to ACCESS_KEY_ID:SECRET of a key that "
@@ -125,6 +125,6 @@ class Access:
         )
 
 
-def identity_of(key: Key) -> Identity:
+def actor_of_key(key: Key) -> Actor:
     """The user of a key."""
-    return Identity(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only)
+    return Actor(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only)

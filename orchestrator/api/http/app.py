@@ -13,10 +13,8 @@ from sqlalchemy.exc import DataError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import IDEMPOTENCY_HEADER
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import IDEMPOTENCY_HEADER, actor_of
 from orchestrator.api.http import docs_page
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import Guard, error_response, kind_of
@@ -27,6 +25,8 @@ from orchestrator.control import monitoring
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import RequestError, Unavailable
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store import __version__
 from shared_store.volume.files import DamagedFile
 
@@ -68,9 +68,9 @@ def create_app(
         return JSONResponse({"status": "ok", "version": __version__})
 
     @app.get("/metrics", response_class=PlainTextResponse)
-    def metrics() -> Response:
+    def metrics(request: Request) -> Response:
         """Metrics for Prometheus: jobs, waits, restarts, GPU-seconds used and lost, steps a second, hosts; for keys with all queues."""
-        permissions.check_all_queues(permissions.Operation.READ_MONITORING)
+        actor_of(request).check_all_queues(Operation.READ_MONITORING)
         return Response(monitoring.exposition(reconciler), media_type=monitoring.CONTENT_TYPE)
 
     @app.post("/v1/{operation}", include_in_schema=False)
@@ -79,7 +79,7 @@ def create_app(
         body = await _body(request)
         name = batch.operation_names().get(operation, operation)
         key = request.headers.get(IDEMPOTENCY_HEADER)
-        return JSONResponse(await run_in_threadpool(batch.call, reconciler, name, body, key))
+        return JSONResponse(await run_in_threadpool(batch.call, reconciler, actor_of(request), name, body, key))
 
     @app.api_route("/v1/tags/{arn:path}", methods=["GET", "POST", "DELETE"], include_in_schema=False)
     async def aws_tags(arn: str, request: Request) -> JSONResponse:
@@ -90,7 +90,9 @@ def create_app(
             raise ClientError(f"{name}: expected a JSON object")
         if request.method == "DELETE":
             body = {"tagKeys": request.query_params.getlist("tagKeys")}
-        return JSONResponse(await run_in_threadpool(batch.call, reconciler, name, {**body, "resourceArn": arn}))
+        return JSONResponse(
+            await run_in_threadpool(batch.call, reconciler, actor_of(request), name, {**body, "resourceArn": arn})
+        )
 
     @app.get("/api/docs", include_in_schema=False)
     def describe() -> HTMLResponse:
@@ -102,7 +104,7 @@ def create_app(
     async def cloudwatch_logs(request: Request) -> Response:
         """CloudWatch Logs: the operation in a header (JSON 1.1)."""
         target = request.headers.get("x-amz-target", "")
-        return await logs.answer(reconciler, app.state.closing, target, lambda: _body(request))
+        return await logs.answer(reconciler, actor_of(request), app.state.closing, target, lambda: _body(request))
 
     return app
 

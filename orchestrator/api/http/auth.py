@@ -27,14 +27,14 @@ from starlette.requests import ClientDisconnect, cookie_parser
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from orchestrator.api.errors import ClientError
 from orchestrator.api.http import elsewhere
-from orchestrator.api.http.access import Access, identity_of
+from orchestrator.api.http.access import Access, actor_of_key
 from orchestrator.api.http.callers import Caller, user_name
 from orchestrator.api.http.limits import Body, RateLimit
-from orchestrator.api.permissions import BY_LOWER_NAME, Identity, Refusal, current_identity
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.excerpts import LONGEST_ERROR, excerpt
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import BY_LOWER_NAME, Actor, Refusal
 
 log = logging.getLogger("muster.api")
 
@@ -81,7 +81,7 @@ class Guard:
             return
         body = Body(receive, request.first("content-length"), request.operation)
         try:
-            identity = await self._admit(request, body, scope.get("state", {}).get("caller"))
+            actor = await self._admit(request, body, scope.get("state", {}).get("caller"))
             if scope["type"] == "http":
                 await body.read()
         except ClientDisconnect:
@@ -94,48 +94,44 @@ class Guard:
             else:
                 await send({"type": "websocket.close", "code": 1008, "reason": "refused"})  # the server answers 403
             return
-        scope.setdefault("state", {})["identity"] = identity
-        before = current_identity.set(identity)
-        try:
-            await self.app(scope, body.receive, _with_request_id(send))
-        finally:
-            current_identity.reset(before)
+        scope.setdefault("state", {})["actor"] = actor
+        await self.app(scope, body.receive, _with_request_id(send))
 
-    async def _admit(self, request: _Request, body: Body, caller: Caller | None) -> Identity:
+    async def _admit(self, request: _Request, body: Body, caller: Caller | None) -> Actor:
         """The sender of the request. Raises ClientError if it is refused."""
         demanded = self.access.demanded()
         request.check_browser(loopback_only=not demanded)
         if request.path == "/healthz":
-            return Identity("a health check", frozenset(), read_only=True)
-        identity = Identity(f"address {request.client}")
+            return Actor("a health check", frozenset(), read_only=True)
+        actor = Actor(f"address {request.client}")
         if request.path in (LOGIN, LOGOUT) or request.path.startswith(STATIC):
-            self._count(identity, "")
-            return Identity("a visitor", frozenset(), read_only=True)
+            self._count(actor, "")
+            return Actor("a visitor", frozenset(), read_only=True)
         if demanded:
             try:
-                identity = self._of_session(request) or await self._authenticate(request, body)
+                actor = self._of_session(request) or await self._authenticate(request, body)
             except ClientError:
                 if reason := self.limit.refusal_of_failures(request.client):
                     raise Refusal("TooManyRequestsException", reason, 429) from None
-                self._count(identity, "")
+                self._count(actor, "")
                 raise
         elif self.access.user is not None:
-            identity = await self._local_user(self.access.user, caller)
-        self._count(identity, request.operation)
-        if identity.read_only and not request.reads:
+            actor = await self._local_user(self.access.user, caller)
+        self._count(actor, request.operation)
+        if actor.read_only and not request.reads:
             raise Refusal(
                 "AccessDeniedException",
-                f"{identity.name} is read-only: {request.method} {request.path} is refused; use a key that may write",
+                f"{actor.name} is read-only: {request.method} {request.path} is refused; use a key that may write",
             )
-        return identity
+        return actor
 
     @staticmethod
-    async def _local_user(user: int, caller: Caller | None) -> Identity:
+    async def _local_user(user: int, caller: Caller | None) -> Actor:
         """The controller's own user, where the process at the other end is that user's. Raises Refusal."""
         uid = await caller.uid() if caller else None
         name = user_name(user)
         if uid == user:
-            return Identity(f"user {name}")
+            return Actor(f"user {name}")
         who = (
             f"it comes from user {user_name(uid)}"
             if uid is not None
@@ -147,17 +143,17 @@ class Guard:
             "`muster keys create NAME` makes one",
         )
 
-    def _of_session(self, request: _Request) -> Identity | None:
-        """The identity of the console's session, where a session counts and nothing else is presented."""
+    def _of_session(self, request: _Request) -> Actor | None:
+        """The actor of the console's session, where a session counts and nothing else is presented."""
         if "authorization" in request.headers or not (request.method in ("GET", "HEAD") or request.is_of_console):
             return None
         return self.access.session(session_of(request.first_of_each(), request.port))
 
-    def _count(self, identity: Identity, operation: str) -> None:
-        if reason := self.limit.refusal(identity.name, operation):
+    def _count(self, actor: Actor, operation: str) -> None:
+        if reason := self.limit.refusal(actor.name, operation):
             raise Refusal("TooManyRequestsException", reason, 429)
 
-    async def _authenticate(self, request: _Request, body: Body) -> Identity:
+    async def _authenticate(self, request: _Request, body: Body) -> Actor:
         given = request.single("authorization") or ""
         scheme, _, credentials = given.strip().partition(" ")
         if scheme.lower() == "bearer":
@@ -173,7 +169,7 @@ class Guard:
                 )
             claim.check(request, datetime.now(UTC))
             claim.check_signature(request, key.secret, await body.read() if request.has_body else b"")
-            return identity_of(key)
+            return actor_of_key(key)
         raise Refusal(
             "MissingAuthenticationToken",
             "a token is needed: set MUSTER_TOKEN (the server's token, or ACCESS_KEY_ID:SECRET of a key), send it as "

@@ -14,7 +14,6 @@ from starlette.types import Receive, Scope, Send
 
 from orchestrator import machine
 from orchestrator.api.http.auth import error_response
-from orchestrator.api.permissions import current_identity
 from orchestrator.control.store_calls import StoreCalls
 
 T = TypeVar("T")
@@ -40,7 +39,7 @@ class Following(StreamingResponse):
     """A stream that takes one of its reader's places while it is open; :meth:`refusal` is sent where none is free."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        name = current_identity.get().name
+        name = scope["state"]["actor"].name
         if _open[name] >= MOST:
             await self.refusal(f"{name} follows {MOST} logs and pages already; close some")(scope, receive, send)
             return

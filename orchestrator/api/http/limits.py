@@ -11,7 +11,7 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 
 LARGEST_BODY = 1 << 20
 """Bytes of any request's body."""

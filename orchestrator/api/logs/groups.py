@@ -9,20 +9,20 @@ from typing import Any
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from orchestrator.api import permissions
 from orchestrator.api.arns import log_group_arn
 from orchestrator.api.batch.members import check_log_group
 from orchestrator.api.batch.rules import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
-from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
 from orchestrator.persistence.models import Job, Node
 from orchestrator.persistence.own_models import LogGroup, LogStream
+from orchestrator.services import permissions
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.layout import Store
 
 _RETENTIONS = (
@@ -58,17 +58,17 @@ def _name(reference: str) -> str:
     return reference.removeprefix(log_group_arn("")).removesuffix(":*")
 
 
-def _group(session: Session, reference: str, operation: Operation) -> LogGroup:
+def _group(session: Session, actor: Actor, reference: str, operation: Operation) -> LogGroup:
     """The row of a group, where the caller may do this to it. Raises LogsError, Refusal."""
     group = session.get(LogGroup, existing(session, reference)) or LogGroup(name=LOG_GROUP, owner=None, tags={})
-    permissions.check(operation, group)
+    actor.check(operation, group)
     return group
 
 
 # -- what is read -----------------------------------------------------------------------------------------------------
 
 
-def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
+def describe_log_groups(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeLogGroups: by name, those that fit the request."""
     prefix, pattern = request.get("logGroupNamePrefix"), request.get("logGroupNamePattern")
     if prefix is not None and pattern is not None:
@@ -91,7 +91,9 @@ def describe_log_groups(reconciler: Reconciler, request: dict[str, Any]) -> dict
             and (pattern or "") in name
             and (not identifiers or name in identifiers)
         )
-        streams = {name: newest_streams(session, reconciler.store, (name,)) for name in names[:size] if pattern is None}
+        streams = {
+            name: newest_streams(session, actor, reconciler.store, (name,)) for name in names[:size] if pattern is None
+        }
         rows[LOG_GROUP].created_at = session.scalar(select(func.min(Job.created_at))) or 0
         session.expunge_all()
     found = [_describe(rows[name], streams.get(name)) for name in names[:size]]  # the store may hang, the database not
@@ -109,28 +111,28 @@ def _describe(group: LogGroup, streams: Sequence[Stream] | None) -> dict[str, An
     return described
 
 
-def list_tags_for_resource(reconciler: Reconciler, request: dict[str, Any]) -> dict[str, Any]:
+def list_tags_for_resource(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """ListTagsForResource: the tags of the group with this ARN."""
     with reconciler.database.session() as session:
-        return {"tags": _group(session, request["resourceArn"], Operation.LIST_TAGS_FOR_RESOURCE).tags}
+        return {"tags": _group(session, actor, request["resourceArn"], Operation.LIST_TAGS_FOR_RESOURCE).tags}
 
 
 # -- what is written --------------------------------------------------------------------------------------------------
 
 
-def write(reconciler: Reconciler, operation: str, request: dict[str, Any]) -> None:
+def write(reconciler: Reconciler, actor: Actor, operation: str, request: dict[str, Any]) -> None:
     """Carry out one of :data:`WRITES`. Raises LogsError, RequestError; DatabaseError where the database can't be written."""
     reconciler.check_writable(adds=operation.startswith(("Create", "Put", "Tag")))
     with reconciler.writing, reconciler.database.session() as session:
-        WRITES[operation]((session, reconciler.store), request)
+        WRITES[operation](actor, (session, reconciler.store), request)
 
 
 _Place = tuple[Session, Store]
 
 
-def create_log_group(place: _Place, request: dict[str, Any]) -> None:
+def create_log_group(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """CreateLogGroup: the caller's own, empty."""
-    session, name, owner = place[0], request["logGroupName"], permissions.current_identity.get().name
+    session, name, owner = place[0], request["logGroupName"], actor.name
     check_log_group("logGroupName", name)
     tags = request.get("tags") or {}
     check_tags(tags)
@@ -150,14 +152,14 @@ def create_log_group(place: _Place, request: dict[str, Any]) -> None:
     session.add(LogGroup(name=name, owner=owner, tags=tags))
 
 
-def delete_log_group(place: _Place, request: dict[str, Any]) -> None:
+def delete_log_group(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """DeleteLogGroup: its streams are no longer shown; the files stay with their runs."""
     session, name = place[0], request["logGroupName"]
     if _name(name) == LOG_GROUP:
-        permissions.check(Operation.DELETE_LOG_GROUP, LogGroup(name=LOG_GROUP))
+        actor.check(Operation.DELETE_LOG_GROUP, LogGroup(name=LOG_GROUP))
         raise invalid(f"log group {LOG_GROUP} can't be deleted: jobs that name no group log there")
-    group = _group(session, name, Operation.DELETE_LOG_GROUP)
-    if (queues := permissions.visible_queues()) is not None:
+    group = _group(session, actor, name, Operation.DELETE_LOG_GROUP)
+    if (queues := actor.queues) is not None:
         logged = select(Node.job_id).join(Job, Job.id == Node.job_id).where(Node.log_group == group.name)
         if session.scalar(logged.where(Job.queue.not_in(queues)).limit(1)) is not None:
             words = f"log group {group.name} has streams of jobs in other queues; ask for a key with all queues"
@@ -166,28 +168,28 @@ def delete_log_group(place: _Place, request: dict[str, Any]) -> None:
     session.delete(group)
 
 
-def put_retention_policy(place: _Place, request: dict[str, Any]) -> None:
+def put_retention_policy(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """PutRetentionPolicy: kept and shown."""
     days = request["retentionInDays"]
     if days not in _RETENTIONS:
         raise invalid(f"retentionInDays is {str(days)[:30]}; it is one of {', '.join(map(str, _RETENTIONS))}")
-    group = _group(place[0], request["logGroupName"], Operation.PUT_RETENTION_POLICY)
+    group = _group(place[0], actor, request["logGroupName"], Operation.PUT_RETENTION_POLICY)
     group.retention = days
     place[0].add(group)
 
 
-def delete_retention_policy(place: _Place, request: dict[str, Any]) -> None:
+def delete_retention_policy(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """DeleteRetentionPolicy: none is shown any more."""
-    _group(place[0], request["logGroupName"], Operation.DELETE_RETENTION_POLICY).retention = None
+    _group(place[0], actor, request["logGroupName"], Operation.DELETE_RETENTION_POLICY).retention = None
 
 
-def create_log_stream(place: _Place, request: dict[str, Any]) -> None:
+def create_log_stream(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """CreateLogStream: an empty stream, into which nothing can be written; jobs make their own."""
     (session, store), name = place, request["logStreamName"]
     if not _STREAM.fullmatch(name):
         raise invalid(f"logStreamName {name[:200]!r}: 1 to 512 characters without ':' and '*'")
-    group = _group(session, request["logGroupName"], Operation.CREATE_LOG_STREAM)
-    if find_stream(session, store, group.name, name, Operation.CREATE_LOG_STREAM) is not None:
+    group = _group(session, actor, request["logGroupName"], Operation.CREATE_LOG_STREAM)
+    if find_stream(session, actor, store, group.name, name, Operation.CREATE_LOG_STREAM) is not None:
         raise present("log stream", name)
     created = select(func.count()).select_from(LogStream).where(LogStream.log_group == group.name)
     if (session.scalar(created) or 0) >= _MOST_CREATED:
@@ -197,34 +199,34 @@ def create_log_stream(place: _Place, request: dict[str, Any]) -> None:
     session.add(LogStream(log_group=group.name, name=name))
 
 
-def delete_log_stream(place: _Place, request: dict[str, Any]) -> None:
+def delete_log_stream(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """DeleteLogStream, for those that clients have created."""
     (session, store), name = place, request["logStreamName"]
-    group = _group(session, request["logGroupName"], Operation.DELETE_LOG_STREAM)
+    group = _group(session, actor, request["logGroupName"], Operation.DELETE_LOG_STREAM)
     if (row := session.get(LogStream, (group.name, name))) is not None:
         session.delete(row)
-    elif find_stream(session, store, group.name, name, Operation.DELETE_LOG_STREAM) is None:
+    elif find_stream(session, actor, store, group.name, name, Operation.DELETE_LOG_STREAM) is None:
         raise absent("log stream", name)
     else:
         raise invalid(f"log stream {name[:300]} is a job's: it is kept as long as the job's history")
 
 
-def tag_resource(place: _Place, request: dict[str, Any]) -> None:
+def tag_resource(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """TagResource, on the ARN of a group."""
-    group = _group(place[0], request["resourceArn"], Operation.TAG_RESOURCE)
+    group = _group(place[0], actor, request["resourceArn"], Operation.TAG_RESOURCE)
     tags = {**group.tags, **request["tags"]}
     check_tags(tags)
     group.tags = tags
     place[0].add(group)
 
 
-def untag_resource(place: _Place, request: dict[str, Any]) -> None:
+def untag_resource(actor: Actor, place: _Place, request: dict[str, Any]) -> None:
     """UntagResource, on the ARN of a group; missing tags are passed over."""
-    group = _group(place[0], request["resourceArn"], Operation.UNTAG_RESOURCE)
+    group = _group(place[0], actor, request["resourceArn"], Operation.UNTAG_RESOURCE)
     group.tags = {key: value for key, value in group.tags.items() if key not in request["tagKeys"]}
 
 
-WRITES: dict[str, Callable[[_Place, dict[str, Any]], None]] = {
+WRITES: dict[str, Callable[[Actor, _Place, dict[str, Any]], None]] = {
     "CreateLogGroup": create_log_group,
     "DeleteLogGroup": delete_log_group,
     "PutRetentionPolicy": put_retention_policy,

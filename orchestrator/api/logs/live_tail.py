@@ -22,6 +22,7 @@ from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.models import now
+from orchestrator.services.permissions import Actor
 from shared_store.volume.layout import Run
 from shared_store.volume.log_view import Chosen, Key, LogView
 from shared_store.volume.logs import LogLine
@@ -81,17 +82,24 @@ class LiveTail:
     """
 
     def __init__(
-        self, reconciler: Reconciler, groups: Collection[str], wanted: Callable[[str], bool], matches: Matcher
+        self,
+        reconciler: Reconciler,
+        actor: Actor,
+        groups: Collection[str],
+        wanted: Callable[[str], bool],
+        matches: Matcher,
     ) -> None:
         """Raises OSError.
 
         Args:
             reconciler: Whose jobs' logs are followed.
+            actor: Who follows them.
             groups: Names of the log groups.
             wanted: Whether a stream is asked for, by its name.
             matches: Whether a line is asked for.
         """
-        self._reconciler, self._groups, self._wanted, self._matches = reconciler, groups, wanted, matches
+        self._reconciler, self._actor, self._groups = reconciler, actor, groups
+        self._wanted, self._matches = wanted, matches
         self.group_of: dict[str, str] = {}
         """Group of each stream that was followed."""
         self.calls, self.waker = reconciler.followed, Waker()
@@ -163,7 +171,7 @@ class LiveTail:
         asked = now()
         with self._reconciler.database.session() as session:
             since = max(self._started, self._asked - _OVERLAP)
-            streams = newest_streams(session, self._reconciler.store, self._groups, since=since)
+            streams = newest_streams(session, self._actor, self._reconciler.store, self._groups, since=since)
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
         for stream in streams:
             if stream.run is not None and stream.name not in self._over and self._wanted(stream.name):

@@ -11,13 +11,12 @@ from pathlib import Path
 from sqlalchemy import String, and_, func, literal, or_, select
 from sqlalchemy.orm import Session, joinedload, load_only, raiseload
 
-from orchestrator.api import permissions
 from orchestrator.api.batch.describe import stream_name
 from orchestrator.api.logs.events import LogFile, log_file
-from orchestrator.api.permissions import Operation
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.own_models import LogStream
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.layout import Run, Store
 
 MOST_STREAMS = 1000
@@ -51,7 +50,9 @@ class Stream:
         return log_file(self.path, self.name)
 
 
-def find_stream(session: Session, store: Store, group: str, name: str, operation: Operation) -> Stream | None:
+def find_stream(
+    session: Session, actor: Actor, store: Store, group: str, name: str, operation: Operation
+) -> Stream | None:
     """The stream of that name in a group; None where none exists. Raises Refusal where it is not the caller's."""
     if (row := session.get(LogStream, (group, name))) is not None:
         return Stream(name, group, _NO_FILE, row.created_at)
@@ -62,12 +63,17 @@ def find_stream(session: Session, store: Store, group: str, name: str, operation
         return None
     found = next((stream for stream in _streams(store, job, attempt, {group}) if stream.name == name), None)
     if found is not None:
-        permissions.check(operation, job)
+        actor.check(operation, job)
     return found
 
 
 def newest_streams(
-    session: Session, store: Store, groups: Collection[str] = (LOG_GROUP,), prefix: str = "", since: int = 0
+    session: Session,
+    actor: Actor,
+    store: Store,
+    groups: Collection[str] = (LOG_GROUP,),
+    prefix: str = "",
+    since: int = 0,
 ) -> list[Stream]:
     """Up to MOST_STREAMS streams of jobs, of the newest jobs that the caller may see.
 
@@ -102,7 +108,7 @@ def newest_streams(
         .order_by(Attempt.stopped_at.is_(None).desc(), Job.created_at.desc(), Job.id, Attempt.number)
         .limit(MOST_STREAMS)
     )
-    if (queues := permissions.visible_queues()) is not None:
+    if (queues := actor.queues) is not None:
         query = query.where(Job.queue.in_(queues))
     rows = session.execute(query).unique()
     found = [stream for attempt, job in rows for stream in _streams(store, job, attempt, groups)]

@@ -19,9 +19,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.api import permissions
 from orchestrator.api.context import Context, Known, with_store
-from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import submit
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
@@ -32,6 +30,8 @@ from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import CONTROLLER, Actor
 from orchestrator.spec.evaluations import (
     AUTOMATIC_TAG,
     Counted,
@@ -204,7 +204,7 @@ class AutomaticEvaluations:
             raise ValueError(str(error)) from None
         if wanted is None or job.first_epoch is None:
             return None
-        owner, directory = job.owner or permissions.THIS_PROCESS.name, gang.options.directory
+        owner, directory = job.owner or CONTROLLER.name, gang.options.directory
         run, place = self._reconciler.store.run(job.run), place_of(job.queue, job.share, wanted)
         return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, place, directory, wanted)
 
@@ -227,14 +227,14 @@ class AutomaticEvaluations:
         reconciler, run = self._reconciler, training.run
         reconciler.check_writable(adds=True)
         reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-        token = permissions.current_identity.set(permissions.Identity(training.owner))
+        actor = Actor(training.owner)
         try:
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
             def call(known: Known) -> dict[str, Any]:
                 with reconciler.writing, reconciler.database.session() as session:
-                    context = Context(session, reconciler, known=known)
+                    context = Context(session, reconciler, actor, known=known)
                     answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
                     row = _row(session, training, counted, found)
                     row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
@@ -249,8 +249,6 @@ class AutomaticEvaluations:
                 ("evaluations of", run.name), f"run {run.name}: checkpoints are not evaluated: {error}"
             )
             return
-        finally:
-            permissions.current_identity.reset(token)
         self._backoff.worked(("evaluations of", run.name))
         reconciler.wake()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""

@@ -17,7 +17,6 @@ from sqlalchemy.orm import Session
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
 from orchestrator.api.context import Context, Known, release, using, with_store
-from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import keep_again
 from orchestrator.api.native.continuing import Changes, answered, check, submit
 from orchestrator.api.native.runs import spec_of
@@ -28,6 +27,8 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
@@ -39,7 +40,7 @@ from shared_store.volume.run_settings import first_difference, fixed_settings, i
 
 
 def clone(
-    reconciler: Reconciler, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
+    reconciler: Reconciler, actor: Actor, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
 ) -> dict[str, Any]:
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; refusals come before a job exists.
 
@@ -56,17 +57,17 @@ def clone(
     """
     with using(reconciler, source.name):
         return with_teacher(
-            reconciler, lambda teacher: _clone(reconciler, source, name, changes, idempotency_key, teacher)
+            reconciler, lambda teacher: _clone(reconciler, actor, source, name, changes, idempotency_key, teacher)
         )
 
 
-def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> dict[str, Any]:
+def check_clone(reconciler: Reconciler, actor: Actor, source: Run, name: str, changes: Changes) -> dict[str, Any]:
     """The definition that :func:`clone` would register, its queue, and the run and checkpoint of its weights; nothing is submitted.
 
     Raises ClientError as :func:`clone`.
     """
-    spec, chosen = _checked(reconciler, source, name, changes)
-    definition = _check_submission(reconciler, spec, changes, name)
+    spec, chosen = _checked(reconciler, actor, source, name, changes)
+    definition = _check_submission(reconciler, actor, spec, changes, name)
     return {
         "definition": definition,
         "queue": spec.queue,
@@ -76,6 +77,7 @@ def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes
 
 def _clone(
     reconciler: Reconciler,
+    actor: Actor,
     source: Run,
     name: str,
     changes: Changes,
@@ -84,15 +86,15 @@ def _clone(
 ) -> dict[str, Any]:
     def answered_before(known: Known) -> dict[str, Any] | None:
         with reconciler.database.session() as session:
-            return _answered(Context(session, reconciler, idempotency_key, known=known), name)
+            return _answered(Context(session, reconciler, actor, idempotency_key, known=known), name)
 
     if earlier := with_store(reconciler, answered_before):
         return earlier
-    spec, chosen = _checked(reconciler, source, name, changes)
+    spec, chosen = _checked(reconciler, actor, source, name, changes)
     new = reconciler.store.run(name)
-    _check_submission(reconciler, spec, changes, name)  # before the copy: not for who may not submit it
+    _check_submission(reconciler, actor, spec, changes, name)  # before the copy: not for who may not submit it
     reconciler.check_writable(adds=True)
-    keep_again(reconciler, source, spec.document())
+    keep_again(reconciler, actor, source, spec.document())
     if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
     making = NewRun(reconciler.store, reconciler.peers.id, source.name, chosen)
@@ -100,7 +102,7 @@ def _clone(
 
     def begin(known: Known) -> dict[str, Any]:
         with reconciler.writing, reconciler.database.session() as session:
-            context = Context(session, reconciler, idempotency_key, making, teacher, known)
+            context = Context(session, reconciler, actor, idempotency_key, making, teacher, known)
             if earlier := _answered(context, name):
                 return earlier
             _check_free(session, new, context.read("taken", partial(_is_taken, new)))
@@ -128,12 +130,12 @@ def _clone(
     return answer
 
 
-def _checked(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
+def _checked(reconciler: Reconciler, actor: Actor, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
     """The spec of the new run, and the checkpoint with its weights. Raises ClientError."""
     found = facts_of(source)
     with reconciler.database.session() as session:
-        spec = _changed(session, found, name, changes)
-        new = Context(session, reconciler).run(name)
+        spec = _changed(session, actor, found, name, changes)
+        new = Context(session, reconciler, actor).run(name)
     is_taken = _is_taken(new)
     with reconciler.database.session() as session:
         _check_free(session, new, is_taken)
@@ -142,13 +144,13 @@ def _checked(reconciler: Reconciler, source: Run, name: str, changes: Changes) -
     return spec, chosen
 
 
-def _check_submission(reconciler: Reconciler, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
+def _check_submission(reconciler: Reconciler, actor: Actor, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
     """The definition of the job, which may be submitted. Raises ClientError."""
     reconciler.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
 
     def call(known: Known) -> dict[str, Any]:
         with reconciler.database.session() as session:
-            return check(Context(session, reconciler, known=known), spec, changes.directory, f"clone {name}")
+            return check(Context(session, reconciler, actor, known=known), spec, changes.directory, f"clone {name}")
 
     return with_store(reconciler, call)
 
@@ -162,9 +164,9 @@ def _answered(context: Context, name: str) -> dict[str, Any] | None:
     return {**submission.answer(job), "run": job.run, "parent": parent, "kind": "train"}
 
 
-def _changed(session: Session, source: FoundRun, name: str, changes: Changes) -> Spec:
+def _changed(session: Session, actor: Actor, source: FoundRun, name: str, changes: Changes) -> Spec:
     """The spec of the new run. Raises ClientError."""
-    document = spec_of(session, source)
+    document = spec_of(session, actor, source)
     if document is None:
         raise ClientError(f"run {source.name} was not started from a YAML spec: there is nothing to clone")
     named = next((each for each in changes.assignments if each.partition("=")[0] == "name"), None)

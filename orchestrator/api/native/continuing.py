@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import definitions, submission
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import Context, Known, with_store
-from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
 from orchestrator.api.native.fitting import fit_of
 from orchestrator.api.racing_tracks import check_tracks
@@ -20,6 +18,9 @@ from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
+from orchestrator.services import permissions
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import Spec
 
@@ -68,14 +69,14 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
-    permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(context.queue(spec.queue).name))
+    context.actor.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(context.queue(spec.queue).name))
     check_tracks(context.reconciler.store, spec.document(), context.read)
     limits.check_document("RegisterJobDefinition", definition)
     return definition
 
 
 def _check_fit(context: Context, spec: Spec, gang: GangSpec, what: str) -> None:
-    if problem := fit_of(context.session, context.reconciler, context.queue(spec.queue), gang).problem:
+    if problem := fit_of(context.session, context.actor, context.reconciler, context.queue(spec.queue), gang).problem:
         raise ClientError(f"{what}: {problem}")
 
 
@@ -108,14 +109,14 @@ def submit(
     return answer, job
 
 
-def submit_alone(reconciler: Reconciler, spec: Spec, directory: str, what: str) -> dict[str, Any]:
+def submit_alone(reconciler: Reconciler, actor: Actor, spec: Spec, directory: str, what: str) -> dict[str, Any]:
     """:func:`submit` of a job that neither continues nor begins a run, and its commit. Raises ClientError."""
     reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     reconciler.check_writable(adds=True)
 
     def call(known: Known) -> dict[str, Any]:
         with reconciler.writing, reconciler.database.session() as session:
-            return submit(Context(session, reconciler, known=known), spec, directory, what, {})[0]
+            return submit(Context(session, reconciler, actor, known=known), spec, directory, what, {})[0]
 
     answer = with_store(reconciler, call)
     reconciler.wake()

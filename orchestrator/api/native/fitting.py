@@ -8,21 +8,22 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import rules
 from orchestrator.api.context import queue_names
-from orchestrator.api.errors import ClientError
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import JobQueue
 from orchestrator.scheduling.fit import Fit
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
 
 
-def fit_of(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> Fit:
+def fit_of(session: Session, actor: Actor, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> Fit:
     """The answer of an idle queue to a job; a training whose automatic evaluations could never start has a problem, too."""
     found = fit_in_queue(session, reconciler.engine, queue, gang.shape)
-    if found.problem or not (problem := _problem_of_evaluations(session, reconciler, queue, gang)):
+    if found.problem or not (problem := _problem_of_evaluations(session, actor, reconciler, queue, gang)):
         return found
     return Fit(None, f"evaluation: {problem}")
 
@@ -35,15 +36,17 @@ class UnknownQueue(ClientError):
         super().__init__(f"there is no queue {name[:100]!r}; there is {there}", status)
 
 
-def named_queue(session: Session, name: str) -> JobQueue:
+def named_queue(session: Session, actor: Actor, name: str) -> JobQueue:
     """The queue of this name. Raises UnknownQueue."""
     queue = session.get(JobQueue, name)
     if queue is None or queue.deleting:
-        raise UnknownQueue(name, queue_names(session))
+        raise UnknownQueue(name, queue_names(session, actor))
     return queue
 
 
-def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> str | None:
+def _problem_of_evaluations(
+    session: Session, actor: Actor, reconciler: Reconciler, queue: JobQueue, gang: GangSpec
+) -> str | None:
     """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
     try:
         wanted = wanted_of(gang.spec)
@@ -53,6 +56,6 @@ def _problem_of_evaluations(session: Session, reconciler: Reconciler, queue: Job
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
         shape = rules.check_nodes(rules.node_properties(definition), "multinode").shape
-        return fit_in_queue(session, reconciler.engine, named_queue(session, place["queue"]), shape).problem
+        return fit_in_queue(session, reconciler.engine, named_queue(session, actor, place["queue"]), shape).problem
     except (ClientError, SpecError) as error:
         return str(error)

@@ -14,8 +14,7 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session, selectinload
 
-from orchestrator.api import permissions
-from orchestrator.api.context import queue_names, reconciler_of
+from orchestrator.api.context import actor_of, queue_names, reconciler_of
 from orchestrator.api.damaged import DAMAGED, DamagedRow, reading
 from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.control.reconciler import Reconciler
@@ -27,6 +26,7 @@ from orchestrator.domain.reasons import Reason, array_of
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.services.permissions import Actor
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
 from orchestrator.spec.model import KINDS
 from shared_store.volume.files import DamagedFile
@@ -64,9 +64,9 @@ class Wanted:
         """Of the rows, by the text."""
         return [contains(session, text)] if (text := self.search.strip()) else []
 
-    def queues(self) -> Collection[str] | None:
-        """Those whose jobs are wanted and may be seen by the caller; None: all."""
-        visible = permissions.visible_queues()
+    def queues(self, actor: Actor) -> Collection[str] | None:
+        """Those whose jobs are wanted and may be seen by the actor; None: all."""
+        visible = actor.queues
         if not self.queue:
             return visible
         return [self.queue] if visible is None or self.queue in visible else []
@@ -87,16 +87,19 @@ def find_jobs(
 
     ``next`` and ``previous`` are the places of the pages beside this one; null where there is none.
     """
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     if queue:
         with reconciler.database.session() as session:
-            if queue not in (known := queue_names(session)):
+            if queue not in (known := queue_names(session, actor)):
                 raise UnknownQueue(queue, known, 404)
-    return page_of_jobs(reconciler, Wanted(tuple(status), queue, search), most, after, before, with_progress=progress)
+    return page_of_jobs(
+        reconciler, actor, Wanted(tuple(status), queue, search), most, after, before, with_progress=progress
+    )
 
 
 def page_of_jobs(
     reconciler: Reconciler,
+    actor: Actor,
     wanted: Wanted,
     most: int = JOBS_A_PAGE,
     after: str = "",
@@ -113,7 +116,7 @@ def page_of_jobs(
     if after and before:
         raise RequestError("a page is after a place or before one, not both; leave one of them out")
     places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
-    queues = wanted.queues()
+    queues = wanted.queues(actor)
     with reconciler.database.session() as session:
         if conditions := wanted.conditions(session):
             counts = count(session, queues, conditions, MOST_COUNTED)
@@ -122,7 +125,7 @@ def page_of_jobs(
         page = read_page(session, most, queues, wanted.statuses, conditions, **places)
         rows = [_row(reconciler, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
-    progress = _progress(reconciler, trainings)
+    progress = _progress(reconciler, actor, trainings)
     states = wanted.statuses or tuple(Status)
     return {
         "jobs": [{**row, "progress": progress.get(row["id"])} for row, _ in rows],
@@ -134,11 +137,11 @@ def page_of_jobs(
     }
 
 
-def ids_of(session: Session, wanted: Wanted) -> list[str]:
+def ids_of(session: Session, actor: Actor, wanted: Wanted) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
     active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
     query = select(Job.id).where(Job.parent.is_(None), *wanted.conditions(session), Job.status.in_(active))
-    if (queues := wanted.queues()) is not None:
+    if (queues := wanted.queues(actor)) is not None:
         query = query.where(Job.queue.in_(queues))
     return list(session.scalars(query.order_by(Job.created_at, Job.id)))
 
@@ -222,32 +225,32 @@ def _row(reconciler: Reconciler, session: Session, job: Job) -> tuple[dict[str, 
     return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes)}, found
 
 
-def _progress(reconciler: Reconciler, trainings: Sequence[_Training]) -> Mapping[str, dict[str, Any]]:
+def _progress(reconciler: Reconciler, actor: Actor, trainings: Sequence[_Training]) -> Mapping[str, dict[str, Any]]:
     """By job the progress of those trainings whose runs the caller may see; empty where the store does not answer."""
     if not trainings:
         return {}
     try:
-        read, runs = reconciler.calls.call(partial(_read, reconciler.store, trainings))
+        read, runs = reconciler.calls.call(partial(_read, actor, reconciler.store, trainings))
     except (StoreSilent, OSError):
         return {}
     hidden = set[str]()
-    if permissions.visible_queues() is not None:  # a job may continue a run of another queue
+    if actor.queues is not None:  # a job may continue a run of another queue
         with reconciler.database.session() as session:
             # one query instead of many
             _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(list(runs)))).all()
             owners = {name: owner_of(session, run) for name, run in runs.items()}
-        hidden = {name for name, owner in owners.items() if owner is None or not permissions.is_visible(owner)}
+        hidden = {name for name, owner in owners.items() if owner is None or not actor.may_see(owner)}
     shown = [each for each in trainings if each.job.run not in hidden]
     known = {each.job.id: _told(reconciler, each, read[each.job.id]) for each in shown}
     return {job: progress for job, progress in known.items() if progress is not None}
 
 
 def _read(
-    store: Store, trainings: Sequence[_Training]
+    actor: Actor, store: Store, trainings: Sequence[_Training]
 ) -> tuple[Mapping[str, Sequence[Mapping[str, Any]]], Mapping[str, RunFacts]]:
     """By job its curve, and by name the runs whose owners must be known."""
     read = {each.job.id: curves.of(store.run(each.job.run), each.job) for each in trainings}
-    names = {each.job.run for each in trainings} if permissions.visible_queues() is not None else set()
+    names = {each.job.run for each in trainings} if actor.queues is not None else set()
     return read, {name: facts_of(store.run(name)) for name in names}
 
 

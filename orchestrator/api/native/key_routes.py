@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation, Refusal, Shared
+from orchestrator.api.context import actor_of
 from orchestrator.keys import Key, KeysError, KeyStore, KeyUsageError
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation, Refusal, Shared
 
 router = APIRouter()
 _Value = TypeVar("_Value")
@@ -52,7 +52,8 @@ def remove_key(request: Request, name: str) -> dict[str, str]:
 
 def list_keys(request: Request) -> list[Key]:
     """All keys, by name. Raises ClientError."""
-    permissions.check_all_queues(Operation.READ_KEYS)
+    actor = actor_of(request)
+    actor.check_all_queues(Operation.READ_KEYS)
     return sorted(_carry_out(_store(request).load).values(), key=lambda key: key.name)
 
 
@@ -81,7 +82,8 @@ def _store(request: Request) -> KeyStore:
 
 
 def _writable(request: Request, operation: Operation) -> KeyStore:
-    permissions.check(operation, Shared())
+    actor = actor_of(request)
+    actor.check(operation, Shared())
     if not is_writable(request):
         command = "create" if operation is Operation.CREATE_KEY else "delete"
         raise Refusal(

@@ -12,22 +12,21 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, Known, reconciler_of, using, with_store
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, Known, actor_of, reconciler_of, using, with_store
 from orchestrator.api.http.callers import user_name
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native.continuing import submit
 from orchestrator.api.native.model_routes import entered_model, find_model, owner_of_model
-from orchestrator.api.permissions import LeagueOf, Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import find_job, unknown_job
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import CONTROLLER, Actor, LeagueOf, Operation
 from orchestrator.spec.league_races import race_job
 from orchestrator.spec.settings import task_config
 from shared_store import leagues
@@ -114,8 +113,8 @@ def list_leagues(request: Request) -> list[dict[str, Any]]:
 @router.post("/leagues")
 def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
     """Create a league; its rules are never changed."""
-    reconciler = reconciler_of(request)
-    permissions.check(Operation.CREATE_LEAGUE)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    actor.check(Operation.CREATE_LEAGUE)
     reconciler.check_writable(adds=True)
     if body.opens is not None and body.closes is not None and body.opens >= body.closes:
         raise ClientError("opens: the league would close before it opens")
@@ -132,7 +131,7 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
             track=tuple(body.track),
             rules=rules,
             seed=body.seed,
-            owner=_caller(),
+            owner=_caller(actor),
             created=time.time(),
             opens=body.opens,
             closes=body.closes,
@@ -167,7 +166,7 @@ def league_table(
 @router.get("/leagues/{name}/entries/{number}")
 def read_entry(request: Request, name: str, number: int) -> Any:
     """An entry with its race and, where it is disqualified, the ruling; ``problem`` tells what was altered in it or in its model."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     stored, _ = _find(reconciler, name)
     found: dict[str, Any] = {"entry": number}
     try:
@@ -181,7 +180,7 @@ def read_entry(request: Request, name: str, number: int) -> Any:
         found["problem"] = stored.problem(number, error)
     except ClientError as error:  # of its model
         found["problem"] = str(error)
-    return permissions.shown({**found, "ruling": stored.ruling(number)})
+    return actor.shown({**found, "ruling": stored.ruling(number)})
 
 
 @router.post("/leagues/{name}/races")
@@ -192,17 +191,17 @@ def race(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key gets the answer of the first one."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     stored, league = _find(reconciler, name)
-    model = find_model(reconciler, body.model, body.version)
-    permissions.check(Operation.RACE, owner_of_model(model))
+    model = find_model(reconciler, actor, body.model, body.version)
+    actor.check(Operation.RACE, owner_of_model(model))
     try:
         if closed := league.closed(time.time()):
             raise LeagueError(closed)
-        stored.admit(_caller(), _racer(body))
+        stored.admit(_caller(actor), _racer(actor, body))
     except LeagueError as error:
         raise _refused(error) from None
-    return _submit(reconciler, league, model, body.directory, idempotency_key)
+    return _submit(reconciler, actor, league, model, body.directory, idempotency_key)
 
 
 @router.post("/leagues/{name}/entries/{number}/races")
@@ -214,34 +213,34 @@ def rerun(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit the race of an entry once more, whether the league is open or not; on a CPU its laps are the same."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     stored, league = _find(reconciler, name)
     try:
         entry = stored.entry(number)
     except LeagueError as error:
         raise _refused(error) from None
     model = entered_model(reconciler, entry)
-    permissions.check(Operation.RERUN_ENTRY, owner_of_model(model))
+    actor.check(Operation.RERUN_ENTRY, owner_of_model(model))
     _check_digest(model, entry)
-    return _submit(reconciler, league, model, body.directory, idempotency_key)
+    return _submit(reconciler, actor, league, model, body.directory, idempotency_key)
 
 
 @router.post("/leagues/{name}/entries")
 def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     """Make an entry of a race that has ended: the model's digest, the evaluation and its laps, for good."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     stored, league = _find(reconciler, name)
-    model = find_model(reconciler, body.model, body.version)
-    permissions.check(Operation.ENTER_LEAGUE, owner_of_model(model))
+    model = find_model(reconciler, actor, body.model, body.version)
+    actor.check(Operation.ENTER_LEAGUE, owner_of_model(model))
     reconciler.check_writable(adds=True)
     checkpoint = _checked(reconciler, league, model)
-    job, run = _race_of(reconciler, league, body.job)
+    job, run = _race_of(reconciler, actor, league, body.job)
     cited = model.facts()["run"]
     with using(reconciler, cited, run):
         summary = _summary(reconciler, league, model, checkpoint, job)
         entry = {
-            "racer": _racer(body),
-            "owner": _caller(),
+            "racer": _racer(actor, body),
+            "owner": _caller(actor),
             "model": {**_identity(model), "task": summary.get("task")},
             "evaluation": {"run": cited, "name": summary["name"], "job": job, "time": summary["time"]},
             "versions": summary.get("versions"),
@@ -258,12 +257,12 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
 @router.post("/leagues/{name}/entries/{number}/disqualify")
 def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest) -> dict[str, Any]:
     """Disqualify an entry for good, with the reason; the entry itself stays as it is. For the league's owner."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     stored, league = _find(reconciler, name)
-    permissions.check(Operation.DISQUALIFY, LeagueOf(league.name, league.owner))
+    actor.check(Operation.DISQUALIFY, LeagueOf(league.name, league.owner))
     reconciler.check_writable(adds=True)
     try:
-        stored.disqualify(number, body.reason, _caller())
+        stored.disqualify(number, body.reason, _caller(actor))
     except LeagueError as error:
         raise _refused(error) from None
     except OSError as error:
@@ -303,16 +302,15 @@ def _described(stored: StoredLeague) -> dict[str, Any]:
         return {"name": stored.name, "problem": str(error)}
 
 
-def _caller() -> str:
+def _caller(actor: Actor) -> str:
     """The owner of the caller's leagues and entries. A command with a controller of its own acts for this user, like one on loopback."""
-    identity = permissions.current_identity.get()
-    return f"user {user_name(os.getuid())}" if identity == permissions.THIS_PROCESS else identity.name
+    return f"user {user_name(os.getuid())}" if actor == CONTROLLER else actor.name
 
 
-def _racer(body: RaceRequest) -> str:
+def _racer(actor: Actor, body: RaceRequest) -> str:
     """Name of the racer: the caller's, unless the request gives another. Raises ClientError."""
     if body.racer is None:
-        return _caller().removeprefix("key ").removeprefix("user ")
+        return _caller(actor).removeprefix("key ").removeprefix("user ")
     if not _RACER.fullmatch(body.racer):
         raise ClientError(
             f"racer {shown(body.racer)}: use letters, digits, spaces, dots, hyphens, apostrophes and '_', at most 64, the first a "
@@ -321,14 +319,13 @@ def _racer(body: RaceRequest) -> str:
     return body.racer
 
 
-def _suffix() -> str:
+def _suffix(actor: Actor) -> str:
     """Ends the names of a key's races: a job definition belongs to the key that registered it, and each may race any model of a queue."""
-    identity = permissions.current_identity.get()
-    return "" if identity.queues is None else identity.name.removeprefix("key ")
+    return "" if actor.queues is None else actor.name.removeprefix("key ")
 
 
 def _submit(
-    reconciler: Reconciler, league: League, model: Model, directory: str, idempotency_key: str | None
+    reconciler: Reconciler, actor: Actor, league: League, model: Model, directory: str, idempotency_key: str | None
 ) -> dict[str, Any]:
     """Submit the race of a model. Raises ClientError."""
     _checked(reconciler, league, model)
@@ -338,13 +335,13 @@ def _submit(
 
     def call(known: Known) -> dict[str, Any]:
         with reconciler.writing, reconciler.database.session() as session:
-            context = Context(session, reconciler, idempotency_key, known=known)
+            context = Context(session, reconciler, actor, idempotency_key, known=known)
             earlier = submission.answered(context)
             if earlier is not None:
                 return submission.answer(earlier)
             queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
             try:
-                spec = race_job(league, model.reference, facts, queue, _suffix())
+                spec = race_job(league, model.reference, facts, queue, _suffix(actor))
             except SpecError as error:
                 raise ClientError(str(error)) from None
             tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
@@ -390,14 +387,14 @@ def _identity(model: Model) -> dict[str, Any]:
     return {"name": model.name, "version": model.version, "digest": _digest(model)}
 
 
-def _race_of(reconciler: Reconciler, league: League, reference: str) -> tuple[str, str]:
+def _race_of(reconciler: Reconciler, actor: Actor, league: League, reference: str) -> tuple[str, str]:
     """Id and run of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
     with reconciler.database.session() as session:
-        queues = permissions.visible_queues()
+        queues = actor.queues
         job = find_job(session, reference, queues)
         if job is None:
             raise ClientError(unknown_job(session, reference, queues), 404)
-        permissions.check(Operation.ENTER_LEAGUE, job)
+        actor.check(Operation.ENTER_LEAGUE, job)
         if job.status != Status.SUCCEEDED:
             raise ClientError(
                 f"job {named(job.name, job.id)} is {job.status}: only a race that has SUCCEEDED is entered", CONFLICT

@@ -7,6 +7,7 @@ import time
 
 from orchestrator.api.context import visible_runs
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.services.permissions import Actor
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
 
@@ -14,9 +15,9 @@ _KEPT = 600.0
 """Seconds for which the parent of a run is not read again: it changes only where the run is replaced by another of its name."""
 
 
-def clones_of(reconciler: Reconciler, run: Run) -> list[str]:
+def clones_of(reconciler: Reconciler, actor: Actor, run: Run) -> list[str]:
     """The runs that began with weights of ``run`` and that the caller may see, by name."""
-    return [each.name for each in visible_runs(reconciler) if _parents.of(each) == run.name]
+    return [each.name for each in visible_runs(reconciler, actor) if _parents.of(each) == run.name]
 
 
 class _Parents:

@@ -8,14 +8,13 @@ from typing import Any, Literal
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import owner_of_run, permitted_run, reconciler_of, using
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, owner_of_run, permitted_run, reconciler_of, using
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import RunRecord
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import bundles, models
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile
@@ -37,9 +36,10 @@ class RegisterRequest(BaseModel):
 @router.get("/models")
 def list_models(request: Request) -> Any:
     """The newest version of each model that the caller may see, by name."""
+    actor = actor_of(request)
     store = reconciler_of(request).store
     newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
-    return permissions.shown([_described(model) for model in newest if permissions.is_visible(owner_of_model(model))])
+    return actor.shown([_described(model) for model in newest if actor.may_see(owner_of_model(model))])
 
 
 @router.get("/models/{name}")
@@ -50,23 +50,23 @@ def read_model(
     verify: bool = Query(default=False, description="read every file and check its digest"),
 ) -> Any:
     """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` names the damaged files."""
-    reconciler = reconciler_of(request)
-    model = find_model(reconciler, name, version)
-    permissions.check(Operation.READ_MODEL, owner_of_model(model))
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    model = find_model(reconciler, actor, name, version)
+    actor.check(Operation.READ_MODEL, owner_of_model(model))
     found = _described(model, verify)
     try:
         found["contract"] = model.contract().document()
         found["weights"] = bundles.read_manifest(model.bundle)["files"].get(bundles.POLICY, {}).get("sha256")
     except DamagedBundle as error:
         found["problem"] = found.get("problem") or str(error)
-    return permissions.shown({**found, "versions": [each.version for each in models.versions(reconciler.store, name)]})
+    return actor.shown({**found, "versions": [each.version for each in models.versions(reconciler.store, name)]})
 
 
 @router.post("/runs/{name}/models")
 def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     """Keep the exported bundle of a checkpoint as the next version of a model, permanently."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.REGISTER_MODEL)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.REGISTER_MODEL)
     reconciler.check_writable(adds=True)
     if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
@@ -79,8 +79,8 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
         with using(reconciler, run.name):
             there = models.versions(reconciler.store, body.name)
             if there:
-                permissions.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
-            facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
+                actor.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
+            facts = {"queue": queue, "owner": owner, "registered_by": actor.name}
             model = models.register(
                 reconciler.store, body.name, run, checkpoint, facts, reconciler.peers.id, again=body.again
             )
@@ -92,13 +92,13 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
         raise ClientError(str(error), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"model {body.name} can't be written ({error.strerror or error})", 503) from None
-    return permissions.shown(_described(model))
+    return actor.shown(_described(model))
 
 
-def find_model(reconciler: Reconciler, name: str, version: int | None) -> Model:
+def find_model(reconciler: Reconciler, actor: Actor, name: str, version: int | None) -> Model:
     """A version of a model that the caller may see, the newest where none is named. Raises ClientError."""
     try:
-        return models.find(reconciler.store, name, version, lambda model: permissions.is_visible(owner_of_model(model)))
+        return models.find(reconciler.store, name, version, lambda model: actor.may_see(owner_of_model(model)))
     except UnknownModel as error:
         raise ClientError(str(error), 404) from None
     except (ModelError, DamagedFile) as error:

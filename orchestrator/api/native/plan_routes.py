@@ -8,15 +8,12 @@ from typing import Any
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api import permissions
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.operations import validate
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native.fitting import fit_of, named_queue
-from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
 from orchestrator.control.compute_environments import options_of
@@ -28,6 +25,8 @@ from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import JobsOf, Operation
 
 router = APIRouter(route_class=StoreRoute)
 
@@ -45,18 +44,18 @@ class PlanRequest(BaseModel):
 @router.post("/plan")
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     wanted, definition = _gang_of(body), body.definition
     check_tracks(reconciler.store, wanted.spec)
     for source in sources_of(wanted):
-        run = permitted_run(reconciler, source.run, Operation.READ_RUN)
+        run = permitted_run(reconciler, actor, source.run, Operation.READ_RUN)
         if source.key in ("evaluate", "race"):
             check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
     reconciler.engine.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine
     with reconciler.database.session() as session:
-        queue = named_queue(session, body.queue)
-        permissions.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_of(session, reconciler, queue, wanted)
+        queue = named_queue(session, actor, body.queue)
+        actor.check(Operation.PLAN, JobsOf(queue.name))
+        found = fit_of(session, actor, reconciler, queue, wanted)
         if found.allocation is None:
             raise ClientError(
                 found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
@@ -107,14 +106,14 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
 @router.post("/fit")
 def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     wanted = _gang_of(body)
     check_tracks(reconciler.store, wanted.spec)
     reconciler.engine.capacity(patience=FRESH)
     with reconciler.database.session() as session:
-        queue = named_queue(session, body.queue)
-        permissions.check(Operation.FIT, JobsOf(queue.name))
-        return {"problem": fit_of(session, reconciler, queue, wanted).problem}
+        queue = named_queue(session, actor, body.queue)
+        actor.check(Operation.FIT, JobsOf(queue.name))
+        return {"problem": fit_of(session, actor, reconciler, queue, wanted).problem}
 
 
 def _gang_of(body: PlanRequest) -> GangSpec:

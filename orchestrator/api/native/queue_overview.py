@@ -11,9 +11,8 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.context import reconciler_of
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.native.fitting import UnknownQueue
-from orchestrator.api.permissions import JobsOf, is_visible
 from orchestrator.control.compute_environments import own_queues
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
@@ -25,6 +24,7 @@ from orchestrator.persistence.job_counts import JobCounts
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 from orchestrator.scheduling.order import score, weight
 from orchestrator.scheduling.snapshot import Queue
+from orchestrator.services.permissions import Actor, JobsOf
 
 router = APIRouter()
 
@@ -45,17 +45,18 @@ def queues(
 
     How full a host is counts the jobs of all queues.
     """
-    return overview(reconciler_of(request), queue)
+    actor = actor_of(request)
+    return overview(reconciler_of(request), actor, queue)
 
 
-def overview(reconciler: Reconciler, only: str = "") -> dict[str, Any]:
+def overview(reconciler: Reconciler, actor: Actor, only: str = "") -> dict[str, Any]:
     """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises UnknownQueue."""
     engine = reconciler.engine
     capacities = engine.capacity()
     with reconciler.database.session() as session:
         policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
         rows = [
-            row for row in session.scalars(select(JobQueue).order_by(JobQueue.name)) if is_visible(JobsOf(row.name))
+            row for row in session.scalars(select(JobQueue).order_by(JobQueue.name)) if actor.may_see(JobsOf(row.name))
         ]
         names = [row.name for row in rows]
         if only and only not in names:

@@ -9,15 +9,14 @@ from typing import Any
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api import permissions
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.api.http.store_route import WorkRoute
-from orchestrator.api.permissions import Operation
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.domain.retention import age_of
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import contents
 
 router = APIRouter(route_class=WorkRoute)
@@ -49,16 +48,16 @@ def read_garbage(
 
     ``next`` is None after the last part.
     """
-    return _part(reconciler_of(request), after, older_than, take=False)
+    return _part(reconciler_of(request), actor_of(request), after, older_than, take=False)
 
 
 @router.post("/gc")
 def take_garbage(request: Request, body: TakeRequest) -> dict[str, Any]:
     """Take it: rows of jobs, their logs and outcomes, and runs that hold nothing else."""
-    permissions.check(Operation.TAKE_GARBAGE)
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    actor.check(Operation.TAKE_GARBAGE)
     reconciler.check_writable(adds=False)
-    return _part(reconciler, body.after, body.older_than, take=True)
+    return _part(reconciler, actor, body.after, body.older_than, take=True)
 
 
 class ArchiveRequest(BaseModel):
@@ -70,8 +69,8 @@ class ArchiveRequest(BaseModel):
 @router.post("/runs/{name}/archive")
 def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, Any]:
     """Archive a run, so that nothing is added to it, it is left out of lists, and it is neither taken nor deleted; or take it out again."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.ARCHIVE_RUN)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.ARCHIVE_RUN)
     with reconciler.retention.alone(run.name):
         if reconciler.retention.stored.facts([run.name])[run.name] is None:
             raise ClientError(f"run {run.name} was deleted a moment ago", 404)
@@ -80,7 +79,7 @@ def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, 
                 f"run {run.name} is not archived, since job {job} has not ended; stop it first: muster stop {job}"
             )
         if body.archived:
-            contents.archive(run, permissions.current_identity.get().name)
+            contents.archive(run, actor.name)
         else:
             contents.unarchive(run)
     return {"run": run.name, "archived": body.archived}
@@ -89,20 +88,19 @@ def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, 
 @router.delete("/runs/{name}")
 def delete_run(request: Request, name: str) -> dict[str, Any]:
     """Delete a run with all that it holds, where nothing needs it. Answers its size; ``left`` is where in the trash the rest is that can't be removed."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.DELETE_RUN)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.DELETE_RUN)
     reconciler.check_writable(adds=False)
-    return reconciler.retention.delete(run.name, _caller())
+    return reconciler.retention.delete(run.name, _whose(actor))
 
 
-def _caller() -> Whose:
-    identity = permissions.current_identity.get()
-    return Whose(identity.name, identity.queues)
+def _whose(actor: Actor) -> Whose:
+    return Whose(actor.name, actor.queues)
 
 
-def _part(reconciler: Reconciler, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
+def _part(reconciler: Reconciler, actor: Actor, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
     """The next part of a pass. Raises ClientError for a malformed member."""
-    whose = _caller()
+    whose = _whose(actor)
     try:
         place = Place.of(after) if after else Place()
     except ValueError as error:

@@ -12,12 +12,10 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api import permissions
 from orchestrator.api.batch.fargate import without_effect
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import named_definition, queue_names, reconciler_of
+from orchestrator.api.context import actor_of, named_definition, queue_names, reconciler_of
 from orchestrator.api.damaged import reading
-from orchestrator.api.errors import ClientError
 from orchestrator.api.http.following import PIECE, Following
 from orchestrator.api.native import (
     job_list,
@@ -34,7 +32,6 @@ from orchestrator.api.native import (
     webhook_routes,
 )
 from orchestrator.api.native.log_stream import followed, positions_of, stored
-from orchestrator.api.permissions import Operation
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
 from orchestrator.control.reconciler import Reconciler
@@ -47,6 +44,8 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, unknown_job
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
 from shared_store.contract.phases import Phase, phase_in
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
@@ -66,20 +65,20 @@ router.include_router(key_routes.router)
 router.include_router(plan_routes.router)
 
 
-def permitted_job(session: Session, reference: str, operation: Operation) -> Job:
+def permitted_job(session: Session, actor: Actor, reference: str, operation: Operation) -> Job:
     """The job, where the caller may do this to it. Raises ClientError."""
-    queues = permissions.visible_queues()
+    queues = actor.queues
     job = find_job(session, reference, queues)
     if job is None:
-        raise ClientError(_jobs_of_run(session, reference) or unknown_job(session, reference, queues), 404)
-    permissions.check(operation, job)
+        raise ClientError(_jobs_of_run(session, actor, reference) or unknown_job(session, reference, queues), 404)
+    actor.check(operation, job)
     return job
 
 
-def _jobs_of_run(session: Session, reference: str) -> str:
+def _jobs_of_run(session: Session, actor: Actor, reference: str) -> str:
     """A hint at the jobs that made the run of this name, for a caller who gives it in place of a job; empty without a visible job."""
     query = select(Job).where(Job.run == reference).order_by(Job.created_at)
-    made = [job for job in session.scalars(query) if permissions.is_visible(job)]
+    made = [job for job in session.scalars(query) if actor.may_see(job)]
     if not made:
         return ""
     names = ", ".join(named(job.name, job.id) for job in made[-5:])
@@ -95,12 +94,12 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     hosts tell that.
     ``queues``: those whose jobs the caller may see.
     """
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     names = reconciler.engine.names
     with reconciler.database.session() as session:
         if queue is not None:
             names = queue_engines(session, queue, names[0])
-        queues = queue_names(session)
+        queues = queue_names(session, actor)
     capacities = reconciler.engine.capacity(names, FRESH)
     return {
         "engines": own_queues(reconciler.engine.names),
@@ -131,9 +130,9 @@ def job_detail(
     ``runIsReplaced``: another run has its name now.
     ``withoutEffect``: members of its definition for Fargate, which change nothing here.
     """
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     with reconciler.database.session() as session:
-        job = permitted_job(session, reference, Operation.READ_JOB)
+        job = permitted_job(session, actor, reference, Operation.READ_JOB)
         run = reconciler.store.run(job.run)
     problem, is_replaced, is_gone, results, progress = None, False, False, None, None
     try:
@@ -144,13 +143,13 @@ def job_detail(
             is_replaced = is_of_earlier_run(job, found)
             is_gone = found.missing and job.first_epoch is not None and job.stopped_at is not None
             # a job may continue a run of another queue
-            if owner is not None and permissions.is_visible(owner) and not is_replaced:
+            if owner is not None and actor.may_see(owner) and not is_replaced:
                 results, progress = reconciler.calls.call(partial(_results, run))
     except (StoreSilent, OSError) as error:
         problem = str(error)
     with reconciler.database.session() as session:
-        job = permitted_job(session, job.id, Operation.READ_JOB)
-        described = runs.described(session, results) if results else None
+        job = permitted_job(session, actor, job.id, Operation.READ_JOB)
+        described = runs.described(session, actor, results) if results else None
         definition = named_definition(session, job.definition)
         with reading(job):
             attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
@@ -185,7 +184,7 @@ def job_detail(
                 "progress": progress,
                 "storeProblem": problem,
             }
-    return permissions.shown(detail)
+    return actor.shown(detail)
 
 
 def _phase(attempts: Sequence[dict[str, Any]], main: int) -> Phase | None:
@@ -217,9 +216,9 @@ def job_logs(
 
     ``positions``: a JSON object of ``attempt/node`` and the ``position`` of its last line that the caller has.
     """
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
     with reconciler.database.session() as session:
-        job = permitted_job(session, reference, Operation.READ_JOB_LOGS)
+        job = permitted_job(session, actor, reference, Operation.READ_JOB_LOGS)
         with reading(job):
             count = len(job.gang.nodes)
         if node is not None and not 0 <= node < count:
@@ -235,23 +234,23 @@ def job_logs(
 @router.post("/jobs/{reference}/checkpoint")
 def save_now(request: Request, reference: str) -> dict[str, str]:
     """Have a training job save now; answers when the checkpoint is durable."""
-    reconciler = reconciler_of(request)
-    job, attempt, nodes = _running(reconciler, reference, Operation.CHECKPOINT_JOB)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    job, attempt, nodes = _running(reconciler, actor, reference, Operation.CHECKPOINT_JOB)
     return {"answer": _command(reconciler, job, attempt, nodes[0], "checkpoint", 150.0)}
 
 
 @router.get("/jobs/{reference}/stacks")
 def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
     """The Python and native stacks of every rank, node by node."""
-    reconciler = reconciler_of(request)
-    job, attempt, nodes = _running(reconciler, reference, Operation.READ_JOB_STACKS)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    job, attempt, nodes = _running(reconciler, actor, reference, Operation.READ_JOB_STACKS)
     return [{"node": node, "stacks": _command(reconciler, job, attempt, node, "stacks", 60.0)} for node in nodes]
 
 
-def _running(reconciler: Reconciler, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
+def _running(reconciler: Reconciler, actor: Actor, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
     """Id, attempt and nodes of a running job. Raises ClientError."""
     with reconciler.database.session() as session:
-        job = permitted_job(session, reference, operation)
+        job = permitted_job(session, actor, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
             raise ClientError(f"job {named(job.name, job.id)} is {job.status}, not RUNNING", CONFLICT)

@@ -8,12 +8,11 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from orchestrator.api import permissions
-from orchestrator.api.context import IDEMPOTENCY_HEADER, permitted_run, reconciler_of
+from orchestrator.api.context import IDEMPOTENCY_HEADER, actor_of, permitted_run, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.native import clones, lineage, runs
 from orchestrator.api.native.continuing import Changes
-from orchestrator.api.permissions import Operation
+from orchestrator.services.permissions import Operation
 from shared_store.volume.checkpoints import best_checkpoint, list_checkpoints
 from shared_store.volume.evaluations import by_checkpoint, list_evaluations
 from shared_store.volume.metrics import history_of
@@ -62,28 +61,28 @@ def list_runs(
     archived: bool = Query(default=False, description="those that are archived, in place of the others"),
 ) -> Any:
     """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    reconciler = reconciler_of(request)
-    found = runs.list_runs(reconciler, after, most, search, archived)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    found = runs.list_runs(reconciler, actor, after, most, search, archived)
     if len(found) == most:
         asked = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
         query = urlencode({"max": most, "after": found[-1]["run"], **asked})
         response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
-    return permissions.shown(found)
+    return actor.shown(found)
 
 
 @router.get("/runs/{name}")
 def run_detail(request: Request, name: str) -> Any:
     """One run; ``parent`` is where its weights come from, ``clones`` are the runs that began with its own."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.READ_RUN)
-    described = runs.describe_run(reconciler, run)
-    return permissions.shown({**described, "clones": lineage.clones_of(reconciler, run)})
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.READ_RUN)
+    described = runs.describe_run(reconciler, actor, run)
+    return actor.shown({**described, "clones": lineage.clones_of(reconciler, actor, run)})
 
 
 @router.get("/runs/{name}/checkpoints")
 def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
     """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
-    run = permitted_run(reconciler_of(request), name, Operation.READ_CHECKPOINTS)
+    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_CHECKPOINTS)
     evaluated, best = by_checkpoint(run), best_checkpoint(run)
     return [
         {
@@ -108,7 +107,7 @@ def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
 @router.get("/runs/{name}/evaluations")
 def run_evaluations(request: Request, name: str) -> list[dict[str, Any]]:
     """The summaries of the run's evaluations, the newest last; ``table`` names the Parquet file beside each in ``evaluations/``."""
-    return list_evaluations(permitted_run(reconciler_of(request), name, Operation.READ_EVALUATIONS))
+    return list_evaluations(permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_EVALUATIONS))
 
 
 @router.get("/runs/{name}/metrics")
@@ -120,7 +119,7 @@ def run_metrics(
     most: int = Query(default=METRICS_A_PAGE, ge=1, le=METRICS_A_PAGE, alias="max"),
 ) -> list[dict[str, Any]]:
     """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    history = history_of(permitted_run(reconciler_of(request), name, Operation.READ_METRICS))
+    history = history_of(permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_METRICS))
     found = history.after(after, most)
     if len(found) == most or history.behind:
         last = found[-1]["iteration"] if found else after
@@ -136,9 +135,9 @@ def resume_run(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.RESUME_RUN)
-    return runs.resume(reconciler, run, body.changes(), idempotency_key)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.RESUME_RUN)
+    return runs.resume(reconciler, actor, run, body.changes(), idempotency_key)
 
 
 @router.post("/runs/{name}/clone")
@@ -149,8 +148,8 @@ def clone_run(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key gets the answer of the first one."""
-    reconciler = reconciler_of(request)
-    run = permitted_run(reconciler, name, Operation.CLONE_RUN)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    run = permitted_run(reconciler, actor, name, Operation.CLONE_RUN)
     if body.dry_run:
-        return clones.check_clone(reconciler, run, body.name, body.changes())
-    return clones.clone(reconciler, run, body.name, body.changes(), idempotency_key)
+        return clones.check_clone(reconciler, actor, run, body.name, body.changes())
+    return clones.clone(reconciler, actor, run, body.name, body.changes(), idempotency_key)

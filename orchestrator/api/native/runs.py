@@ -15,10 +15,8 @@ from orchestrator.api.batch import submission
 from orchestrator.api.checkpoints import CONFLICT, choose, refusal
 from orchestrator.api.context import Context, Known, archived, using, visible_runs, with_store
 from orchestrator.api.damaged import DamagedRow, reading
-from orchestrator.api.errors import ClientError
 from orchestrator.api.kept_texts import keep_again
 from orchestrator.api.native.continuing import Changes, answered, submit
-from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
@@ -29,6 +27,8 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
@@ -44,14 +44,14 @@ from shared_store.volume.run_settings import first_difference, fixed_settings, i
 
 
 def list_runs(
-    reconciler: Reconciler, after: str, most: int, search: str = "", archived: bool = False
+    reconciler: Reconciler, actor: Actor, after: str, most: int, search: str = "", archived: bool = False
 ) -> list[dict[str, Any]]:
     """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see: those that are archived, or not.
 
     One that can't be read has a ``problem`` instead of its facts.
     """
     stored: list[StoredRun | dict[str, Any]] = []
-    for run in visible_runs(reconciler, after, most, search.strip(), lambda run: is_archived(run) == archived):
+    for run in visible_runs(reconciler, actor, after, most, search.strip(), lambda run: is_archived(run) == archived):
         try:
             stored.append(stored_run(run))
         except (DamagedFile, OSError) as error:
@@ -61,14 +61,14 @@ def list_runs(
     with reconciler.database.session() as session:
         # one query instead of one a run: the session looks here first
         _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(names))).all()
-        return [described(session, each) if isinstance(each, StoredRun) else each for each in stored]
+        return [described(session, actor, each) if isinstance(each, StoredRun) else each for each in stored]
 
 
-def describe_run(reconciler: Reconciler, run: Run) -> dict[str, Any]:
+def describe_run(reconciler: Reconciler, actor: Actor, run: Run) -> dict[str, Any]:
     """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
     stored = stored_run(run)
     with reconciler.database.session() as session:
-        return described(session, stored)
+        return described(session, actor, stored)
 
 
 @dataclass(frozen=True)
@@ -105,18 +105,20 @@ def stored_run(run: Run) -> StoredRun:
     return StoredRun(found, results)
 
 
-def described(session: Session, stored: StoredRun) -> dict[str, Any]:
+def described(session: Session, actor: Actor, stored: StoredRun) -> dict[str, Any]:
     """:func:`describe_run` of what the store has, and the database."""
     run, results = stored.found, stored.results
     owner = owner_of(session, run)
-    jobs = session.execute(select(Job.id, Job.name, Job.status).where(*_of_run(run)).order_by(Job.created_at)).all()
+    jobs = session.execute(
+        select(Job.id, Job.name, Job.status).where(*_of_run(actor, run)).order_by(Job.created_at)
+    ).all()
     return {
         **results,
         "owner": owner.owner if owner else None,
         "queue": owner.queue if owner else None,
-        "spec": _shown_spec(session, run, results["spec"]) if jobs else results["spec"],
+        "spec": _shown_spec(session, actor, run, results["spec"]) if jobs else results["spec"],
         "jobs": [{"id": job.id, "name": job.name, "status": job.status} for job in jobs],
-        "automatic": _automatic(session, run),
+        "automatic": _automatic(session, actor, run),
     }
 
 
@@ -143,24 +145,26 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
     return facts
 
 
-def spec_of(session: Session, run: FoundRun) -> Mapping[str, Any] | None:
+def spec_of(session: Session, actor: Actor, run: FoundRun) -> Mapping[str, Any] | None:
     """The spec with which a run continues: that of its newest job, else the one that it was created with. Raises DamagedRow."""
-    newest = newest_job(session, run)
+    newest = newest_job(session, actor, run)
     if newest:
         with reading(newest):
             return newest.gang.spec
     return (run.description() or {}).get("spec")
 
 
-def _shown_spec(session: Session, run: FoundRun, created: Any) -> Any:
+def _shown_spec(session: Session, actor: Actor, run: FoundRun, created: Any) -> Any:
     """:func:`spec_of`; that with which the run was ``created`` where the row of its newest job is damaged."""
     try:
-        return spec_of(session, run)
+        return spec_of(session, actor, run)
     except DamagedRow:
         return created
 
 
-def resume(reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: str | None = None) -> dict[str, Any]:
+def resume(
+    reconciler: Reconciler, actor: Actor, run: Run, changes: Changes, idempotency_key: str | None = None
+) -> dict[str, Any]:
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
     Args:
@@ -173,11 +177,18 @@ def resume(reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: 
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
     with using(reconciler, run.name, cites=False):
-        return with_teacher(reconciler, lambda teacher: _resume(reconciler, run, changes, idempotency_key, teacher))
+        return with_teacher(
+            reconciler, lambda teacher: _resume(reconciler, actor, run, changes, idempotency_key, teacher)
+        )
 
 
 def _resume(
-    reconciler: Reconciler, run: Run, changes: Changes, idempotency_key: str | None, teacher: TeacherCopy | None
+    reconciler: Reconciler,
+    actor: Actor,
+    run: Run,
+    changes: Changes,
+    idempotency_key: str | None,
+    teacher: TeacherCopy | None,
 ) -> dict[str, Any]:
     found, checkpoints = facts_of(run), list_checkpoints(run)
     if found.is_missing():
@@ -185,12 +196,12 @@ def _resume(
     if is_archived(run):
         raise archived(run.name)
     with reconciler.database.session() as session:
-        if earlier := _answered(Context(session, reconciler, idempotency_key), found, checkpoints):
+        if earlier := _answered(Context(session, reconciler, actor, idempotency_key), found, checkpoints):
             return earlier
-        document = spec_of(session, found)
+        document = spec_of(session, actor, found)
     with suppress(SpecError, ClientError):  # refused below, with its reason
         document = override(document or {}, changes.all())
-    keep_again(reconciler, run, document)
+    keep_again(reconciler, actor, run, document)
     chosen = choose(run, changes.checkpoint)
     if chosen is not None:
         with suppress(DamagedCheckpoint):
@@ -205,10 +216,10 @@ def _resume(
 
     def begin(known: Known) -> dict[str, Any]:
         with reconciler.writing, reconciler.database.session() as session:
-            context = Context(session, reconciler, idempotency_key, teacher=teacher, known=known)
+            context = Context(session, reconciler, actor, idempotency_key, teacher=teacher, known=known)
             if earlier := _answered(context, found, checkpoints):
                 return earlier
-            document = spec_of(session, found)
+            document = spec_of(session, actor, found)
             if document is None:
                 raise ClientError(
                     f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
@@ -225,8 +236,8 @@ def _resume(
             if spec.train:
                 if chosen:
                     _check_rate(run, chosen, spec, changes.assignments)
-                    _check_progress(session, found, spec, chosen)
-                environment["MUSTER_WORLDS"] = str(_worlds(session, found, before, spec, chosen))
+                    _check_progress(session, actor, found, spec, chosen)
+                environment["MUSTER_WORLDS"] = str(_worlds(session, actor, found, before, spec, chosen))
             if chosen and changes.checkpoint is not None:
                 environment["MUSTER_CHECKPOINT"] = chosen.name
             submitted, _ = submit(context, spec, changes.directory, f"run {run.name}", environment)
@@ -242,7 +253,7 @@ def _answered(context: Context, run: FoundRun, saved: Sequence[Checkpoint]) -> d
     job = answered(context, run.name)
     if job is None:
         return None
-    kind = "train" if (spec_of(context.session, run) or {}).get("train") else "command"
+    kind = "train" if (spec_of(context.session, context.actor, run) or {}).get("train") else "command"
     return {
         **submission.answer(job),
         "run": run.name,
@@ -332,7 +343,7 @@ _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": (
 """Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
 
 
-def _check_progress(session: Session, run: FoundRun, after: Spec, chosen: Checkpoint) -> None:
+def _check_progress(session: Session, actor: Actor, run: FoundRun, after: Spec, chosen: Checkpoint) -> None:
     """Refuse a run that is complete, and one that a newer Muster wrote.
 
     A job that was struck down after its last save still owes its evaluation: such a run may be resumed.
@@ -344,7 +355,7 @@ def _check_progress(session: Session, run: FoundRun, after: Spec, chosen: Checkp
         raise ClientError(f"run {run.name}: {error}", CONFLICT) from None
     except DamagedCheckpoint:
         pass  # the worker names it, sets it aside and uses the one before
-    newest = newest_job(session, run)
+    newest = newest_job(session, actor, run)
     owing = chosen.iteration == after.train.iterations and newest is not None and newest.status == Status.FAILED
     if chosen.iteration >= after.train.iterations and not owing:
         raise ClientError(
@@ -354,7 +365,7 @@ def _check_progress(session: Session, run: FoundRun, after: Spec, chosen: Checkp
         )
 
 
-def _worlds(session: Session, run: FoundRun, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
+def _worlds(session: Session, actor: Actor, run: FoundRun, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
     """Number of worlds with which the run continues: those that it has, whatever the number of ranks. Raises ClientError where they don't fit."""
     assert before.train is not None and after.train is not None
     ranks = after.nodes.max * after.ranks_per_node
@@ -362,7 +373,7 @@ def _worlds(session: Session, run: FoundRun, before: Spec, after: Spec, chosen: 
     changed = before.train.worlds != after.train.worlds
     if changed and chosen is None:  # no checkpoint holds worlds yet
         return wanted
-    worlds = _worlds_of(session, run, before, chosen)
+    worlds = _worlds_of(session, actor, run, before, chosen)
     if changed and wanted != worlds:
         assert chosen is not None
         raise ClientError(
@@ -377,7 +388,7 @@ def _worlds(session: Session, run: FoundRun, before: Spec, after: Spec, chosen: 
     return worlds
 
 
-def _worlds_of(session: Session, run: FoundRun, before: Spec, chosen: Checkpoint | None) -> int:
+def _worlds_of(session: Session, actor: Actor, run: FoundRun, before: Spec, chosen: Checkpoint | None) -> int:
     """Number of worlds of the run, by its checkpoint, else by its newest job's variables or spec."""
     assert before.train is not None
     try:
@@ -385,18 +396,18 @@ def _worlds_of(session: Session, run: FoundRun, before: Spec, chosen: Checkpoint
             return told
     except DamagedCheckpoint:
         pass
-    if (newest := newest_job(session, run)) and (given := newest.gang.options.worlds) is not None:
+    if (newest := newest_job(session, actor, run)) and (given := newest.gang.options.worlds) is not None:
         return given
     return before.train.worlds * before.ranks_per_node * before.nodes.max
 
 
-def newest_job(session: Session, run: FoundRun) -> Job | None:
-    return session.scalars(select(Job).where(*_of_run(run)).order_by(Job.created_at.desc()).limit(1)).first()
+def newest_job(session: Session, actor: Actor, run: FoundRun) -> Job | None:
+    return session.scalars(select(Job).where(*_of_run(actor, run)).order_by(Job.created_at.desc()).limit(1)).first()
 
 
-def _of_run(run: FoundRun) -> list[ColumnElement[bool]]:
+def _of_run(actor: Actor, run: FoundRun) -> list[ColumnElement[bool]]:
     """Those of the run's jobs that the caller may see: a key with all queues may have continued it in another queue."""
-    queues = visible_queues()
+    queues = actor.queues
     return [*jobs_of(run), *([] if queues is None else [Job.queue.in_(queues)])]
 
 
@@ -417,14 +428,14 @@ def _best(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str
     return {"checkpoint": best.name, "iteration": best.iteration, "mean": mean, "of": len(evaluated)}
 
 
-def _automatic(session: Session, run: FoundRun) -> dict[str, Any] | None:
+def _automatic(session: Session, actor: Actor, run: FoundRun) -> dict[str, Any] | None:
     """The newest automatic evaluation of a training, how it is, and how many checkpoints that were due were passed over."""
     row = session.get(AutomaticEvaluation, run.name)
     training = session.get(Job, row.training) if row else None
     if row is None or (training is not None and is_of_earlier_run(training, run)):
         return None
     job = session.get(Job, row.job) if row.job else None
-    job = job if job is not None and is_visible(job) else None  # it may be in a queue that the caller can't see
+    job = job if job is not None and actor.may_see(job) else None  # it may be in a queue that the caller can't see
     return {
         "checkpoint": row.checkpoint,
         "iteration": int(row.checkpoint.partition("-")[0]) if row.checkpoint else None,

@@ -7,11 +7,10 @@ from functools import partial
 from fastapi import APIRouter, Request
 from fastapi.responses import PlainTextResponse, Response
 
-from orchestrator.api import permissions
-from orchestrator.api.context import permitted_run, reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, permitted_run, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.permissions import Operation
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.volume.texts import Reference, TextError, digest_of, read
 
 router = APIRouter(route_class=StoreRoute)
@@ -20,7 +19,8 @@ router = APIRouter(route_class=StoreRoute)
 @router.put("/texts/{sha256}")
 async def keep_text(request: Request, sha256: str) -> dict[str, str]:
     """Keep a text (UTF-8, the body) for jobs that name it by its digest: ``{file: NAME, sha256: …}`` in a task's configuration."""
-    permissions.check(Operation.KEEP_TEXT)
+    actor = actor_of(request)
+    actor.check(Operation.KEEP_TEXT)
     reconciler, data = reconciler_of(request), await request.body()
     reconciler.check_writable(adds=True)
     try:
@@ -29,14 +29,14 @@ async def keep_text(request: Request, sha256: str) -> dict[str, str]:
         raise ClientError("the body is not a text (UTF-8)") from None
     if found != sha256:
         raise ClientError(f"the text that came has sha256 {found}, not {sha256[:100]}; send it again")
-    keep = partial(reconciler.texts.keep, data, permissions.current_identity.get().name)
+    keep = partial(reconciler.texts.keep, data, actor.name)
     return {"sha256": await reconciler.calls.answer(keep, works=True)}
 
 
 @router.get("/runs/{name}/texts/{sha256}")
 def run_text(request: Request, name: str, sha256: str) -> Response:
     """A long text of the run's jobs, such as a reward function, by the digest that their specs have."""
-    run = permitted_run(reconciler_of(request), name, Operation.READ_TEXT)
+    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_TEXT)
     try:
         return PlainTextResponse(read(run.texts, Reference(f"run {name}", "text", sha256)))
     except TextError:

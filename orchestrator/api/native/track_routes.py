@@ -10,14 +10,13 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.api import permissions
-from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.permissions import Operation, Shared
 from orchestrator.api.turns import Turns
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ServerError, UsageError
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation, Shared
 from orchestrator.spec.tracks import ask
 
 router = APIRouter(route_class=StoreRoute)
@@ -48,8 +47,8 @@ def list_tracks(
     rings: bool = Query(default=False, description="with the borders, for a drawing"),
 ) -> list[dict[str, Any]]:
     """The presets and the tracks of the store with their measures [m]; one that is damaged has a ``problem`` instead."""
-    permissions.check(Operation.LIST_TRACKS)
-    reconciler = reconciler_of(request)
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    actor.check(Operation.LIST_TRACKS)
     if name is None:
         found: list[dict[str, Any]] = _ask(reconciler, {"action": "list", "rings": rings})
         return found
@@ -59,8 +58,8 @@ def list_tracks(
 @router.post("/tracks")
 def make_track(request: Request, body: MakeRequest) -> dict[str, Any]:
     """Make a track from a preset or a seed, and keep it in the store, for good."""
-    reconciler = reconciler_of(request)
-    permissions.check(Operation.MAKE_TRACK, Shared())
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    actor.check(Operation.MAKE_TRACK, Shared())
     reconciler.check_writable(adds=True)
     if (body.preset is None) == (body.seed is None):
         raise ClientError("give one of preset and seed")

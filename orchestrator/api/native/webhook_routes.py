@@ -6,12 +6,11 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 
-from orchestrator.api import permissions
 from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import reconciler_of
-from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation
+from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.control.deliveries import Deliveries
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest
 
 router = APIRouter()
@@ -20,7 +19,8 @@ router = APIRouter()
 @router.get("/webhooks")
 def list_webhooks(request: Request) -> list[dict[str, Any]]:
     """The webhooks of the controller's ``--webhooks`` file, without paths and secrets: how many messages wait, and which were given up."""
-    permissions.check_all_queues(Operation.READ_WEBHOOKS)
+    actor = actor_of(request)
+    actor.check_all_queues(Operation.READ_WEBHOOKS)
     deliveries: Deliveries | None = request.app.state.deliveries
     if deliveries is None:
         return []
@@ -31,8 +31,9 @@ def list_webhooks(request: Request) -> list[dict[str, Any]]:
 @router.post("/webhooks/{name}/test")
 def test_webhook(request: Request, name: str) -> dict[str, Any]:
     """Send a sample once, signed like any message; ``problem`` is null where the receiver accepted it."""
-    permissions.check(Operation.TEST_WEBHOOK)
-    permissions.check_all_queues(Operation.TEST_WEBHOOK)
+    actor = actor_of(request)
+    actor.check(Operation.TEST_WEBHOOK)
+    actor.check_all_queues(Operation.TEST_WEBHOOK)
     deliveries: Deliveries | None = request.app.state.deliveries
     if deliveries is None or not deliveries.webhooks:
         raise ClientError("this controller has no webhooks; start it with: muster serve --webhooks FILE", CONFLICT)

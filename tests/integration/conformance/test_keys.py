@@ -23,7 +23,7 @@ from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.callers import Caller
 from orchestrator.api.http.limits import RateLimit
-from orchestrator.api.permissions import current_identity
+from orchestrator.services.permissions import current_identity
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
 from orchestrator.keys import KeyStore

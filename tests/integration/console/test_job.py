@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 from orchestrator.console import job_view
 from orchestrator.console.job_view import State, Views
 from orchestrator.domain.errors import ApiError

@@ -14,7 +14,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 from orchestrator.api.turns import Turns
 from shared_store.volume.files import DamagedFile, open_inside, write_json
 from shared_store.volume.layout import Run, Store

@@ -10,10 +10,10 @@ import pytest
 from sqlalchemy import event, func, select
 
 from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.api.logs.streams import newest_streams
-from orchestrator.api.permissions import Identity, current_identity
+from orchestrator.services.permissions import Identity, current_identity
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server

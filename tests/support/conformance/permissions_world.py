@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 
 from orchestrator.api.logs import operations as logs
-from orchestrator.api.permissions import Operation
+from orchestrator.services.permissions import Operation
 from orchestrator.client import Client
 from orchestrator.keys import KeyStore
 from orchestrator.spec.compile import compile_definition, compile_submission

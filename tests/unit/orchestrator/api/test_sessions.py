@@ -8,7 +8,7 @@ import pytest
 
 from orchestrator.api.http import access
 from orchestrator.api.http.access import Access
-from orchestrator.api.permissions import Identity, Refusal
+from orchestrator.services.permissions import Identity, Refusal
 from orchestrator.keys import KeyStore
 
 SECRET = bytes(32)

@@ -13,7 +13,7 @@ from typing import Any, cast
 import pytest
 from fastapi import Request
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 from orchestrator.api.http.access import Access
 from orchestrator.console import job, live
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream

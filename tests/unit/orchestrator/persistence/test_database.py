@@ -14,7 +14,7 @@ from sqlalchemy import event, func, or_, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 from sqlalchemy.orm import Session
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 from orchestrator.domain.resources import Resources
 from orchestrator.persistence.gangs import Gangs
 from orchestrator.persistence.group_commit import GroupCommit

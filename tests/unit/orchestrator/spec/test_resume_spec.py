@@ -12,7 +12,7 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from orchestrator.api.errors import ClientError
+from orchestrator.services.errors import ClientError
 from orchestrator.api.native.continuing import Changes
 from orchestrator.api.native.runs import _check_changes, _check_rate
 from orchestrator.spec.changes import override

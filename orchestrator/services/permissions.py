@@ -26,12 +26,10 @@ these hold secrets. The token in ``MUSTER_TOKEN`` and the controller's own user 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from orchestrator.api.errors import ClientError
 from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import (
     ComputeEnvironment,
@@ -42,6 +40,7 @@ from orchestrator.persistence.models import (
     SchedulingPolicy,
 )
 from orchestrator.persistence.own_models import LogGroup
+from orchestrator.services.errors import ClientError
 
 HIDDEN = "(hidden)"
 """Stands for the value of an environment variable that the caller may not read."""
@@ -55,20 +54,6 @@ class Refusal(ClientError):
     def __init__(self, kind: str, message: str, status: int = 403) -> None:
         super().__init__(message, status)
         self.kind = kind
-
-
-@dataclass(frozen=True)
-class Identity:
-    """The sender of a request. ``queues``: names of the queues that it may use; None means all."""
-
-    name: str
-    queues: frozenset[str] | None = None
-    read_only: bool = False
-
-
-THIS_PROCESS = Identity("this process")
-current_identity: ContextVar[Identity] = ContextVar("current_identity", default=THIS_PROCESS)
-"""The sender of the current request; outside of a request the controller itself, which may do everything."""
 
 
 class Operation(StrEnum):
@@ -192,50 +177,56 @@ _OfQueues = Job | RunRecord | JobsOf | JobDefinition | LeagueOf | LogGroup
 Object = _OfQueues | JobQueue | ComputeEnvironment | SchedulingPolicy | Shared
 
 
-def check(operation: Operation, *objects: Object) -> None:
-    """Raise Refusal (403, AccessDeniedException) where the caller may not do this to all of these objects."""
-    identity = current_identity.get()
-    if identity.read_only and not operation.reads:
-        raise Refusal(
-            "AccessDeniedException", f"{identity.name} is read-only: {operation} is refused; use a key that may write"
-        )
-    for each in objects:
-        if not _allowed(identity, operation, each):
-            queues = ", ".join(sorted(identity.queues or ())) or "none"
-            if operation in _OF_THE_OWNER and _allowed(identity, Operation.READ_RUN, each):
-                raise Refusal(
-                    "AccessDeniedException", f"{identity.name}: {operation} is refused, since {_made_by(each)}"
-                )
+@dataclass(frozen=True)
+class Actor:
+    """Who asks for something.
+
+    Attributes:
+        name: Of a key, such as ``key ann``, or of a user of this machine.
+        queues: Names of the queues that it may use, and whose jobs and runs it may see; None means all.
+        read_only: Whether it may change nothing.
+    """
+
+    name: str
+    queues: frozenset[str] | None = None
+    read_only: bool = False
+
+    def check(self, operation: Operation, *objects: Object) -> None:
+        """Raise Refusal (403, AccessDeniedException) where the actor may not do this to all of these objects."""
+        if self.read_only and not operation.reads:
             raise Refusal(
-                "AccessDeniedException",
-                f"{identity.name} may use job queue {queues} only: {operation} is refused, since {_whose(each)}",
+                "AccessDeniedException", f"{self.name} is read-only: {operation} is refused; use a key that may write"
             )
+        for each in objects:
+            if not _allowed(self, operation, each):
+                if operation in _OF_THE_OWNER and _allowed(self, Operation.READ_RUN, each):
+                    raise Refusal(
+                        "AccessDeniedException", f"{self.name}: {operation} is refused, since {_made_by(each)}"
+                    )
+                raise self._refusal(operation, _whose(each))
 
+    def check_all_queues(self, operation: Operation) -> None:
+        """Raise Refusal unless the actor may see all queues in one answer."""
+        if self.queues is not None:
+            raise self._refusal(operation, "it tells of all queues")
 
-def check_all_queues(operation: Operation) -> None:
-    """Raise Refusal unless the caller may see all queues in one answer."""
-    identity = current_identity.get()
-    if identity.queues is not None:
-        queues = ", ".join(sorted(identity.queues)) or "none"
-        raise Refusal(
-            "AccessDeniedException",
-            f"{identity.name} may use job queue {queues} only: {operation} is refused, since it tells of all queues",
+    def may_see(self, thing: Object) -> bool:
+        """Whether the actor may read all of it; lists leave out the rest."""
+        return _allowed(self, Operation.LIST_JOBS, thing)
+
+    def shown(self, answer: Any) -> Any:
+        """An answer as the actor may see it: to a read-only key without the values of environment variables."""
+        return without_values(answer) if self.read_only else answer
+
+    def _refusal(self, operation: Operation, why: str) -> Refusal:
+        queues = ", ".join(sorted(self.queues or ())) or "none"
+        return Refusal(
+            "AccessDeniedException", f"{self.name} may use job queue {queues} only: {operation} is refused, since {why}"
         )
 
 
-def is_visible(thing: Object) -> bool:
-    """Whether the caller may read all of it; lists leave out the rest."""
-    return _allowed(current_identity.get(), Operation.LIST_JOBS, thing)
-
-
-def visible_queues() -> frozenset[str] | None:
-    """Names of the queues whose jobs and runs the caller may see; None: all."""
-    return current_identity.get().queues
-
-
-def shown(answer: Any) -> Any:
-    """An answer as the caller may see it: to a read-only key without the values of environment variables."""
-    return without_values(answer) if current_identity.get().read_only else answer
+CONTROLLER = Actor("this process")
+"""The controller itself, which may do everything."""
 
 
 def without_values(document: Any) -> Any:
@@ -256,21 +247,21 @@ def _hidden(environment: Any) -> Any:
     return environment
 
 
-def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
-    queues = identity.queues
+def _allowed(actor: Actor, operation: Operation, thing: Object) -> bool:
+    queues = actor.queues
     if queues is None:
         return True
     match thing:
         case RunRecord() if operation in _OF_THE_OWNER:
-            return thing.queue in queues and thing.owner == identity.name
+            return thing.queue in queues and thing.owner == actor.name
         case Job() | RunRecord() | JobsOf():
             return thing.queue in queues
         case LeagueOf() | LogGroup():
-            return thing.owner == identity.name or operation.reads
+            return thing.owner == actor.name or operation.reads
         case JobDefinition():
             shared = thing.tags.get(QUEUES_TAG, "").split()
             tagged = "*" in shared or not queues.isdisjoint(shared)
-            return thing.owner == identity.name or (tagged and (operation.reads or operation is Operation.SUBMIT_JOB))
+            return thing.owner == actor.name or (tagged and (operation.reads or operation is Operation.SUBMIT_JOB))
         case _:
             return operation.reads
 
