@@ -19,11 +19,11 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
+from orchestrator.api.context import actor_of
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.callers import Caller
 from orchestrator.api.http.limits import RateLimit
-from orchestrator.services.permissions import current_identity
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
 from orchestrator.keys import KeyStore
@@ -213,9 +213,8 @@ def test_the_application_sees_who_asks(tmp_path: Path) -> None:
     key = KeyStore(tmp_path).create("a", ("robots",), read_only=True)
 
     def who(request: Request) -> JSONResponse:  # in another thread, as all our operations are
-        identity = current_identity.get()
-        assert request.state.identity is identity
-        return JSONResponse([identity.name, sorted(identity.queues or ()), identity.read_only])
+        actor = actor_of(request)
+        return JSONResponse([actor.name, sorted(actor.queues or ()), actor.read_only])
 
     inner = Starlette(routes=[Route("/", who)])
 
@@ -229,7 +228,6 @@ def test_the_application_sees_who_asks(tmp_path: Path) -> None:
     assert asyncio.run(ask(access, "the-token")) == ["MUSTER_TOKEN", [], False]
     assert asyncio.run(ask(access, access.own_token)) == ["this process", [], False]
     assert asyncio.run(ask(Access(), "any")) == ["address 127.0.0.1", [], False]
-    assert current_identity.get().name == "this process"
 
 
 def test_muster_run_gets_into_the_controller_that_it_brings(tmp_path: Path) -> None:

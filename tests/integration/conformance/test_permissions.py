@@ -14,8 +14,8 @@ from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.app import create_app
 from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
-from orchestrator.services.permissions import HIDDEN, Operation
 from orchestrator.domain.errors import ApiError
+from orchestrator.services.permissions import HIDDEN, Operation
 from tests.support.conformance.fuzz_requests import GROUP_ARN
 from tests.support.conformance.permissions_world import KEYS, MARK, SECRET, TOKEN, World, definition
 from tests.support.conformance.streams import GROUP

@@ -10,13 +10,13 @@ import pytest
 from sqlalchemy import event, func, select
 
 from orchestrator.api.context import Context
-from orchestrator.services.errors import ClientError
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.api.logs.streams import newest_streams
-from orchestrator.services.permissions import Identity, current_identity
 from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import CONTROLLER, Actor
 from shared_store.volume.layout import Store
 from tests.conftest import wait_for
 from tests.support.definitions import container, multinode, single
@@ -137,16 +137,13 @@ def test_the_newest_streams_cost_one_statement_however_many_jobs_are_children_of
     statements: list[str] = []
     event.listen(database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     with database.session() as session:
-        assert len(newest_streams(session, Store(tmp_path / "store"))) == 3
+        assert len(newest_streams(session, CONTROLLER, Store(tmp_path / "store"))) == 3
     assert len(statements) == 1, statements
     database.close()
 
 
 def test_an_unknown_queue_is_refused_with_the_names_that_the_caller_may_see(inside: Server) -> None:
-    before = current_identity.set(Identity("robots", frozenset({"robots"})))
-    try:
-        with inside.reconciler.database.session() as session, pytest.raises(ClientError) as refused:
-            Context(session, inside.reconciler).queue("nosuch")
-    finally:
-        current_identity.reset(before)
+    actor = Actor("robots", frozenset({"robots"}))
+    with inside.reconciler.database.session() as session, pytest.raises(ClientError) as refused:
+        Context(session, inside.reconciler, actor).queue("nosuch")
     assert str(refused.value) == "Job queue nosuch does not exist; there is none yet"

@@ -9,9 +9,9 @@ from typing import Any
 import httpx
 
 from orchestrator.api.logs import operations as logs
-from orchestrator.services.permissions import Operation
 from orchestrator.client import Client
 from orchestrator.keys import KeyStore
+from orchestrator.services.permissions import Operation
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
 from shared_store import leagues

@@ -17,6 +17,7 @@ from orchestrator.control.log_hub import LogHub
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.job import Status
 from orchestrator.persistence.session import Database
+from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run
 from shared_store.volume.log_files import LogWriter
 from shared_store.volume.logs import format_line
@@ -49,7 +50,7 @@ class World:
         self.writers[job].append(format_line(1_800_000_000.0, 0, "o", text).encode())
 
     def tail(self) -> LiveTail:
-        return LiveTail(self.reconciler, ["group"], lambda _: True, lambda _: True)
+        return LiveTail(self.reconciler, CONTROLLER, ["group"], lambda _: True, lambda _: True)
 
     @property
     def followers(self) -> int:

@@ -8,8 +8,8 @@ import pytest
 
 from orchestrator.api.http import access
 from orchestrator.api.http.access import Access
-from orchestrator.services.permissions import Identity, Refusal
 from orchestrator.keys import KeyStore
+from orchestrator.services.permissions import Actor, Refusal
 
 SECRET = bytes(32)
 
@@ -28,7 +28,7 @@ def test_a_session_has_the_rights_of_its_key_as_they_are_now(keys: KeyStore) -> 
     keys.create("a", ("robots",), read_only=True)
     here = Access(keys, console_secret=SECRET)
     session = here.sign_in(given(keys, "a"))
-    assert here.session(session) == Identity("key a", frozenset({"robots"}), True)
+    assert here.session(session) == Actor("key a", frozenset({"robots"}), True)
     keys.delete("a")
     keys.create("a")
     assert here.session(session) is None, "another key of the same name"
@@ -50,7 +50,7 @@ def test_a_changed_session_is_none(keys: KeyStore) -> None:
 def test_the_servers_token_opens_a_session_that_ends_when_the_token_changes() -> None:
     session = Access(None, "a-token-of-the-server", console_secret=SECRET).sign_in("a-token-of-the-server")
     assert "a-token" not in session
-    assert Access(None, "a-token-of-the-server", console_secret=SECRET).session(session) == Identity("MUSTER_TOKEN")
+    assert Access(None, "a-token-of-the-server", console_secret=SECRET).session(session) == Actor("MUSTER_TOKEN")
     assert Access(None, "another-token-of-it", console_secret=SECRET).session(session) is None
     assert Access(None, None, console_secret=SECRET).session(session) is None
     with pytest.raises(Refusal, match="not known here"):
