@@ -25,7 +25,7 @@ from uuid import UUID
 from sqlalchemy import insert
 
 from benchmarks.load import Watch, add_option, machine, told
-from orchestrator.api.arns import definition_arn
+from orchestrator.domain.arns import definition_arn
 from orchestrator.console import jobs as jobs_page
 from orchestrator.console import live
 from orchestrator.console.live import Recent

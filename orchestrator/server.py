@@ -16,13 +16,11 @@ from typing import Any, cast
 
 import uvicorn
 
-from orchestrator.api import arns
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
 from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.http.connections import Connection, Connections, Seldom, Serving, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit
-from orchestrator.api.native.automatic import AutomaticEvaluations
 from orchestrator.console import add_console
 from orchestrator.control.account import recognise as recognise_account
 from orchestrator.control.bus import Bus
@@ -34,6 +32,7 @@ from orchestrator.control.presence import LOST_AFTER, Presence
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_identity import recognise
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
+from orchestrator.domain import arns
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
 from orchestrator.engines.installed import make_engine
@@ -44,6 +43,7 @@ from orchestrator.home import HomeLock, console_secret
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
+from orchestrator.services.automatic_evaluations import AutomaticEvaluations
 from shared_store.volume.layout import Store
 
 log = logging.getLogger("muster.controller")

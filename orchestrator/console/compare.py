@@ -10,12 +10,13 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of, visible_runs
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import run_routes
 from orchestrator.console.curves import number
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
+from orchestrator.services.context import permitted_run, visible_runs
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest

@@ -25,9 +25,10 @@ from typing import Any
 
 from fastapi import Query, Request
 
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.console.live import Recent
 from orchestrator.console.routing import page_router
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.layout import Run

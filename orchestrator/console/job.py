@@ -12,8 +12,7 @@ from fastapi import Request, Response
 from fastapi.responses import RedirectResponse
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
-from orchestrator.api.kept_texts import with_texts
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.routes import job_detail
 from orchestrator.console.curves import columns
 from orchestrator.console.job_config import before_it, code_of, differences
@@ -28,8 +27,10 @@ from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.reasons import short_id
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
+from orchestrator.services.texts import with_texts
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
 from shared_store.volume.learning_metrics import LEARNING

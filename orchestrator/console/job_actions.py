@@ -8,10 +8,8 @@ from typing import Any, Literal
 from fastapi import Depends, Request, Response
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
-from orchestrator.api.native import clones, continuing, routes, runs
-from orchestrator.api.native.continuing import Changes
+from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.native import routes
 from orchestrator.api.native.model_routes import RegisterRequest, register_model
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.forms import Form, Question, done, sent_form
@@ -20,8 +18,14 @@ from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.reasons import short_id
+from orchestrator.services import clone as clones
+from orchestrator.services import runs
+from orchestrator.services import spec_submission as continuing
+from orchestrator.services.chosen_checkpoints import CONFLICT, choose
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
+from orchestrator.services.spec_submission import Changes
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.volume.checkpoints import list_checkpoints
@@ -137,8 +141,8 @@ def _submitted(request: Request, document: Mapping[str, Any], directory: str, wh
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    answer = continuing.submit_alone(reconciler_of(request), actor, spec, directory, what)
-    return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']}")
+    job = continuing.submit_alone(reconciler_of(request), actor, spec, directory, what)
+    return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 
 def _job(request: Request, reference: str, operation: Operation) -> tuple[str, str, str, str]:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.http.following import PIECE
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.log_stream import positions_of
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.live import Event

@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import actor_of, queue_names, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
 from orchestrator.console import words
 from orchestrator.console.forms import Form, Question, done, sent_form
@@ -21,6 +21,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.reasons import short_id
+from orchestrator.services.context import queue_names
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from shared_store.contract.error_text import counted

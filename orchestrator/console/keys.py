@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 from fastapi import Depends, Request, Response
 
-from orchestrator.api.arns import here
-from orchestrator.api.context import actor_of, queue_names, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
 from orchestrator.console import words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
+from orchestrator.domain.arns import here
+from orchestrator.services.context import queue_names
 
 router = page_router()
 _INTERVAL = 1.0

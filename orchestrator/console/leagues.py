@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import league_routes as api
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.league_routes import LEAGUE_TAG, MODEL_TAG

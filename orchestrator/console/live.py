@@ -16,9 +16,9 @@ from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import format_sse_event
 
-from orchestrator.api.context import actor_of, reconciler_of
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.following import Following, looked_patiently
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.console.pages import session
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.errors import Unavailable

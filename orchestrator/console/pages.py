@@ -11,9 +11,9 @@ from fastapi import Request, Response
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
-from orchestrator.api.context import actor_of
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import error_response, session_of
+from orchestrator.api.http.requests import actor_of
 from orchestrator.console import assets, words
 from orchestrator.services.permissions import Actor
 from shared_store import __version__

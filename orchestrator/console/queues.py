@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.queue_overview import FIRST, overview
 from orchestrator.console import words
 from orchestrator.console.live import Event, Recent, Rows, stream

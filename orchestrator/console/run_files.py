@@ -14,8 +14,9 @@ from urllib.parse import quote
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.console.routing import page_router
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.files import DamagedFile, open_inside

@@ -8,9 +8,8 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.context import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import run_routes
-from orchestrator.api.native.runs import last_metrics, list_runs
 from orchestrator.console import words
 from orchestrator.console.curves import number
 from orchestrator.console.live import Event, Recent, Rows, stream
@@ -19,6 +18,7 @@ from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.reasons import short_id
 from orchestrator.services.permissions import Actor
+from orchestrator.services.runs import last_metrics, list_runs
 from shared_store.volume.evaluations import told_changes
 from shared_store.volume.learning_metrics import LEARNING, in_words
 from shared_store.volume.metrics import finite, warnings_of

@@ -12,10 +12,8 @@ from fastapi import Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import actor_of, queue_names, reconciler_of
-from orchestrator.api.kept_texts import with_texts
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import plan_routes, routes
-from orchestrator.api.native.fitting import UnknownQueue
 from orchestrator.api.native.plan_routes import PlanRequest
 from orchestrator.api.turns import Turns
 from orchestrator.console.forms import TOKEN, Form, done, sent_form
@@ -27,8 +25,11 @@ from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_o
 from orchestrator.console.tracks import track_names
 from orchestrator.domain.errors import SpecError
 from orchestrator.services import permissions
+from orchestrator.services.context import queue_names
 from orchestrator.services.errors import ClientError
+from orchestrator.services.fit import UnknownQueue
 from orchestrator.services.permissions import Operation
+from orchestrator.services.texts import with_texts
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec

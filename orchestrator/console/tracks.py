@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from fastapi import Depends, Query, Request, Response
 
-from orchestrator.api.context import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.track_routes import MakeRequest, list_tracks, make_track, picture
 from orchestrator.console.forms import Form, body_of, done, sent_form
 from orchestrator.console.live import Recent

@@ -14,6 +14,8 @@ from orchestrator.domain.resources import Resources
 
 MOST_NODES = 5000
 """Nodes of a gang from YAML; the Batch API takes AWS's 1,000."""
+LARGEST_DEFINITION = 24 << 10
+"""Bytes of a job definition, as on AWS."""
 
 
 @dataclass(frozen=True)

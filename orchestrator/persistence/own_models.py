@@ -108,7 +108,7 @@ class LogStream(Base):
 
 
 class AutomaticEvaluation(Base):
-    """Progress of a training's automatic evaluations (:mod:`orchestrator.api.native.automatic`)."""
+    """Progress of a training's automatic evaluations (:mod:`orchestrator.services.automatic_evaluations`)."""
 
     __tablename__ = "automatic_evaluations"
     run: Mapped[str] = mapped_column(primary_key=True)

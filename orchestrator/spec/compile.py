@@ -87,3 +87,13 @@ def compile_submission(
             "nodePropertyOverrides": [{"targetNodes": "0:", "containerOverrides": {"environment": pairs}}]
         }
     return request
+
+
+def with_environment(properties: Mapping[str, Any], environment: Mapping[str, str]) -> dict[str, Any]:
+    """Node properties of :func:`compile_definition` with variables added on every node, as the job of :func:`compile_submission` has them."""
+    ranges = []
+    for entry in properties["nodeRangeProperties"]:
+        merged = {each["name"]: each["value"] for each in entry["container"]["environment"]} | dict(environment)
+        pairs = [{"name": name, "value": value} for name, value in merged.items()]
+        ranges.append({**entry, "container": {**entry["container"], "environment": pairs}})
+    return {**properties, "nodeRangeProperties": ranges}

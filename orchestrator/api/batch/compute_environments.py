@@ -9,14 +9,14 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
-from orchestrator.api.context import Context
 from orchestrator.control.compute_environments import is_built_in
+from orchestrator.domain.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy
+from orchestrator.services.context import Context
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation, Shared
 

@@ -6,15 +6,14 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api.arns import definition_arn, plain_name
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
-from orchestrator.api.context import Context
-from orchestrator.api.kept_texts import check_texts
-from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.arns import definition_arn, plain_name
 from orchestrator.persistence.models import JobDefinition
 from orchestrator.services import permissions
+from orchestrator.services.context import Context
+from orchestrator.services.definitions import check_owner, register
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 
@@ -23,11 +22,6 @@ _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 
 def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """RegisterJobDefinition; each registration of a name is a new revision."""
-    return register(context, request)[0]
-
-
-def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any], GangSpec]:
-    """RegisterJobDefinition: its answer, and the gang of the definition. Raises ClientError."""
     name, kind = request["jobDefinitionName"], request["type"]
     rules.check_name("jobDefinitionName", name)
     rules.check_tries(request)
@@ -44,19 +38,10 @@ def register(context: Context, request: dict[str, Any]) -> tuple[dict[str, Any],
     properties = rules.node_properties(request)
     gang = rules.check_nodes(properties, kind)
     fargate.check_platform(request, properties, f"job definition {name}")
-    _check_owner(context, name, Operation.REGISTER_JOB_DEFINITION)
-    check_texts(context, gang)
-    query = select(JobDefinition.revision, JobDefinition.owner).where(JobDefinition.name == name)
-    newest = context.session.execute(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
-    revision = newest.revision + 1 if newest else 1
-    # the name stays its owner's when a key with all queues adds a revision
-    owner = (newest.owner if newest else None) or context.actor.name
     document = {key: value for key, value in request.items() if key != "tags"}
-    context.session.add(
-        JobDefinition(name=name, revision=revision, document=document, owner=owner, tags=request.get("tags") or {})
-    )
-    answer = {"jobDefinitionName": name, "jobDefinitionArn": definition_arn(name, revision), "revision": revision}
-    return answer, gang
+    added = register(context, name, document, gang, request.get("tags"))
+    arn = definition_arn(name, added.revision)
+    return {"jobDefinitionName": name, "jobDefinitionArn": arn, "revision": added.revision}
 
 
 def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -89,18 +74,11 @@ def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict
         raise ClientError(
             f"job definition {request['jobDefinition'][:300]!r}: name it with its revision, NAME:N, or by ARN"
         )
-    _check_owner(context, name, Operation.DEREGISTER_JOB_DEFINITION)
+    check_owner(context, name, Operation.DEREGISTER_JOB_DEFINITION)
     definition = context.session.get(JobDefinition, (name, int(revision)))
     if definition is not None:  # AWS answers the same for one that is not there
         definition.status = "INACTIVE"
     return {}
-
-
-def _check_owner(context: Context, name: str, operation: Operation) -> None:
-    """Refuse a name that another key has registered: jobs are submitted by the bare name."""
-    caller = context.actor.name
-    foreign = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.owner.is_distinct_from(caller))
-    context.actor.check(operation, *context.session.scalars(foreign.limit(1)))
 
 
 def _describe(actor: Actor, definition: JobDefinition) -> dict[str, Any]:

@@ -8,15 +8,15 @@ from typing import Any
 from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import selectinload
 
-from orchestrator.api.arns import definition_arn, queue_arn, split_reference
 from orchestrator.api.batch.describe import array_properties, describe_damaged, describe_job, node_status, summarize
 from orchestrator.api.batch.paging import decode, encode, page, page_size
-from orchestrator.api.context import Context
-from orchestrator.api.damaged import DamagedRow, reading
+from orchestrator.domain.arns import definition_arn, queue_arn, split_reference
 from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
+from orchestrator.services.context import Context
+from orchestrator.services.damaged_rows import DamagedRow, reading
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import JobsOf, Operation
 

@@ -16,12 +16,12 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
 from orchestrator.api.batch.service_model import service_model
-from orchestrator.api.context import Context, Known, with_store
 from orchestrator.api.http import limits
-from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
+from orchestrator.services.sources import with_teacher
 from shared_store.volume.initial_weights import TeacherCopy
 
 OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {

@@ -7,15 +7,15 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
-from orchestrator.api.context import Context
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
+from orchestrator.domain.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
+from orchestrator.services.context import Context
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import JobsOf, Operation, Shared
 

@@ -14,11 +14,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import IDEMPOTENCY_HEADER, actor_of
 from orchestrator.api.http import docs_page
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import Guard, error_response, kind_of
 from orchestrator.api.http.limits import RateLimit, parse
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of
 from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
 from orchestrator.control import monitoring

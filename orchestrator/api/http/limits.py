@@ -11,11 +11,12 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive
 
+from orchestrator.domain.gang import LARGEST_DEFINITION
 from orchestrator.services.errors import ClientError
 
 LARGEST_BODY = 1 << 20
 """Bytes of any request's body."""
-LARGEST = {"submitjob": 30 << 10, "registerjobdefinition": 24 << 10}
+LARGEST = {"submitjob": 30 << 10, "registerjobdefinition": LARGEST_DEFINITION}
 """Bytes of the body of these operations (lower case), as on AWS."""
 LARGEST_COMMANDS = 64 << 10
 """Bytes of the commands of all node ranges of a job, with its parameters substituted."""
@@ -82,12 +83,6 @@ def check_size(operation: str, request: Mapping[str, Any]) -> None:
             return
         level = [inner for each in nested for inner in (each.values() if isinstance(each, dict) else each)]
     raise ClientError(f"{operation}: the request is nested deeper than {DEEPEST} levels")
-
-
-def check_document(operation: str, request: Mapping[str, Any]) -> None:
-    """The same limit of bytes for a request that was made here as for one that comes over the network. Raises ClientError."""
-    if len(json.dumps(request).encode()) > LARGEST[operation.lower()]:
-        raise _too_large(operation.lower(), LARGEST[operation.lower()])
 
 
 def _too_large(operation: str, limit: int) -> ClientError:

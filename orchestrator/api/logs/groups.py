@@ -9,13 +9,13 @@ from typing import Any
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from orchestrator.api.arns import log_group_arn
 from orchestrator.api.batch.members import check_log_group
 from orchestrator.api.batch.rules import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.arns import log_group_arn
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups

@@ -21,7 +21,6 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from orchestrator.api.arns import here, log_group_arn
 from orchestrator.api.batch.service_model import service_model
 from orchestrator.api.http.following import Following
 from orchestrator.api.http.limits import check_size
@@ -32,6 +31,7 @@ from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
 from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.arns import here, log_group_arn
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.persistence.models import now
 from orchestrator.services.permissions import Actor, Operation, Refusal

@@ -14,9 +14,7 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session, selectinload
 
-from orchestrator.api.context import actor_of, queue_names, reconciler_of
-from orchestrator.api.damaged import DAMAGED, DamagedRow, reading
-from orchestrator.api.native.fitting import UnknownQueue
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
@@ -26,6 +24,9 @@ from orchestrator.domain.reasons import Reason, array_of
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.services.context import queue_names
+from orchestrator.services.damaged_rows import DAMAGED, DamagedRow, reading
+from orchestrator.services.fit import UnknownQueue
 from orchestrator.services.permissions import Actor
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
 from orchestrator.spec.model import KINDS

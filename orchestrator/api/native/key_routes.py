@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import actor_of
+from orchestrator.api.http.requests import actor_of
 from orchestrator.keys import Key, KeysError, KeyStore, KeyUsageError
+from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation, Refusal, Shared
 

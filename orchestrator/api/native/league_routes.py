@@ -12,12 +12,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.api.batch import submission
-from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, Known, actor_of, reconciler_of, using, with_store
 from orchestrator.api.http.callers import user_name
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.native.continuing import submit
 from orchestrator.api.native.model_routes import entered_model, find_model, owner_of_model
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
@@ -25,8 +22,12 @@ from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import find_job, unknown_job
+from orchestrator.services import submission
+from orchestrator.services.chosen_checkpoints import CONFLICT
+from orchestrator.services.context import Context, Known, using, with_store
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER, Actor, LeagueOf, Operation
+from orchestrator.services.spec_submission import submit
 from orchestrator.spec.league_races import race_job
 from orchestrator.spec.settings import task_config
 from shared_store import leagues
@@ -346,7 +347,7 @@ def _submit(
                 raise ClientError(str(error)) from None
             tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
             what = f"league {league.name}, race of {model.reference}"
-            return submit(context, spec, directory, what, {}, tags)[0]
+            return submission.answer(submit(context, spec, directory, what, tags=tags))
 
     answer = with_store(reconciler, call)
     reconciler.wake()

@@ -8,11 +8,12 @@ from typing import Any, Literal
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.checkpoints import CONFLICT, choose
-from orchestrator.api.context import actor_of, owner_of_run, permitted_run, reconciler_of, using
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.models import RunRecord
+from orchestrator.services.chosen_checkpoints import CONFLICT, choose
+from orchestrator.services.context import owner_of_run, permitted_run, using
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import bundles, models

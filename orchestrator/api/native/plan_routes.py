@@ -10,12 +10,8 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.operations import validate
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
-from orchestrator.api.evaluated import check_evaluation
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.native.fitting import fit_of, named_queue
-from orchestrator.api.racing_tracks import check_tracks
-from orchestrator.api.sources import sources_of
 from orchestrator.control.compute_environments import options_of
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import new_nodes
@@ -25,8 +21,13 @@ from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
+from orchestrator.services.evaluated_checkpoints import check_evaluation
+from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation
+from orchestrator.services.racing_tracks import check_tracks
+from orchestrator.services.sources import sources_of
 
 router = APIRouter(route_class=StoreRoute)
 

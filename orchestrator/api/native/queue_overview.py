@@ -11,8 +11,7 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.context import actor_of, reconciler_of
-from orchestrator.api.native.fitting import UnknownQueue
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.control.compute_environments import own_queues
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
@@ -24,6 +23,7 @@ from orchestrator.persistence.job_counts import JobCounts
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 from orchestrator.scheduling.order import score, weight
 from orchestrator.scheduling.snapshot import Queue
+from orchestrator.services.fit import UnknownQueue
 from orchestrator.services.permissions import Actor, JobsOf
 
 router = APIRouter()

@@ -9,12 +9,13 @@ from typing import Any
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import WorkRoute
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.domain.retention import age_of
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import contents

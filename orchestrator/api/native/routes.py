@@ -13,10 +13,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api.batch.fargate import without_effect
-from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import actor_of, named_definition, queue_names, reconciler_of
-from orchestrator.api.damaged import reading
 from orchestrator.api.http.following import PIECE, Following
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import (
     job_list,
     key_routes,
@@ -26,7 +24,6 @@ from orchestrator.api.native import (
     queue_overview,
     retention_routes,
     run_routes,
-    runs,
     text_routes,
     track_routes,
     webhook_routes,
@@ -44,6 +41,10 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, unknown_job
+from orchestrator.services import runs
+from orchestrator.services.chosen_checkpoints import CONFLICT
+from orchestrator.services.context import named_definition, queue_names
+from orchestrator.services.damaged_rows import reading
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.contract.phases import Phase, phase_in

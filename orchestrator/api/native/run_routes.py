@@ -8,11 +8,13 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from orchestrator.api.context import IDEMPOTENCY_HEADER, actor_of, permitted_run, reconciler_of
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.native import clones, lineage, runs
-from orchestrator.api.native.continuing import Changes
+from orchestrator.services import clone as clones
+from orchestrator.services import lineage, runs
+from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
+from orchestrator.services.spec_submission import Changes
 from shared_store.volume.checkpoints import best_checkpoint, list_checkpoints
 from shared_store.volume.evaluations import by_checkpoint, list_evaluations
 from shared_store.volume.metrics import history_of

@@ -7,8 +7,9 @@ from functools import partial
 from fastapi import APIRouter, Request
 from fastapi.responses import PlainTextResponse, Response
 
-from orchestrator.api.context import actor_of, permitted_run, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
+from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.texts import Reference, TextError, digest_of, read

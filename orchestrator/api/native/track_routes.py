@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.api.context import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.turns import Turns
 from orchestrator.control.reconciler import Reconciler

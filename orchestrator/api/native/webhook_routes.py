@@ -6,9 +6,9 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 
-from orchestrator.api.checkpoints import CONFLICT
-from orchestrator.api.context import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.control.deliveries import Deliveries
+from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest

@@ -19,11 +19,11 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from orchestrator.api.context import actor_of
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.callers import Caller
 from orchestrator.api.http.limits import RateLimit
+from orchestrator.api.http.requests import actor_of
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
 from orchestrator.keys import KeyStore

@@ -14,11 +14,11 @@ import pytest
 from sqlalchemy import select
 
 from orchestrator.api.batch import submission
-from orchestrator.api.native import automatic
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from orchestrator.persistence.models import Job
 from orchestrator.server import Server
+from orchestrator.services import automatic_evaluations as automatic
 from shared_store.volume.checkpoints import list_checkpoints, retain
 from shared_store.volume.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang

@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from orchestrator.api.batch import rules
-from orchestrator.api.native import continuing
 from orchestrator.console.job_facts import facts_of
 from orchestrator.console.jobs import _row as jobs_page_row
 from orchestrator.domain import attempt
@@ -23,6 +22,7 @@ from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
+from orchestrator.services import spec_submission as continuing
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
 from shared_store.volume.layout import Store

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from orchestrator.api import arns
 from orchestrator.control.account import DEFAULT, Account, recognise
 from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.domain import arns
 from orchestrator.domain.errors import UsageError
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue
 from orchestrator.persistence.own_models import LogGroup

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from orchestrator.api.context import using
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention, RunNeeded
 from orchestrator.control.run_users import RunInUse
 from orchestrator.persistence.models import Dependency
+from orchestrator.services.context import using
 from shared_store.volume import contents, epoch, trash
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Run, Store

@@ -12,9 +12,9 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from orchestrator.api.native.continuing import Changes
-from orchestrator.api.native.runs import _check_changes, _check_rate
 from orchestrator.services.errors import ClientError
+from orchestrator.services.runs import _check_changes, _check_rate
+from orchestrator.services.spec_submission import Changes
 from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import ALGORITHMS, Spec, validate

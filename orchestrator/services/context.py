@@ -9,28 +9,24 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-from fastapi import Request
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.arns import plain_name
-from orchestrator.api.damaged import DamagedRow
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain import reasons
+from orchestrator.domain.arns import plain_name
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
+from orchestrator.services.damaged_rows import DamagedRow
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, JobsOf, Operation
 from shared_store.contract.error_text import nearest
 from shared_store.volume.initial_weights import NewRun, TeacherCopy, WeightsCopy
 from shared_store.volume.layout import Run, StoreError
-
-IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
-"""Makes it safe to repeat a submission whose answer was lost."""
 
 _COMPARED = 1000
 """Names of runs among which the nearest to an unknown one is looked for."""
@@ -93,7 +89,7 @@ class Context:
     making: NewRun | None = None
     """The run that a submission makes, of a clone."""
     teacher: TeacherCopy | None = None
-    """The weights that the submitted job's policy will imitate, copied already (:func:`orchestrator.api.sources.with_teacher`)."""
+    """The weights that the submitted job's policy will imitate, copied already (:func:`orchestrator.services.sources.with_teacher`)."""
     known: Known = field(default_factory=dict)
     """What was read of the store for the call."""
 
@@ -152,18 +148,6 @@ class Context:
     def reason(self, job: Job) -> str | None:
         """The job's ``statusReason`` in the AWS Batch API; None before it has one."""
         return self.reconciler.admission.reason(job).aws or None
-
-
-def actor_of(request: Request) -> Actor:
-    """Who has sent the request, as the guard has found."""
-    actor: Actor = request.state.actor
-    return actor
-
-
-def reconciler_of(request: Request) -> Reconciler:
-    """The controller that the application serves."""
-    reconciler: Reconciler = request.app.state.reconciler
-    return reconciler
 
 
 def named_definition(session: Session, arn: str) -> JobDefinition | None:

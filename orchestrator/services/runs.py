@@ -11,13 +11,6 @@ from typing import Any
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.batch import submission
-from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context, Known, archived, using, visible_runs, with_store
-from orchestrator.api.damaged import DamagedRow, reading
-from orchestrator.api.kept_texts import keep_again
-from orchestrator.api.native.continuing import Changes, answered, submit
-from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain.errors import SpecError
@@ -27,8 +20,15 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
+from orchestrator.services import submission
+from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
+from orchestrator.services.context import Context, Known, archived, using, visible_runs, with_store
+from orchestrator.services.damaged_rows import DamagedRow, reading
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
+from orchestrator.services.sources import with_teacher
+from orchestrator.services.spec_submission import Changes, answered, submit
+from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
@@ -240,8 +240,13 @@ def _resume(
                 environment["MUSTER_WORLDS"] = str(_worlds(session, actor, found, before, spec, chosen))
             if chosen and changes.checkpoint is not None:
                 environment["MUSTER_CHECKPOINT"] = chosen.name
-            submitted, _ = submit(context, spec, changes.directory, f"run {run.name}", environment)
-            return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
+            job = submit(context, spec, changes.directory, f"run {run.name}", environment)
+            return {
+                **submission.answer(job),
+                "run": run.name,
+                "iteration": chosen.iteration if chosen else 0,
+                "kind": spec.kind,
+            }
 
     answer = with_store(reconciler, begin)
     reconciler.wake()

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from orchestrator.api.context import Context, archived, permitted_run, release
-from orchestrator.api.evaluated import check_evaluation
-from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.services.context import Context, archived, permitted_run, release
 from orchestrator.services.errors import ClientError
+from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.permissions import Operation
+from orchestrator.services.racing_tracks import check_tracks
 from shared_store.contract.error_text import shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.contents import is_archived

@@ -14,21 +14,21 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.batch import submission
-from orchestrator.api.checkpoints import CONFLICT, choose, refusal
-from orchestrator.api.context import Context, Known, release, using, with_store
-from orchestrator.api.kept_texts import keep_again
-from orchestrator.api.native.continuing import Changes, answered, check, submit
-from orchestrator.api.native.runs import spec_of
-from orchestrator.api.sources import with_teacher
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import SpecError
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
+from orchestrator.services import submission
+from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
+from orchestrator.services.context import Context, Known, release, using, with_store
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
+from orchestrator.services.runs import spec_of
+from orchestrator.services.sources import with_teacher
+from orchestrator.services.spec_submission import Changes, answered, check, submit
+from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
 from orchestrator.spec.settings import task_config
@@ -107,11 +107,11 @@ def _clone(
                 return earlier
             _check_free(session, new, context.read("taken", partial(_is_taken, new)))
             forget_gone_run(session, new)
-            answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
+            job = submit(context, spec, changes.directory, f"clone {name}", environment)
             # before the commit: a job without its weights must not start
             description = first_description(new, job, job.owner, job.queue)
             context.publish(new.name, making, partial(making.publish, new.name, description))
-            return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
+            return {**submission.answer(job), "run": new.name, "parent": making.lineage, "kind": spec.kind}
 
     try:
         with making:

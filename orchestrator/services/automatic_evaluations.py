@@ -19,8 +19,6 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.api.context import Context, Known, with_store
-from orchestrator.api.native.continuing import submit
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain.errors import SpecError, Unavailable
@@ -30,8 +28,10 @@ from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
+from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER, Actor
+from orchestrator.services.spec_submission import submit
 from orchestrator.spec.evaluations import (
     AUTOMATIC_TAG,
     Counted,
@@ -232,15 +232,15 @@ class AutomaticEvaluations:
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
-            def call(known: Known) -> dict[str, Any]:
+            def call(known: Known) -> Job:
                 with reconciler.writing, reconciler.database.session() as session:
                     context = Context(session, reconciler, actor, known=known)
-                    answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
+                    job = submit(context, spec, training.directory, f"evaluation of run {run.name}", tags=tags)
                     row = _row(session, training, counted, found)
-                    row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
-                    return answer
+                    row.checkpoint, row.job, row.open, row.problem = chosen.name, job.id, True, None
+                    return job
 
-            answer = with_store(reconciler, call)
+            job = with_store(reconciler, call)
         except (ClientError, SpecError) as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
@@ -252,7 +252,7 @@ class AutomaticEvaluations:
         self._backoff.worked(("evaluations of", run.name))
         reconciler.wake()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
-        log.info("job %s evaluates %s@%d%s", answer["jobId"][:8], run.name, chosen.iteration, passed)
+        log.info("job %s evaluates %s@%d%s", job.id[:8], run.name, chosen.iteration, passed)
 
 
 def _is_open(session: Session, row: AutomaticEvaluation) -> bool:

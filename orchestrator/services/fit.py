@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from orchestrator.api.batch import rules
-from orchestrator.api.context import queue_names
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.errors import SpecError
-from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.persistence.models import JobQueue
 from orchestrator.scheduling.fit import Fit
+from orchestrator.services.context import queue_names
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from orchestrator.spec.compile import compile_definition
@@ -55,7 +54,7 @@ def _problem_of_evaluations(
         place = place_of(queue.name, None, wanted)
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
-        shape = rules.check_nodes(rules.node_properties(definition), "multinode").shape
+        shape = gang_needs(definition["nodeProperties"]).shape
         return fit_in_queue(session, reconciler.engine, named_queue(session, actor, place["queue"]), shape).problem
     except (ClientError, SpecError) as error:
         return str(error)

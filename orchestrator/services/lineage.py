@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 
-from orchestrator.api.context import visible_runs
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.services.context import visible_runs
 from orchestrator.services.permissions import Actor
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run

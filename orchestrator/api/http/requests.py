@@ -1,0 +1,23 @@
+"""What a request brings with it: the controller that it is for, who has sent it, and the key under which it may be repeated."""
+
+from __future__ import annotations
+
+from fastapi import Request
+
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.services.permissions import Actor
+
+IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
+"""Makes it safe to repeat a submission whose answer was lost."""
+
+
+def actor_of(request: Request) -> Actor:
+    """Who has sent the request, as the guard has found."""
+    actor: Actor = request.state.actor
+    return actor
+
+
+def reconciler_of(request: Request) -> Reconciler:
+    """The controller that the application serves."""
+    reconciler: Reconciler = request.app.state.reconciler
+    return reconciler
