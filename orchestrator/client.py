@@ -25,7 +25,7 @@ from shared_store.volume.texts import digest_of
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
 
-_SUBMISSIONS = ("/submitjob", "/resume", "/clone", "/races")
+_SUBMISSIONS = ("/submitjob", "/api/jobs", "/resume", "/clone", "/races")
 """Paths of requests that must not be carried out twice."""
 _PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
 """Seconds after each refusal for too many requests or connections; the last refusal is reported."""
@@ -199,7 +199,8 @@ class Client:
         content: bytes | None = None,
     ) -> httpx.Response:
         """``body``: JSON; ``content``: a body as it is."""
-        headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if path.endswith(_SUBMISSIONS) else {}
+        is_submission = method == "POST" and path.endswith(_SUBMISSIONS)
+        headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if is_submission else {}
 
         def send() -> httpx.Response:
             for pause in _PAUSES:

@@ -21,10 +21,11 @@ from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
 from orchestrator.home import local_url, muster_home
 from orchestrator.spec import file as specfile
-from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
 from shared_store.contract.error_text import counted, nearest
+from shared_store.volume.texts import beside
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 AcceptOption = Annotated[
@@ -46,6 +47,8 @@ JobArgument = Annotated[
 
 _EXAMPLES = """Examples:  muster submit job_specs/ant.yaml --set train.iterations=600 -f
 muster submit job_specs/ant.yaml --name ant-2 --set train.seed=2 --dry-run"""
+_LARGEST_SPEC = 900_000
+"""Characters of a spec that is sent as it is; the long texts of a larger one are sent beforehand."""
 _PATIENCE = 3.0
 """Seconds after which a slow stop explains itself."""
 
@@ -63,22 +66,32 @@ def register(app: typer.Typer) -> None:
 def submit_spec(
     client: Client, spec: Spec, source: str, environment: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Register and submit a spec; refused before anything is registered if no host could ever hold it. Raises SpecError.
+    """Submit a spec; refused before anything is registered if no host could ever hold it.
 
-    ``environment`` is added on every node.
+    Args:
+        client: The controller's.
+        spec: Of the job.
+        source: Its name in errors.
+        environment: Added on every node.
+
+    Raises:
+        SpecError: The controller refuses the spec.
+        ApiError: The controller refuses the request.
+        Unreachable: No controller answers.
     """
-    definition = compile_definition(spec, os.getcwd())
-    if problem := client.post("/api/fit", {"definition": definition, "queue": spec.queue})["problem"]:
-        if problem.startswith("evaluation: "):
-            raise SpecError(f"{source}: {problem}; change evaluation.resources or evaluation.queue")
-        lower = "lower nodes or resources (cpus may be a fraction)"
-        if spec.train and spec.resources.gpus:
-            lower += "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly"
-        raise SpecError(f"{source}: resources: {problem}; {lower}")
-    for text in long_texts(spec):
-        client.keep_text(text)
-    registered = client.batch("RegisterJobDefinition", **definition)
-    return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
+    document = spec.document()
+    if len(json.dumps(document)) > _LARGEST_SPEC:
+        document, texts = beside(document)
+        for text in texts.values():
+            client.keep_text(text)
+    body = {"spec": document, "directory": os.getcwd(), "environment": dict(environment or {})}
+    try:
+        answer: dict[str, Any] = client.post("/api/jobs", body, seconds=60)
+    except ApiError as error:
+        if error.status == 400:
+            raise SpecError(f"{source}: {error}") from None
+        raise
+    return answer
 
 
 def submit(

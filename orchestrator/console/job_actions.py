@@ -141,7 +141,7 @@ def _submitted(request: Request, document: Mapping[str, Any], directory: str, wh
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    job = continuing.submit_alone(reconciler_of(request), actor, spec, directory, what)
+    job = continuing.submit_spec(reconciler_of(request), actor, spec, directory, what)
     return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 

@@ -11,7 +11,6 @@ from typing import Any
 from fastapi import Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.plan_routes import PlanRequest
@@ -29,8 +28,9 @@ from orchestrator.services.context import queue_names
 from orchestrator.services.errors import ClientError
 from orchestrator.services.fit import UnknownQueue
 from orchestrator.services.permissions import Operation
+from orchestrator.services.spec_submission import submit_spec
 from orchestrator.services.texts import with_texts
-from orchestrator.spec.compile import compile_definition, compile_submission, long_texts
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
 from shared_store.contract.error_text import nearest
@@ -172,15 +172,8 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    definition = compile_definition(spec, "")
-    if unfit := _unfit(request, spec, PlanRequest(definition=definition, queue=spec.queue)):
-        raise ClientError(unfit.message)
-    for text in long_texts(spec):
-        reconciler.texts.keep(text.encode(), actor.name)
-    registered = batch.call(reconciler, actor, "RegisterJobDefinition", definition)
-    answer = batch.call(reconciler, actor, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
-    return answer["jobId"], answer["jobName"]
+    job = submit_spec(reconciler_of(request), actor_of(request), spec, "")
+    return job.id, job.name
 
 
 def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:

@@ -5,12 +5,11 @@ A commit costs a trip to the disk, whatever it holds. An uncontended submission 
 
 from __future__ import annotations
 
-import contextvars
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
@@ -18,15 +17,14 @@ from sqlalchemy.orm import Session
 from orchestrator.domain.errors import RequestError
 from orchestrator.persistence.session import Database
 
-Body = Callable[[Session], dict[str, Any]]
+T = TypeVar("T")
+_NOTHING = object()
 
 
 @dataclass(eq=False)
 class _Call:
-    body: Body
-    context: contextvars.Context = field(default_factory=contextvars.copy_context)
-    """The caller's context: its identity."""
-    answer: dict[str, Any] | None = None
+    body: Callable[[Session], Any]
+    answer: Any = _NOTHING
     error: Exception | None = None
 
 
@@ -42,7 +40,7 @@ class GroupCommit:
         self._database, self._writing = database, writing
         self._waiting: deque[_Call] = deque()
 
-    def call(self, body: Body) -> dict[str, Any]:
+    def call(self, body: Callable[[Session], T]) -> T:
         """The answer of ``body``, once it is committed. Raises RequestError, or the database's error.
 
         Args:
@@ -51,13 +49,13 @@ class GroupCommit:
         mine = _Call(body)
         self._waiting.append(mine)
         with self._writing:
-            if mine.answer is None and mine.error is None:  # else the previous lock holder committed it
+            if mine.answer is _NOTHING and mine.error is None:  # else the previous lock holder committed it
                 calls = [self._waiting.popleft() for _ in range(len(self._waiting))]
                 self._carry_out(calls)
         if mine.error is not None:
             raise mine.error
-        assert mine.answer is not None
-        return mine.answer
+        answer: T = mine.answer
+        return answer
 
     def _carry_out(self, calls: list[_Call]) -> None:
         try:
@@ -84,10 +82,10 @@ class GroupCommit:
             call.answer = answer
 
     @staticmethod
-    def _answer(session: Session, call: _Call) -> dict[str, Any] | None:
+    def _answer(session: Session, call: _Call) -> Any:
         """None if it is refused, which leaves nothing in the session and does not affect the others."""
         try:
-            return call.context.run(call.body, session)
+            return call.body(session)
         except RequestError as error:
             call.error = error
             return None

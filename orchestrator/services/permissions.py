@@ -104,6 +104,7 @@ class Operation(StrEnum):
     READ_QUEUES = "GET /api/queues"
     PLAN = "POST /api/plan"
     FIT = "POST /api/fit"
+    SUBMIT_SPEC = "POST /api/jobs"
     FIND_JOBS = "GET /api/jobs"
     READ_JOB = "GET /api/jobs/{reference}"
     READ_JOB_LOGS = "GET /api/jobs/{reference}/logs"

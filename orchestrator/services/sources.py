@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.gang import GangSpec, NodeSpec
@@ -25,6 +25,7 @@ from shared_store.volume.contents import is_archived
 from shared_store.volume.initial_weights import TeacherCopy, named_parent
 from shared_store.volume.layout import NAME, Run
 
+T = TypeVar("T")
 _TEACHER = "train.rsl_rl.teacher_checkpoint"
 
 
@@ -103,7 +104,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     return teacher
 
 
-def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], dict[str, Any]]) -> dict[str, Any]:
+def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], T]) -> T:
     """Submit a job; the weights that its policy will imitate are copied first, without holding the database.
 
     Raises ClientError.

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
+
+from sqlalchemy.orm import Session
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.arns import definition_arn
@@ -17,12 +20,14 @@ from orchestrator.services import definitions, submission
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.errors import ClientError
-from orchestrator.services.fit import fit_of
+from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import Actor, JobsOf, Operation
 from orchestrator.services.racing_tracks import check_tracks
+from orchestrator.services.sources import with_teacher
 from orchestrator.services.submission import Submission
-from orchestrator.spec.compile import compile_definition, compile_submission, with_environment
+from orchestrator.spec.compile import compile_definition, compile_submission, long_texts, with_environment
 from orchestrator.spec.model import Spec
+from shared_store.volume.initial_weights import TeacherCopy
 
 
 @dataclass(frozen=True)
@@ -63,13 +68,19 @@ def answered(context: Context, run: str) -> Job | None:
 def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:
     """The definition of the job, which the actor may submit and which the queue could have. Raises ClientError."""
     definition = _definition(context, spec, directory)
-    _check_fit(context, context.queue(spec.queue), gang_needs(definition["nodeProperties"]), what)
+    _check_fit(
+        context,
+        spec,
+        named_queue(context.session, context.actor, spec.queue),
+        gang_needs(definition["nodeProperties"]),
+        what,
+    )
     return definition
 
 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
-    context.actor.check(Operation.SUBMIT_JOB, JobsOf(context.queue(spec.queue).name))
+    context.actor.check(Operation.SUBMIT_JOB, JobsOf(named_queue(context.session, context.actor, spec.queue).name))
     check_tracks(context.reconciler.store, spec.document(), context.read)
     if len(json.dumps(definition).encode()) > LARGEST_DEFINITION:
         raise ClientError(
@@ -79,9 +90,25 @@ def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     return definition
 
 
-def _check_fit(context: Context, queue: JobQueue, gang: GangSpec, what: str) -> None:
+class Unfit(ClientError):
+    """A job could never start in its queue, whatever else ended; ``key``: the section of its spec that asks for too much."""
+
+    def __init__(self, problem: str, what: str, *, on_gpus: bool) -> None:
+        of_evaluations = problem.startswith("evaluation: ")
+        self.key = "evaluation" if of_evaluations else "resources"
+        if what:
+            super().__init__(f"{what}: {problem}")
+        elif of_evaluations:
+            super().__init__(f"{problem}; change evaluation.resources or evaluation.queue")
+        else:
+            lower = "lower nodes or resources (cpus may be a fraction)"
+            tried = "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly" if on_gpus else ""
+            super().__init__(f"resources: {problem}; {lower}{tried}")
+
+
+def _check_fit(context: Context, spec: Spec, queue: JobQueue, gang: GangSpec, what: str) -> None:
     if problem := fit_of(context.session, context.actor, context.reconciler, queue, gang).problem:
-        raise ClientError(f"{what}: {problem}")
+        raise Unfit(problem, what, on_gpus=bool(spec.train and spec.resources.gpus))
 
 
 def submit(
@@ -98,7 +125,7 @@ def submit(
         context: The call.
         spec: Of the job.
         directory: Its working directory.
-        what: Begins the words of a refusal.
+        what: Begins the words of a refusal; empty where the spec is the caller's own, who then learns what to change.
         environment: Added on every node.
         tags: Of the job.
 
@@ -108,12 +135,12 @@ def submit(
         TeacherNeeded: Its teacher's weights have to be copied first (:func:`.sources.with_teacher`).
     """
     document = _definition(context, spec, directory)
-    queue = submission.open_queue(context, context.queue(spec.queue), spec.share)
+    queue = submission.open_queue(context, named_queue(context.session, context.actor, spec.queue), spec.share)
     properties = with_environment(document["nodeProperties"], environment or {})
     gang = gang_needs(properties)
     definition = definitions.register(context, spec.name, document, gang, again=False)
     context.actor.check(Operation.SUBMIT_JOB, definition)
-    _check_fit(context, queue, gang, what)
+    _check_fit(context, spec, queue, gang, what)
     retry, timeout = document["retryStrategy"], document.get("timeout") or {}
     job = submission.submit(
         context,
@@ -136,15 +163,38 @@ def submit(
     return job
 
 
-def submit_alone(reconciler: Reconciler, actor: Actor, spec: Spec, directory: str, what: str) -> Job:
-    """:func:`submit` of a job that neither continues nor begins a run, and its commit. Raises ClientError."""
+def submit_spec(
+    reconciler: Reconciler,
+    actor: Actor,
+    spec: Spec,
+    directory: str,
+    what: str = "",
+    environment: Mapping[str, str] | None = None,
+    idempotency_key: str | None = None,
+) -> Job:
+    """:func:`submit` of a job that neither continues nor begins a run, and its commit.
+
+    Raises:
+        ClientError: It can't be submitted as it is, or not by this actor.
+        Unfit: It could never start.
+        Unavailable: The store, the database or an engine does not answer.
+    """
+    for text in long_texts(spec):
+        reconciler.calls.call(partial(reconciler.texts.keep, text.encode(), actor.name), works=True)
     reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     reconciler.check_writable(adds=True)
 
-    def call(known: Known) -> Job:
-        with reconciler.writing, reconciler.database.session() as session:
-            return submit(Context(session, reconciler, actor, known=known), spec, directory, what)
+    def with_copy(teacher: TeacherCopy | None) -> Job:
+        def call(known: Known) -> Job:
+            def submit_once(session: Session) -> Job:
+                context = Context(session, reconciler, actor, idempotency_key, teacher=teacher, known=known)
+                earlier = submission.answered(context)
+                return earlier or submit(context, spec, directory, what, environment)
 
-    job = with_store(reconciler, call)
+            return reconciler.submissions.call(submit_once)
+
+        return with_store(reconciler, call)
+
+    job = with_teacher(reconciler, with_copy)
     reconciler.wake()
     return job

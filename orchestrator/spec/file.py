@@ -48,13 +48,27 @@ def from_text(text: str, source: str, *, whole: bool = True, store: Place = lamb
         SpecError: As :func:`load`.
     """
     document, lines = _parsed(text, source, aliases=False)
-    if isinstance(document, dict):
-        refuse_paths(document, source, lines)
-        check_sizes(document, source, lines)
-    spec, notes = validate(document, source, lines), list[str]()
+    spec, notes = from_document(document, source, lines), list[str]()
     if whole:
         check_texts(document, source, lines, store, notes.append)
     return spec.with_notes(notes)
+
+
+def from_document(document: Any, source: str, lines: Mapping[strict_yaml.Path, int] | None = None) -> Spec:
+    """The spec in a document that a request brought: without paths of files that belong into the job.
+
+    Args:
+        document: What the YAML says.
+        source: Its name in errors.
+        lines: The line of each key; empty for a document that has none.
+
+    Raises:
+        SpecError: It is not a valid spec; one line with the key.
+    """
+    if isinstance(document, dict):
+        refuse_paths(document, source, lines or {})
+        check_sizes(document, source, lines or {})
+    return validate(document, source, lines or {})
 
 
 def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.Path, int]) -> Any:

@@ -40,6 +40,8 @@ RATE = 1000
 """Requests per second that one client may send for long, unless the server is told otherwise."""
 FAILURES = 50
 """Requests per second with a wrong token, key or signature that one address may send for long, twice as many at once."""
+_SUBMISSIONS = ("submitjob", "POST /api/jobs")
+"""Operations that the rate of submissions bounds."""
 _FULL = 2.0
 """Seconds after which a bucket that nobody took from is full again, and need not be kept."""
 _SWEEP = 10.0
@@ -132,7 +134,7 @@ class Body:
 class RateLimit:
     """A token bucket for each client: ``rate`` requests per second for long, twice as many at once. 0 means no limit.
 
-    ``submit_rate`` bounds SubmitJob on top of that (AWS: 50 per second).
+    ``submit_rate`` bounds submissions on top of that (AWS: 50 per second).
     """
 
     def __init__(self, rate: int = RATE, submit_rate: int = 0) -> None:
@@ -145,7 +147,7 @@ class RateLimit:
         """Count a request; None where it may pass, else why not. ``operation``: lower case."""
         if not self._take((client, ""), self.rate):
             return f"Too Many Requests: {client} may send {self.rate} requests per second; wait and try again"
-        if operation == "submitjob" and not self._take((client, operation), self.submit_rate):
+        if operation in _SUBMISSIONS and not self._take((client, "submissions"), self.submit_rate):
             return f"Too Many Requests: {client} may submit {self.submit_rate} jobs per second; wait and try again"
         return None
 

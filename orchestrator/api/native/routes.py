@@ -24,6 +24,7 @@ from orchestrator.api.native import (
     queue_overview,
     retention_routes,
     run_routes,
+    submit_routes,
     text_routes,
     track_routes,
     webhook_routes,
@@ -64,6 +65,7 @@ router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)
 router.include_router(plan_routes.router)
+router.include_router(submit_routes.router)
 
 
 def permitted_job(session: Session, actor: Actor, reference: str, operation: Operation) -> Job:
