@@ -25,6 +25,7 @@ from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
+from orchestrator.services.resume import resume as resume_job
 from orchestrator.services.spec_submission import Changes
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
@@ -73,7 +74,7 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
     changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepted(form) else []))
-    answer = runs.resume(reconciler_of(request), actor, run, Changes(iteration, changes, directory))
+    answer = resume_job(reconciler_of(request), actor, run, Changes(iteration, changes, directory))
     return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
 
 

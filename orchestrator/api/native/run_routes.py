@@ -14,6 +14,7 @@ from orchestrator.services import clone as clones
 from orchestrator.services import lineage, runs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
+from orchestrator.services.resume import resume
 from orchestrator.services.spec_submission import Changes
 from shared_store.volume.checkpoints import best_checkpoint, list_checkpoints
 from shared_store.volume.evaluations import by_checkpoint, list_evaluations
@@ -139,7 +140,7 @@ def resume_run(
     """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
     reconciler, actor = reconciler_of(request), actor_of(request)
     run = permitted_run(reconciler, actor, name, Operation.RESUME_RUN)
-    return runs.resume(reconciler, actor, run, body.changes(), idempotency_key)
+    return resume(reconciler, actor, run, body.changes(), idempotency_key)
 
 
 @router.post("/runs/{name}/clone")

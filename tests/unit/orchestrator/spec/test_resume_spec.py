@@ -13,7 +13,7 @@ import yaml
 from pydantic import BaseModel
 
 from orchestrator.services.errors import ClientError
-from orchestrator.services.runs import _check_changes, _check_rate
+from orchestrator.services.resume import _check_changes, _check_rate
 from orchestrator.services.spec_submission import Changes
 from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, compile_submission
