@@ -157,7 +157,7 @@ class Server:
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
             stack.callback(self.reconciler.close)
-            self.evaluations = AutomaticEvaluations(self.reconciler)
+            self.evaluations = AutomaticEvaluations(self.reconciler, self.access.actor_named)
             stack.callback(self.evaluations.close)
             _name_lost_gangs(home, found)
             bound = self._socket.getsockname()[1]

@@ -74,9 +74,16 @@ class _Training:
 class AutomaticEvaluations:
     """The thread that sees new checkpoints and submits their evaluations."""
 
-    def __init__(self, reconciler: Reconciler, interval: float = LOOK) -> None:
-        """``interval``: seconds between two looks."""
-        self._reconciler, self._interval = reconciler, interval
+    def __init__(
+        self, reconciler: Reconciler, actor_named: Callable[[str], Actor | None], interval: float = LOOK
+    ) -> None:
+        """
+        Args:
+            reconciler: The controller.
+            actor_named: The actor of that name with the rights that it has now; None where its key is gone.
+            interval: Seconds between two looks.
+        """
+        self._reconciler, self._actor_named, self._interval = reconciler, actor_named, interval
         self._known: dict[str, _Training | None] = {}
         """By job, of those that run; None of one without a section ``evaluation``."""
         self._backoff = Backoff(log)
@@ -227,8 +234,10 @@ class AutomaticEvaluations:
         reconciler, run = self._reconciler, training.run
         reconciler.check_writable(adds=True)
         reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-        actor = Actor(training.owner)
         try:
+            actor = self._actor_named(training.owner)
+            if actor is None:
+                raise ClientError(f"{training.owner}, which submitted the training, is no longer there")
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 

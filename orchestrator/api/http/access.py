@@ -80,6 +80,12 @@ class Access:
             return None
         return Actor("MUSTER_TOKEN") if name == _TOKEN else actor_of_key(self.known()[name])
 
+    def actor_named(self, name: str) -> Actor | None:
+        """The actor of this name with the rights that it has now; None where its key is gone."""
+        if not name.startswith("key "):
+            return Actor(name)
+        return next((actor for key in self.known().values() if (actor := actor_of_key(key)).name == name), None)
+
     def still_admits(self, actor: Actor, session: str) -> bool:
         """Whether a caller who was admitted as ``actor`` would be admitted now; ``session``: the caller's, empty without one."""
         if session:
