@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 from fastapi import Depends, Request, Response
 
-from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import routes
 from orchestrator.api.native.model_routes import RegisterRequest, register_model
@@ -27,6 +26,7 @@ from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume as resume_job
 from orchestrator.services.spec_submission import Changes
+from orchestrator.services.stop import stop as stop_jobs
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.volume.checkpoints import list_checkpoints
@@ -43,8 +43,9 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
     job, name, _, _ = _job(request, reference, Operation.TERMINATE_JOB)
     text = "A training saves a checkpoint before it leaves, and can be resumed. A waiting job is cancelled."
     form.confirm(Question(f"Stop {name}?", text, "Stop"))
-    reason = f"stopped in the console by {actor.name}"
-    batch.call(reconciler_of(request), actor, "TerminateJob", {"jobId": job, "reason": reason})
+    refused = stop_jobs(reconciler_of(request), actor, [job], f"stopped in the console by {actor.name}")
+    if job in refused:
+        raise refused[job]
     return done(request, f"/jobs/{job}", f"{name} is asked to stop")
 
 

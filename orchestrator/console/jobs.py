@@ -10,7 +10,6 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
 
-from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
 from orchestrator.console import words
@@ -24,6 +23,7 @@ from orchestrator.domain.reasons import short_id
 from orchestrator.services.context import queue_names
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
+from orchestrator.services.stop import stop as stop_jobs
 from shared_store.contract.error_text import counted
 
 router = page_router()
@@ -117,15 +117,12 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     several = counted(len(ids), "job")
     text = "Trainings save a checkpoint before they leave, and can be resumed. Waiting jobs are cancelled."
     form.confirm(Question(f"Stop {several}?", text, f"Stop {several}"))
-    errors = []
-    reason = f"stopped in the console by {actor.name}"
+    refused: list[ClientError] = []
     for start in range(0, len(ids), _AT_ONCE):
-        answer = batch.call(
-            reconciler, actor, "TerminateJobs", {"jobs": ids[start : start + _AT_ONCE], "reason": reason}
-        )
-        errors += answer["errors"]
-    if errors:
-        raise ClientError(f"{len(errors)} of {several} can't be stopped: {errors[0]['message']}", 403)
+        part = ids[start : start + _AT_ONCE]
+        refused += stop_jobs(reconciler, actor, part, f"stopped in the console by {actor.name}").values()
+    if refused:
+        raise ClientError(f"{len(refused)} of {several} can't be stopped: {refused[0]}", 403)
     return done(
         request, _address(*(form.one(each) for each in ("state", "queue", "search"))), f"{several} asked to stop"
     )

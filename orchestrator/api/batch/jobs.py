@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import selectinload
 
 from orchestrator.api.batch.describe import array_properties, describe_damaged, describe_job, node_status, summarize
 from orchestrator.api.batch.paging import decode, encode, page, page_size
 from orchestrator.domain.arns import definition_arn, queue_arn, split_reference
-from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
-from orchestrator.persistence.queries import ask_to_end
 from orchestrator.services.context import Context
 from orchestrator.services.damaged_rows import DamagedRow, reading
 from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import JobsOf, Operation
+from orchestrator.services.stop import UnknownJob, check_reason, end
 
 
 def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -148,43 +147,43 @@ def _by_definition(value: str) -> Any:
 
 def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; a job that does not run yet is cancelled; a finished job is left unchanged."""
-    _check_reason(request, Operation.TERMINATE_JOB)
-    _terminate(context, _target(context, request["jobId"], Operation.TERMINATE_JOB), request["reason"])
+    _end(context, request["jobId"], request["reason"], Operation.TERMINATE_JOB)
     return {}
 
 
 def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
-    _check_reason(request, Operation.CANCEL_JOB)
-    _cancel(context, _target(context, request["jobId"], Operation.CANCEL_JOB), request["reason"])
+    _end(context, request["jobId"], request["reason"], Operation.CANCEL_JOB)
     return {}
 
 
 def terminate_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """TerminateJobs: TerminateJob for up to 50 jobs, each with its own result."""
-    return _each(context, request, Operation.TERMINATE_JOBS, _terminate)
+    return _end_each(context, request, Operation.TERMINATE_JOBS)
 
 
 def cancel_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CancelJobs: CancelJob for up to 50 jobs, each with its own result."""
-    return _each(context, request, Operation.CANCEL_JOBS, _cancel)
+    return _end_each(context, request, Operation.CANCEL_JOBS)
 
 
-def _each(
-    context: Context,
-    request: Mapping[str, Any],
-    operation: Operation,
-    end: Callable[[Context, ColumnElement[bool], str], None],
-) -> dict[str, Any]:
+def _end(context: Context, reference: str, reason: str, operation: Operation) -> None:
+    job_id, node = split_reference(reference)
+    if node is not None:
+        raise ClientError(f"{operation}: a single node can't be ended; give the job's id")
+    end(context, job_id, reason, operation, only_waiting=operation in (Operation.CANCEL_JOB, Operation.CANCEL_JOBS))
+
+
+def _end_each(context: Context, request: Mapping[str, Any], operation: Operation) -> dict[str, Any]:
     """The result for each job; as on AWS, one that does not exist counts as ended."""
-    _check_reason(request, operation)
+    check_reason(request["reason"], operation)
     if not request["jobs"]:
         raise ClientError(f"{operation} takes at least one job")
     successful: list[str] = []
     errors: list[dict[str, str]] = []
     for reference in request["jobs"]:
         try:
-            end(context, _target(context, reference, operation), request["reason"])
+            _end(context, reference, request["reason"], operation)
         except UnknownJob:
             pass
         except ClientError as error:
@@ -193,35 +192,6 @@ def _each(
             continue
         successful.append(reference)
     return {"successful": successful, "errors": errors}
-
-
-def _terminate(context: Context, target: ColumnElement[bool], reason: str) -> None:
-    ask_to_end(context.session, target, reason)
-
-
-def _cancel(context: Context, target: ColumnElement[bool], reason: str) -> None:
-    ask_to_end(context.session, target, reason, cancel=True)
-
-
-class UnknownJob(ClientError):
-    """No job has this id."""
-
-
-def _check_reason(request: Mapping[str, Any], operation: Operation) -> None:
-    if len(request["reason"]) > LONGEST_REASON:
-        raise ClientError(f"{operation}: the reason is longer than {LONGEST_REASON} characters")
-
-
-def _target(context: Context, reference: str, operation: Operation) -> ColumnElement[bool]:
-    """The row of the job; of an array those of its children too. Raises ClientError, UnknownJob."""
-    job_id, node = split_reference(reference)
-    if node is not None:
-        raise ClientError(f"{operation}: a single node can't be ended; give the job's id")
-    job = context.session.get(Job, job_id)
-    if job is None:
-        raise UnknownJob(f"Job {reference[:300]} does not exist")
-    context.actor.check(operation, job)
-    return or_(Job.id == job.id, Job.parent == job.id) if job.kind == "array" else Job.id == job.id
 
 
 def _count_children(context: Context, job: Job) -> Mapping[str, int]:
