@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Literal
 
 from fastapi import Depends, Request, Response
 
@@ -13,13 +13,10 @@ from orchestrator.api.native.model_routes import RegisterRequest, register_model
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Reconciler
-from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import SpecError
 from orchestrator.domain.reasons import short_id
+from orchestrator.persistence.models import Job
 from orchestrator.services import clone as clones
-from orchestrator.services import runs
-from orchestrator.services import spec_submission as continuing
+from orchestrator.services import derived_jobs
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
@@ -27,8 +24,6 @@ from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume as resume_job
 from orchestrator.services.spec_submission import Changes
 from orchestrator.services.stop import stop as stop_jobs
-from orchestrator.spec.evaluations import evaluation_document
-from orchestrator.spec.model import validate
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.layout import Run
 
@@ -93,23 +88,19 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
 @_stored.post("/jobs/{reference}/evaluate")
 def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that evaluates a checkpoint."""
-    run, directory = _run(request, reference, Operation.READ_RUN)
-    document = evaluation_document(
-        run.name, _trained(request, run), {"checkpoint": _iteration(run, form), **_accepted(form)}
-    )
-    return _submitted(request, document, directory, f"evaluation of {run.name}")
+    return _derived(request, derived_jobs.evaluate, reference, form)
 
 
 @_stored.post("/jobs/{reference}/export")
 def export(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that exports a checkpoint's policy."""
-    return _beside(request, reference, form, "export")
+    return _derived(request, derived_jobs.export, reference, form)
 
 
 @_stored.post("/jobs/{reference}/record")
 def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that records a checkpoint's policy at work."""
-    return _beside(request, reference, form, "record")
+    return _derived(request, derived_jobs.record, reference, form)
 
 
 @_stored.post("/jobs/{reference}/register")
@@ -122,28 +113,11 @@ def register(request: Request, reference: str, form: Form = Depends(sent_form)) 
     return done(request, f"/jobs/{reference}", told)
 
 
-def _beside(request: Request, reference: str, form: Form, kind: str) -> Response:
-    """A job of one CPU that reads a checkpoint, in the queue of its training."""
+def _derived(request: Request, submit: Callable[..., Job], reference: str, form: Form) -> Response:
+    """Submit a job that reads a checkpoint, and go to its page. Raises ClientError."""
     run, directory = _run(request, reference, Operation.READ_RUN)
-    trained = _trained(request, run)
-    kept = {key: trained[key] for key in ("queue", "share", "image", "environment", "secrets") if trained.get(key)}
-    document = {
-        **kept,
-        "name": f"{kind}-{run.name}".replace(".", "-")[:100],
-        "resources": {"cpus": 1, "memory": "2GiB"},
-        kind: {"run": run.name, "checkpoint": _iteration(run, form), **_accepted(form)},
-    }
-    return _submitted(request, document, directory, f"{kind} of {run.name}")
-
-
-def _submitted(request: Request, document: Mapping[str, Any], directory: str, what: str) -> Response:
-    """Submit a job and go to its page. Raises ClientError."""
-    actor = actor_of(request)
-    try:
-        spec = validate(dict(document), what)
-    except SpecError as error:
-        raise ClientError(str(error)) from None
-    job = continuing.submit_spec(reconciler_of(request), actor, spec, directory, what)
+    section = {"checkpoint": _iteration(run, form), **_accepted(form)}
+    job = submit(reconciler_of(request), actor_of(request), run, section, directory)
     return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 
@@ -159,17 +133,6 @@ def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, s
     """The run of a job, with which the caller may do this, and the job's working directory. Raises ClientError."""
     _, _, run, directory = _job(request, reference, Operation.READ_JOB)
     return permitted_run(reconciler_of(request), actor_of(request), run, operation), directory
-
-
-def _trained(request: Request, run: Run) -> Mapping[str, Any]:
-    actor = actor_of(request)
-    reconciler: Reconciler = reconciler_of(request)
-    found = facts_of(run)
-    with reconciler.database.session() as session:
-        spec = runs.spec_of(session, actor, found) or {}
-    if not spec.get("train"):
-        raise ClientError(f"run {run.name} is no training, so it has no policy")
-    return spec
 
 
 def _checkpoint(form: Form) -> _Wanted:

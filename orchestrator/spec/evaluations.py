@@ -1,4 +1,4 @@
-"""Jobs that evaluate a checkpoint of a training: their spec, and the checkpoints of a running training that are due. No I/O."""
+"""Jobs that evaluate or read a checkpoint of a training: their spec, and the checkpoints of a running training that are due. No I/O."""
 
 from __future__ import annotations
 
@@ -30,20 +30,38 @@ def evaluation_document(
         name: Of the job; ``evaluate-RUN`` or ``race-RUN`` where None.
         kind: ``evaluate`` or ``race``.
     """
-    kept = {
-        key: trained[key]
-        for key in ("queue", "share", "image", "environment", "secrets")
-        if trained.get(key) is not None
-    }
     resources = dict(trained.get("resources") or {})
     if resources.get("gpus"):
         resources["gpus"] = 1
     return {
-        **kept,
+        **_kept(trained),
         "name": name or f"{kind}-{run}".replace(".", "-")[:100],
         **({"resources": resources} if resources else {}),
         kind: {"run": run, **section},
     }
+
+
+def document_beside(run: str, trained: Mapping[str, Any], kind: str, section: Mapping[str, Any]) -> dict[str, Any]:
+    """The spec of a job of one CPU that reads a checkpoint of ``run``.
+
+    Args:
+        run: Name of the run.
+        trained: Spec of the training.
+        kind: ``export`` or ``record``.
+        section: What that section says beside the run.
+    """
+    return {
+        **_kept(trained),
+        "name": f"{kind}-{run}".replace(".", "-")[:100],
+        "resources": {"cpus": 1, "memory": "2GiB"},
+        kind: {"run": run, **section},
+    }
+
+
+def _kept(trained: Mapping[str, Any]) -> dict[str, Any]:
+    """What a job has of the training whose policy it reads."""
+    keys = ("queue", "share", "image", "environment", "secrets")
+    return {key: trained[key] for key in keys if trained.get(key) is not None}
 
 
 def wanted_of(spec: Mapping[str, Any] | None) -> Evaluation | None:
