@@ -9,14 +9,13 @@ from fastapi import Depends, Request, Response
 
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native import routes
-from orchestrator.api.native.model_routes import RegisterRequest, register_model
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.domain.reasons import short_id
 from orchestrator.persistence.models import Job
 from orchestrator.services import clone as clones
-from orchestrator.services import derived_jobs
+from orchestrator.services import derived_jobs, models
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
 from orchestrator.services.errors import ClientError
@@ -107,9 +106,9 @@ def record(request: Request, reference: str, form: Form = Depends(sent_form)) ->
 def register(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Keep an exported checkpoint as the next version of a model."""
     run, _ = _run(request, reference, Operation.REGISTER_MODEL)
-    body = RegisterRequest(name=_named(form, "the model"), checkpoint=_checkpoint(form))
-    model = register_model(request, run.name, body)
-    told = f"registered {run.name}@{model['iteration']} as {model['name']}@{model['version']}"
+    reconciler, actor = reconciler_of(request), actor_of(request)
+    model = models.register(reconciler, actor, run.name, _named(form, "the model"), _checkpoint(form))
+    told = f"registered {run.name}@{model.facts()['iteration']} as {model.name}@{model.version}"
     return done(request, f"/jobs/{reference}", told)
 
 

@@ -6,20 +6,17 @@ off loopback, or behind a proxy, leaves that to ``muster keys``, run by its own 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
+from orchestrator.api.http.access import Access
 from orchestrator.api.http.requests import actor_of
-from orchestrator.keys import Key, KeysError, KeyStore, KeyUsageError
-from orchestrator.services.chosen_checkpoints import CONFLICT
-from orchestrator.services.errors import ClientError
-from orchestrator.services.permissions import Operation, Refusal, Shared
+from orchestrator.keys import Key
+from orchestrator.services import keys
 
 router = APIRouter()
-_Value = TypeVar("_Value")
 
 
 class KeyRequest(BaseModel):
@@ -52,52 +49,21 @@ def remove_key(request: Request, name: str) -> dict[str, str]:
 
 def list_keys(request: Request) -> list[Key]:
     """All keys, by name. Raises ClientError."""
-    actor = actor_of(request)
-    actor.check_all_queues(Operation.READ_KEYS)
-    return sorted(_carry_out(_store(request).load).values(), key=lambda key: key.name)
+    return keys.listed(request.app.state.access.keys, actor_of(request))
 
 
 def create_key(request: Request, name: str, queues: tuple[str, ...], read_only: bool) -> Key:
     """A new key, with its secret. Raises ClientError."""
-    store = _writable(request, Operation.CREATE_KEY)
-    return _carry_out(lambda: store.create(name, queues, read_only))
+    access: Access = request.app.state.access
+    return keys.create(access.keys, actor_of(request), name, queues, read_only=read_only, reachable=access.reachable)
 
 
 def delete_key(request: Request, name: str) -> None:
     """Delete the key of this name. Raises ClientError."""
-    store = _writable(request, Operation.DELETE_KEY)
-    _carry_out(lambda: store.delete(name))
+    access: Access = request.app.state.access
+    keys.delete(access.keys, actor_of(request), name, reachable=access.reachable)
 
 
 def is_writable(request: Request) -> bool:
     """Whether keys are made and deleted through this server."""
     return not request.app.state.access.reachable
-
-
-def _store(request: Request) -> KeyStore:
-    store: KeyStore | None = request.app.state.access.keys
-    if store is None:
-        raise ClientError("this server has no keys", 404)
-    return store
-
-
-def _writable(request: Request, operation: Operation) -> KeyStore:
-    actor = actor_of(request)
-    actor.check(operation, Shared())
-    if not is_writable(request):
-        command = "create" if operation is Operation.CREATE_KEY else "delete"
-        raise Refusal(
-            "AccessDeniedException",
-            f"other machines can reach this server, so keys are made and deleted on its own one alone: muster keys {command} NAME",
-        )
-    return _store(request)
-
-
-def _carry_out(body: Callable[[], _Value]) -> _Value:
-    """Raises ClientError for errors of the keys' file, or of the name of a key."""
-    try:
-        return body()
-    except KeyUsageError as error:
-        raise ClientError(str(error)) from None
-    except KeysError as error:
-        raise ClientError(str(error), CONFLICT) from None

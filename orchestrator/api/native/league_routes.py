@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from orchestrator.api.http.callers import user_name
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.api.native.model_routes import entered_model, find_model, owner_of_model
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.job import Status
@@ -26,6 +25,7 @@ from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, using, with_store
 from orchestrator.services.errors import ClientError
+from orchestrator.services.models import entered_model, find_model, owner_of_model
 from orchestrator.services.permissions import CONTROLLER, Actor, LeagueOf, Operation
 from orchestrator.services.spec_submission import submit
 from orchestrator.spec.league_races import race_job

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Literal
 
 from fastapi import APIRouter, Query, Request
@@ -10,16 +9,10 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.control.reconciler import Reconciler
-from orchestrator.persistence.models import RunRecord
-from orchestrator.services.chosen_checkpoints import CONFLICT, choose
-from orchestrator.services.context import owner_of_run, permitted_run, using
-from orchestrator.services.errors import ClientError
-from orchestrator.services.permissions import Actor, Operation
+from orchestrator.services.models import described, find_model, owner_of_model, register
+from orchestrator.services.permissions import Operation
 from shared_store.volume import bundles, models
 from shared_store.volume.bundles import DamagedBundle
-from shared_store.volume.files import DamagedFile
-from shared_store.volume.models import AlreadyRegistered, Model, ModelError, UnknownModel
 
 router = APIRouter(route_class=StoreRoute)
 
@@ -40,7 +33,7 @@ def list_models(request: Request) -> Any:
     actor = actor_of(request)
     store = reconciler_of(request).store
     newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
-    return actor.shown([_described(model) for model in newest if actor.may_see(owner_of_model(model))])
+    return actor.shown([described(model) for model in newest if actor.may_see(owner_of_model(model))])
 
 
 @router.get("/models/{name}")
@@ -54,7 +47,7 @@ def read_model(
     reconciler, actor = reconciler_of(request), actor_of(request)
     model = find_model(reconciler, actor, name, version)
     actor.check(Operation.READ_MODEL, owner_of_model(model))
-    found = _described(model, verify)
+    found = described(model, verify)
     try:
         found["contract"] = model.contract().document()
         found["weights"] = bundles.read_manifest(model.bundle)["files"].get(bundles.POLICY, {}).get("sha256")
@@ -67,72 +60,5 @@ def read_model(
 def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     """Keep the exported bundle of a checkpoint as the next version of a model, permanently."""
     reconciler, actor = reconciler_of(request), actor_of(request)
-    run = permitted_run(reconciler, actor, name, Operation.REGISTER_MODEL)
-    reconciler.check_writable(adds=True)
-    if shortage := reconciler.disk.shortage("store"):
-        raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
-    checkpoint = choose(run, body.checkpoint)
-    if checkpoint is None:
-        raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
-    record = owner_of_run(reconciler, run)
-    queue, owner = (record.queue, record.owner) if record else ("", None)
-    try:
-        with using(reconciler, run.name):
-            there = models.versions(reconciler.store, body.name)
-            if there:
-                actor.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
-            facts = {"queue": queue, "owner": owner, "registered_by": actor.name}
-            model = models.register(
-                reconciler.store, body.name, run, checkpoint, facts, reconciler.peers.id, again=body.again
-            )
-    except AlreadyRegistered as error:
-        raise ClientError(str(error), CONFLICT) from None
-    except ModelError as error:
-        raise ClientError(str(error)) from None
-    except (DamagedBundle, DamagedFile) as error:
-        raise ClientError(str(error), CONFLICT) from None
-    except OSError as error:
-        raise ClientError(f"model {body.name} can't be written ({error.strerror or error})", 503) from None
-    return actor.shown(_described(model))
-
-
-def find_model(reconciler: Reconciler, actor: Actor, name: str, version: int | None) -> Model:
-    """A version of a model that the caller may see, the newest where none is named. Raises ClientError."""
-    try:
-        return models.find(reconciler.store, name, version, lambda model: actor.may_see(owner_of_model(model)))
-    except UnknownModel as error:
-        raise ClientError(str(error), 404) from None
-    except (ModelError, DamagedFile) as error:
-        raise ClientError(str(error)) from None
-
-
-def entered_model(reconciler: Reconciler, entry: Mapping[str, Any]) -> Model:
-    """The model of a league's entry, which every key may see with its league. Raises ClientError."""
-    name, version = entry["model"]["name"], entry["model"]["version"]
-    try:
-        return next(model for model in models.versions(reconciler.store, name) if model.version == version)
-    except StopIteration:
-        raise ClientError(f"model {name}@{version} is not in the store any more", 404) from None
-    except (ModelError, DamagedFile) as error:
-        raise ClientError(str(error)) from None
-
-
-def owner_of_model(model: Model) -> RunRecord:
-    """The owner of a model: that of the run that it comes from. A damaged model is visible to keys with all queues alone."""
-    try:
-        queue = model.facts().get("queue")
-    except DamagedBundle:
-        queue = ""
-    return RunRecord(name=model.reference, queue=queue if isinstance(queue, str) else "")
-
-
-def _described(model: Model, verify: bool = False) -> dict[str, Any]:
-    found: dict[str, Any] = {"name": model.name, "version": model.version, "path": str(model.path)}
-    try:
-        found = {**model.facts(), **found}
-        if verify:
-            model.verify()
-            found["verified"] = True
-    except DamagedBundle as error:
-        found["problem"] = str(error)
-    return found
+    model = register(reconciler, actor, name, body.name, body.checkpoint, again=body.again)
+    return actor.shown(described(model))

@@ -1,0 +1,107 @@
+"""Models: an exported policy becomes a version of a model, for good; and who may see which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.persistence.models import RunRecord
+from orchestrator.services.chosen_checkpoints import CONFLICT, choose
+from orchestrator.services.context import owner_of_run, permitted_run, using
+from orchestrator.services.errors import ClientError
+from orchestrator.services.permissions import Actor, Operation
+from shared_store.volume import models
+from shared_store.volume.bundles import DamagedBundle
+from shared_store.volume.files import DamagedFile
+from shared_store.volume.models import AlreadyRegistered, Model, ModelError, UnknownModel
+
+
+def register(
+    reconciler: Reconciler,
+    actor: Actor,
+    run_name: str,
+    name: str,
+    wanted: int | Literal["best", "latest"] | None = None,
+    *,
+    again: bool = False,
+) -> Model:
+    """Keep the exported bundle of a checkpoint as the next version of a model.
+
+    Args:
+        reconciler: The controller.
+        actor: Who asks.
+        run_name: The run of the checkpoint.
+        name: Of the model.
+        wanted: Iteration of the checkpoint, ``best`` or ``latest``; the newest where None.
+        again: Register a checkpoint that is a version of the model already.
+
+    Raises:
+        ClientError: There is no such checkpoint or no bundle of it, or the model is another's.
+    """
+    run = permitted_run(reconciler, actor, run_name, Operation.REGISTER_MODEL)
+    reconciler.check_writable(adds=True)
+    if shortage := reconciler.disk.shortage("store"):
+        raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
+    checkpoint = choose(run, wanted)
+    if checkpoint is None:
+        raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
+    record = owner_of_run(reconciler, run)
+    queue, owner = (record.queue, record.owner) if record else ("", None)
+    try:
+        with using(reconciler, run.name):
+            there = models.versions(reconciler.store, name)
+            if there:
+                actor.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
+            facts = {"queue": queue, "owner": owner, "registered_by": actor.name}
+            return models.register(reconciler.store, name, run, checkpoint, facts, reconciler.peers.id, again=again)
+    except AlreadyRegistered as error:
+        raise ClientError(str(error), CONFLICT) from None
+    except ModelError as error:
+        raise ClientError(str(error)) from None
+    except (DamagedBundle, DamagedFile) as error:
+        raise ClientError(str(error), CONFLICT) from None
+    except OSError as error:
+        raise ClientError(f"model {name} can't be written ({error.strerror or error})", 503) from None
+
+
+def find_model(reconciler: Reconciler, actor: Actor, name: str, version: int | None) -> Model:
+    """A version of a model that the caller may see, the newest where none is named. Raises ClientError."""
+    try:
+        return models.find(reconciler.store, name, version, lambda model: actor.may_see(owner_of_model(model)))
+    except UnknownModel as error:
+        raise ClientError(str(error), 404) from None
+    except (ModelError, DamagedFile) as error:
+        raise ClientError(str(error)) from None
+
+
+def entered_model(reconciler: Reconciler, entry: Mapping[str, Any]) -> Model:
+    """The model of a league's entry, which every key may see with its league. Raises ClientError."""
+    name, version = entry["model"]["name"], entry["model"]["version"]
+    try:
+        return next(model for model in models.versions(reconciler.store, name) if model.version == version)
+    except StopIteration:
+        raise ClientError(f"model {name}@{version} is not in the store any more", 404) from None
+    except (ModelError, DamagedFile) as error:
+        raise ClientError(str(error)) from None
+
+
+def owner_of_model(model: Model) -> RunRecord:
+    """The owner of a model: that of the run that it comes from. A damaged model is visible to keys with all queues alone."""
+    try:
+        queue = model.facts().get("queue")
+    except DamagedBundle:
+        queue = ""
+    return RunRecord(name=model.reference, queue=queue if isinstance(queue, str) else "")
+
+
+def described(model: Model, verify: bool = False) -> dict[str, Any]:
+    found: dict[str, Any] = {"name": model.name, "version": model.version, "path": str(model.path)}
+    try:
+        found = {**model.facts(), **found}
+        if verify:
+            model.verify()
+            found["verified"] = True
+    except DamagedBundle as error:
+        found["problem"] = str(error)
+    return found
