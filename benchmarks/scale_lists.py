@@ -25,10 +25,10 @@ from uuid import UUID
 from sqlalchemy import insert
 
 from benchmarks.load import Watch, add_option, machine, told
-from orchestrator.domain.arns import definition_arn
 from orchestrator.console import jobs as jobs_page
 from orchestrator.console import live
 from orchestrator.console.live import Recent
+from orchestrator.domain.arns import definition_arn
 from orchestrator.domain.job import Status
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Attempt, Job, JobDefinition, JobQueue, Node

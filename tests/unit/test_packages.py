@@ -30,7 +30,7 @@ LAYERS = {
     "persistence": {"domain", "machine"},
     "engines": {"domain", "machine"},
     "control": {"domain", "machine", "spec", "scheduling", "persistence", "engines"},
-    "services": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control"},
+    "services": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "keys"},
     "api": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "services", "keys"},
     "console": {"domain", "spec", "scheduling", "persistence", "control", "services", "api", "keys"},
     "service_manager": {"machine"},
