@@ -205,7 +205,7 @@ def measure(folder: Path) -> Measured:
     from muster_policy.messages import Messages
     from worker.deploy.simulated_robot import SimulatedRobot
     from worker.tasks import DeclaredTask, find_task
-    from worker.tasks.compile.policy_contract import policy_contract
+    from worker.tasks.run.policy_contract import policy_contract
 
     task_type = find_task("Go1Flat")
     task = task_type(task_type.config_type(), 1, device="cpu")

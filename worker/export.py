@@ -35,7 +35,7 @@ def export(
     from worker.deploy import bundle
     from worker.learning.setup import check_contract, contract_from
     from worker.learning.trained import load_policy
-    from worker.tasks.compile.policy_contract import policy_contract
+    from worker.tasks.run.policy_contract import policy_contract
 
     changes = check_contract(checkpoint, task, section)
     policy = load_policy(checkpoint)

@@ -70,7 +70,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
 
 def _compare_robots(then: Sequence[Mapping[str, Any]], task: Task) -> None:
     """Print which robots load otherwise than in the training; files of older versions know none."""
-    from worker.tasks.compile.policy_contract import robots_of
+    from worker.tasks.run.policy_contract import robots_of
 
     if lines := robot_changes([RobotModel(**each) for each in then], robots_of(task)):
         print(

@@ -265,8 +265,8 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
     """
     from worker.learning.setup import check_fit, check_robots
     from worker.tasks import find_task
-    from worker.tasks.compile.policy_contract import policy_contract, same_policy
     from worker.tasks.run.declared import DeclaredTask
+    from worker.tasks.run.policy_contract import policy_contract, same_policy
 
     try:
         manifest, contract = verify(bundle), read_contract(bundle)

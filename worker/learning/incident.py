@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from shared_store.volume.files import write_atomic
-from worker.tasks.compile.policy_contract import robots_of
+from worker.tasks.run.policy_contract import robots_of
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import Share

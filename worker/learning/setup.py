@@ -25,9 +25,9 @@ from worker.learning.distributed import Gang, warm_marker
 from worker.learning.job import Job, user_errors
 from worker.settings.errors import UserError
 from worker.simulation.robot_values import shown_value
-from worker.tasks.compile.policy_contract import policy_contract, readings_of, robots_of, same_policy
 from worker.tasks.run.adapting import begin_evaluation
 from worker.tasks.run.mistakes import task_mistakes
+from worker.tasks.run.policy_contract import policy_contract, readings_of, robots_of, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -150,7 +150,7 @@ def describe(training: Training, task: Task, exported: ExportedPolicy | None = N
     Args:
         training: The training.
         task: Its task, with worlds.
-        exported: See :func:`worker.tasks.compile.policy_contract.policy_contract`.
+        exported: See :func:`worker.tasks.run.policy_contract.policy_contract`.
     """
     spaces, name = spaces_of(task), training.job.section["task"]
     return {

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from shared_store.contract.error_text import counted
 from worker.tasks import find_task, task_names
 from worker.tasks.compile.images import shown
-from worker.tasks.compile.policy_contract import robots_of
 from worker.tasks.compile.tables import numbers, tables
 from worker.tasks.run.mistakes import task_mistakes
+from worker.tasks.run.policy_contract import robots_of
 
 if TYPE_CHECKING:
     from worker.tasks.compile.plan import Plan

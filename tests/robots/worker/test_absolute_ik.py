@@ -32,7 +32,7 @@ from tests.robots.worker.test_differential_ik import (
 )
 from tests.support.worker.sensing import Reference
 from worker.tasks import Action, DifferentialIK, Randomization, terms
-from worker.tasks.compile.policy_contract import policy_contract
+from worker.tasks.run.policy_contract import policy_contract
 
 FULL = ("x", "y", "z", "qx", "qy", "qz", "qw")
 GOALS = ((0.2, -0.7, 0.9, 0.05, -0.5, 0.2, 0.8), (-1.0, 0.8, 0.0, -0.1, 0.2, -0.4, 0.3))

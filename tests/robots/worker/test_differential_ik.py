@@ -17,8 +17,8 @@ from tests.support.refusals import refusal
 from tests.support.worker.declared import Small, SmallConfig
 from tests.support.worker.sensing import Reference
 from worker.tasks import Action, DifferentialIK, PositionActuator, Robot, terms
-from worker.tasks.compile.policy_contract import policy_contract
 from worker.tasks.compile.tables import tables
+from worker.tasks.run.policy_contract import policy_contract
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 SERVO = PositionActuator("*", stiffness=2000.0, damping=60.0)

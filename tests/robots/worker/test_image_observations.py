@@ -34,10 +34,10 @@ from worker.settings.task import Randomization
 from worker.simulation.sensors.camera import CameraSensor
 from worker.simulation.sensors.imu import Imu
 from worker.tasks.__main__ import describe
-from worker.tasks.compile.images import described
 from worker.tasks.compile.tables import tables
 from worker.tasks.declare.declaration import Declaration, Image, Observation
 from worker.tasks.run.gym import TaskVectorEnv
+from worker.tasks.run.policy_contract import images_of
 
 torch.set_num_threads(1)
 NAME = "tests.support.worker.seeing:Seeing"
@@ -177,7 +177,7 @@ def test_a_policy_may_see_an_image_alone() -> None:
     assert alone.groups["critic"].shape == (2, 1) and set(alone.terminal_groups) == {"critic"}
     assert alone.config.observation_groups == {"policy": True, "critic": False}
     assert set(tables(alone.plan)) >= {"observations", "observations of critic"}
-    assert described(alone)["policy"]["sensor"] == "front"
+    assert images_of(alone)["policy"]["sensor"] == "front"
     space = TaskVectorEnv("tests.support.worker.seeing:SeeingAlone", 2).single_observation_space
     assert space == gymnasium.spaces.Box(0, 255, (6, 12, 16), np.uint8)
 

@@ -12,9 +12,9 @@ from muster_policy.messages import Messages
 from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
 from worker.deploy.simulated_robot import SimulatedRobot
 from worker.tasks import Observation, find_task, terms
-from worker.tasks.compile.policy_contract import policy_contract
 from worker.tasks.declare.declaration import Declaration
 from worker.tasks.library.quadruped import Quadruped, QuadrupedConfig
+from worker.tasks.run.policy_contract import policy_contract
 
 EXACT = {
     f"observations.{name}.noise": 0.0

@@ -36,10 +36,10 @@ from worker.learning.setup import spaces_of
 from worker.settings.cartpole import CartpolePixelsConfig
 from worker.settings.errors import UserError
 from worker.settings.racer import FrontCameraConfig, RacerPixelsConfig
-from worker.tasks.compile.policy_contract import policy_contract
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.library.cartpole_pixels import CartpolePixels
 from worker.tasks.library.racer import RacerPixels
+from worker.tasks.run.policy_contract import policy_contract
 from worker.tasks.run.task import Task
 
 SECONDS, EPISODES, SEED = 2.0, 3, 11
@@ -158,7 +158,7 @@ def test_the_node_sees_a_camera_s_images_as_the_task_does() -> None:
 def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import worker.tasks.compile.policy_contract as contracts
+    import worker.tasks.run.policy_contract as contracts
     from shared_store.volume.bundles import read_contract
 
     assert isinstance(open_robot(exported, Messages()), SimulatedRobot)

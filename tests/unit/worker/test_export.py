@@ -33,10 +33,10 @@ from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
 from worker.settings.errors import TrainingError, UserError
-from worker.tasks.compile.policy_contract import policy_contract
 from worker.tasks.library.ant import Ant
 from worker.tasks.library.cartpole import Cartpole
 from worker.tasks.library.go1 import Go1Flat
+from worker.tasks.run.policy_contract import policy_contract
 
 torch.set_num_threads(1)
 FACTS = {"task": "Point", "algorithm": "mine:Mine", "policy": {"groups": {"policy": [2]}, "action_size": 2}}

@@ -38,9 +38,9 @@ from worker.tasks import (
     reward_weights,
     terms,
 )
-from worker.tasks.compile.policy_contract import policy_contract
 from worker.tasks.declare.interface import Interface, motor
 from worker.tasks.declare.interface import Observation as Seen
+from worker.tasks.run.policy_contract import policy_contract
 
 WORLDS = 4
 

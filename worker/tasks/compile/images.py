@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,6 @@ from worker.tasks.declare.declaration import Declaration
 
 if TYPE_CHECKING:
     from worker.tasks.compile.plan import Plan
-    from worker.tasks.run.task import Task
 
 
 def cameras(
@@ -66,19 +64,6 @@ def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
                 f"observations.{group}: {kind}.further_groups says that it is an image, and the task gives terms; give "
                 "Image(camera)"
             )
-
-
-def described(task: Task) -> dict[str, dict[str, Any]]:
-    """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
-    camera = getattr(task.config, "camera", None)
-    plan: Plan | None = getattr(task, "plan", None)
-    found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
-    if plan is None:
-        return found
-    for group, name in plan.images.items():
-        sensor = plan.declaration.sensors[name]
-        found[group] = {"sensor": name, **dataclasses.asdict(sensor), "channels": sensor.rows(plan.views)}
-    return found
 
 
 def shown(plan: Plan, group: str) -> str:

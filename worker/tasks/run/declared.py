@@ -23,17 +23,18 @@ from worker.simulation.sensors.differential_ik import IkSolver
 from worker.simulation.sensors.rays import RayCasting
 from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.terrain import Terrain
-from worker.tasks.compile.checks import checked_interface, placed
+from worker.tasks.compile.checks import placed
 from worker.tasks.compile.compiler import Kernels, further
 from worker.tasks.compile.contract import contract
 from worker.tasks.compile.numbers import flat
 from worker.tasks.compile.plan import Plan, stacked
-from worker.tasks.compile.step_needs import StepNeeds
-from worker.tasks.compile.torch_terms import TorchTerms
 from worker.tasks.declare.declaration import Choice, Declaration
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
+from worker.tasks.run.checks import checked_interface
+from worker.tasks.run.step_needs import StepNeeds
 from worker.tasks.run.task import Task
+from worker.tasks.run.torch_terms import TorchTerms
 from worker.tasks.terms.motion import RecordedMotion
 
 

@@ -28,9 +28,9 @@ from worker.simulation.episodes import (
 from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
-from worker.tasks.compile.checks import assert_replays, check_arguments, noise_of
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
+from worker.tasks.run.checks import assert_replays, check_arguments, noise_of
 from worker.tasks.run.ended import Ended
 from worker.tasks.run.saved import check_state, completed
 from worker.tasks.run.telling import Telling

@@ -21,8 +21,8 @@ from worker.racer.geometry import on_road, place_at
 from worker.racer.naming import keep
 from worker.settings.errors import UserError
 from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from worker.tasks.compile.policy_contract import policy_contract
 from worker.tasks.library.racer import Racer, RacerPixels, RacerPixelsAndState
+from worker.tasks.run.policy_contract import policy_contract
 
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]
 DISCRETE = {"action_space": FIVE, "action_space_type": "discrete", "sensor": ["FRONT_FACING_CAMERA"], "version": "5"}

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from shared_store import __version__
 from shared_store.contract.policy import Command, Contract, Group, Image, RobotModel, State, Term
 from worker.tasks.compile.contract import described, range_of
-from worker.tasks.compile.images import described as images_of
 from worker.tasks.compile.measured import frame_of, is_library
 from worker.tasks.compile.tables import settings
 
 if TYPE_CHECKING:
-    from worker.learning.algorithm import ExportedPolicy
     from worker.simulation.robot_reading import Reading
     from worker.tasks.compile.plan import Plan, Seen
     from worker.tasks.run.task import Task
@@ -23,7 +21,18 @@ CHANNELS = ("red", "green", "blue")
 """Name of the camera that the configuration adds to any task."""
 
 
-def policy_contract(task: Task, name: str, exported: ExportedPolicy | None = None) -> Contract:
+class Exported(Protocol):
+    """A policy as a function of tensors, as far as its contract says something of it."""
+
+    @property
+    def sample(self) -> Any: ...
+    @property
+    def inputs(self) -> Any: ...
+    @property
+    def states(self) -> Sequence[str]: ...
+
+
+def policy_contract(task: Task, name: str, exported: Exported | None = None) -> Contract:
     """The contract of a policy of ``task``: inputs, outputs and recurrent state.
 
     Args:
@@ -194,3 +203,16 @@ def same_policy(contract: Contract, of: Contract) -> Contract:
         if group is not None:
             groups.append(dataclasses.replace(group, input=told.input))
     return dataclasses.replace(contract, groups=tuple(groups), states=of.states, normalizer=of.normalizer)
+
+
+def images_of(task: Task) -> dict[str, dict[str, Any]]:
+    """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
+    camera = getattr(task.config, "camera", None)
+    plan: Plan | None = getattr(task, "plan", None)
+    found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
+    if plan is None:
+        return found
+    for group, name in plan.images.items():
+        sensor = plan.declaration.sensors[name]
+        found[group] = {"sensor": name, **dataclasses.asdict(sensor), "channels": sensor.rows(plan.views)}
+    return found

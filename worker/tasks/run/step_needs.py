@@ -8,8 +8,8 @@ from typing import Any
 from worker.simulation.sensors.differential_ik import IkSolver
 from worker.tasks.compile.binding import Bound
 from worker.tasks.compile.plan import Plan
-from worker.tasks.compile.torch_terms import TorchTerms
 from worker.tasks.declare.functions import reads_poses
+from worker.tasks.run.torch_terms import TorchTerms
 
 
 class StepNeeds:
